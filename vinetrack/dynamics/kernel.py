@@ -31,7 +31,121 @@ from vinetrack.dynamics.integrator import BATCH
 from vinetrack.dynamics.model import Model, effects_on, hosted, shared_host
 from vinetrack.effects import Effect, State, TrialInputs, effect_sources
 
-_HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
+_STATE = (
+    "State(time, y, ydot, x, v, set_pressure, pressure, yield_pressure, area, density, mass, gain, bend_angle, "
+    "tension, seen)"
+)
+
+
+def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
+    """Source of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects."""
+    model = Model(tuple(effects))
+    loads: dict[str, str] = {}
+
+    def calls(hook: str, assign: str, indent: int = 4, state: str = _STATE) -> str:
+        """Call a hook of every effect that acts, one after the other, and load its functions."""
+        lines = []
+        for i, _, place in model.hooks[hook]:
+            effect = model.effects[i]
+            name = f"{effect.name}__{hook}"
+            loads[name] = f"{name} = inlined(EFFECTS[{i}].functions[{hook!r}])"
+            arguments = "".join(f", theta[{j}]" for j in range(place.start, place.stop))
+            # A measured pressure includes everything that happens in the chamber.
+            condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
+            lines += [f"if {condition}:", f"    {assign} {name}({state}, rig{arguments})"]
+        return ("\n" + " " * indent).join(lines)
+
+    def function(name: str, arguments: str, motion: str, *body: str, at_release: bool = False) -> str:
+        lines = "\n    ".join(body)
+        return f"""
+@inlined
+def {name}({arguments}):
+    on, theta = trial.on, trial.theta
+    rig = TrialInputs({", ".join(f"trial.inputs[{i}]" for i in range(len(TrialInputs._fields)))})
+    film = 1.0
+    {motion}
+    yield_pressure = rig.yield_pressure
+    area, gain, bend_angle, tension, seen = rig.area, 1.0, {"0.0" if at_release else "angle_passed(y, trial)"}, 0.0, y
+    mass, density = 0.0, rig.linear_density
+    measured = {"False" if at_release else "trial.trace_time.size > 0"}
+    chamber_rate, set_pressure, pressure = 0.0, rig.set_pressure, rig.set_pressure
+    tip, tail = 0.0, 0.0
+    {lines}
+"""
+
+    # Gauge, then chamber, then area and losses. Where the area depends on the pressure, they are iterated: without
+    # strain that converges at once, with the largest strain by one or two digits a turn.
+    losses = calls("pressure", "pressure =")
+    if model.hooks["area"]:
+        losses = f"""start = pressure
+    for turn in range(30):
+        area_before, area = area, rig.area
+        {calls("area", "area =", 8)}
+        if turn > 0 and abs(area - area_before) <= 1e-10 * area:
+            break
+        pressure = start
+        {calls("pressure", "pressure =", 8)}"""
+    has_chamber = bool(model.hooks["chamber_rate"])
+    terms = f"""{calls("film_gain", "film *=")}
+    density = rig.linear_density * film
+    film_mass = density * rig.length - rig.mass_loss * film * rig.travel_ratio * y
+    mass = max(film_mass, rig.least_mass) + rig.payload_mass
+    {calls("gauge", "pressure =")}
+    set_pressure = pressure
+    if measured:
+        pressure = trace_at(time, trial)
+        {calls("gauge", "pressure =", 8)}
+    {"else: pressure = chamber" if has_chamber else ""}
+    {calls("yield_gauge", "yield_pressure =")}
+    {losses}
+    {calls("damping_gain", "gain =")}
+    {calls("tip_force", "tip +=")}
+    {calls("tail_force", "tail +=")}"""
+    # Everything that moves with the tail (`vinetrack.dynamics.audit.inertia_kg`): mass that effects add has no weight
+    # of its own, so it is added after the forces.
+    added = f"""added = 0.0
+    {calls("added_mass", "added +=")}
+    mass = max(film_mass + max(added, 0.0), rig.least_mass)
+    mass = max(mass + min(added, 0.0) + rig.payload_mass, rig.least_mass)"""
+    added = added if model.hooks["added_mass"] else ""
+    # Without an effect that changes the position that the camera reports, it is that of the edge.
+    acting = " or ".join(f"on[{i}]" for i in sorted(i for i, _, _ in model.hooks["observed_position"]))
+    seen = f"""if not ({acting}):
+        return seen
+    {terms}
+    tension = max(tip, 0.0) / rig.travel_ratio
+    {calls("observed_position", "seen =")}"""
+    # The rate of the chamber depends on its own pressure, not on that at the tip.
+    chamber = calls("chamber_rate", "chamber_rate +=", state=_STATE.replace(" pressure,", " chamber,"))
+    no_compression = "if rig.tail_free > 0: tip = max(tip, 0.0)" if tail_free else ""
+    acceleration = "return (tip / rig.travel_ratio + tail) / mass"
+    moving = "x, v = max(x, 0.0), max(v, 0.0)\n    y, ydot = x / rig.travel_ratio, v / rig.travel_ratio"
+    at_rest = "v, ydot = 0.0, 0.0\n    x = max(x, 0.0)\n    y = x / rig.travel_ratio"
+    released = "x, v, y, ydot, time = 0.0, 0.0, 0.0, 0.0, 0.0"
+    gauge, held = calls("gauge", "pressure ="), calls("rest_force", "tip +=")
+    functions = [
+        function("rates", "time, x, v, chamber, trial", moving, terms, chamber, added, f"{acceleration}, chamber_rate"),
+        function(
+            "rest_acceleration", "time, x, chamber, trial", at_rest, terms, held, no_compression, added, acceleration
+        ),
+        function("observed", "time, x, v, chamber, trial", moving, seen if acting else "", "return seen"),
+        function("first_chamber", "trial", released, gauge, "return pressure", at_release=True),
+        f"\n@inlined\ndef has_chamber():\n    return {has_chamber}\n",
+    ]
+    for hook in ("row_delay", "averaged_over"):
+        summed = "total = 0.0", calls(hook, "total +="), "return total"
+        functions.append(function(hook, "trial", released, *summed, at_release=True))
+    fields = "rates, rest_acceleration, observed, first_chamber, has_chamber, row_delay, averaged_over"
+    if tail_free:
+        resting = f"if resting:\n        {calls('rest_force', 'tip +=', 8) or 'pass'}"
+        tension = "return tip / rig.travel_ratio, chamber_rate"
+        functions += [
+            function("tip_tension", "time, x, v, chamber, resting, trial", moving, terms, resting, chamber, tension),
+            function("free_fall", "time, y, ydot, x, v, chamber, trial", "", terms, "return tail / mass"),
+        ]
+        fields += ", slack_fraction, slack_at_rest, follow_slack, tip_tension, free_fall"
+    batch, loaded = ", ".join(BATCH), "\n".join(loads.values())
+    return f"""\"""Machine-made: a sum of effects, for the integrator of vinetrack.dynamics.\"""
 
 from numba import njit
 
@@ -39,9 +153,8 @@ from vinetrack.dynamics.equations import Equations, angle_passed, inlined, trace
 from vinetrack.dynamics.integrator import follow_slack, integrate_trials, slack_at_rest, slack_fraction
 from vinetrack.effects import State, TrialInputs
 
-'''
-
-_FOOT = """
+{loaded}
+{"".join(functions)}
 EQUATIONS = Equations(__name__, {fields})
 
 
@@ -50,165 +163,6 @@ EQUATIONS = Equations(__name__, {fields})
 def integrate_many({batch}):
     integrate_trials(EQUATIONS, {batch})
 """
-
-_SUM = """
-@inlined
-def {name}({arguments}):
-    on, theta = trial.on, trial.theta
-    rig = TrialInputs({rig_fields})
-    film = 1.0
-    {motion}
-    yield_pressure = rig.yield_pressure
-    area, gain, bend_angle, tension, seen = rig.area, 1.0, {angle}, 0.0, y
-    mass, density = 0.0, rig.linear_density
-    measured = {measured}
-    chamber_rate, set_pressure, pressure = 0.0, rig.set_pressure, rig.set_pressure
-    tip, tail = 0.0, 0.0
-{body}
-"""
-
-_STATE = (
-    "State(time, y, ydot, x, v, set_pressure, pressure, yield_pressure, area, density, mass, gain, bend_angle, "
-    "tension, seen)"
-)
-_MOTION = "time, x, v, chamber, trial"
-_MOVING = """x, v = max(x, 0.0), max(v, 0.0)
-    y, ydot = x / rig.travel_ratio, v / rig.travel_ratio"""
-_AT_REST = "v, ydot = 0.0, 0.0\n    x = max(x, 0.0)\n    y = x / rig.travel_ratio"
-_AT_RELEASE = "x, v, y, ydot, time = 0.0, 0.0, 0.0, 0.0, 0.0"
-
-
-class _Writer:
-    """Writes the calls of hooks, in the order of the effects, and collects the functions to be loaded."""
-
-    def __init__(self, effects: Sequence[Effect]) -> None:
-        self.model = Model(tuple(effects))
-        self.loads: dict[str, str] = {}
-
-    def calls(self, hook: str, target: str, state: str = _STATE) -> list[str]:
-        lines = []
-        for i, _, place in self.model.hooks[hook]:
-            effect = self.model.effects[i]
-            arguments = "".join(f", theta[{j}]" for j in range(place.start, place.stop))
-            name = f"{effect.name}__{hook}"
-            self.loads[name] = f"{name} = inlined(EFFECTS[{i}].functions[{hook!r}])"
-            # A measured pressure includes everything that happens in the chamber.
-            condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
-            lines += [f"if {condition}:", f"    {target.format(call=f'{name}({state}, rig{arguments})')}"]
-        return lines
-
-    def pressure(self) -> list[str]:
-        """Gauge, then chamber, then area and losses; where the area depends on the pressure, iterate to consistency."""
-        gauge = self.calls("gauge", "pressure = {call}")
-        lines = [*gauge, "set_pressure = pressure"]
-        lines += ["if measured:", "    pressure = trace_at(time, trial)"]
-        lines += [f"    {line}" for line in gauge]
-        if self.model.hooks["chamber_rate"]:
-            lines += ["else:", "    pressure = chamber"]
-        lines += self.calls("yield_gauge", "yield_pressure = {call}")
-        pressures = self.calls("pressure", "pressure = {call}")
-        areas = self.calls("area", "area = {call}")
-        if not areas:
-            return lines + pressures
-        # Fixed-point iteration: without strain it converges at once, with the largest strain by one or two digits a
-        # turn.
-        lines += ["start = pressure", "for turn in range(30):", "    area_before, area = area, rig.area"]
-        lines += [f"    {line}" for line in areas]
-        lines += ["    if turn > 0 and abs(area - area_before) <= 1e-10 * area:", "        break"]
-        return lines + [f"    {line}" for line in ["pressure = start", *pressures]]
-
-    def mass(self) -> list[str]:
-        lines = [*self.calls("film_gain", "film *= {call}"), "density = rig.linear_density * film"]
-        everted = "rig.mass_loss * film * rig.travel_ratio * y"
-        lines += [f"film_mass = density * rig.length - {everted}"]
-        lines += ["mass = max(film_mass, rig.least_mass) + rig.payload_mass"]
-        return lines
-
-    def inertia(self) -> list[str]:
-        """Everything that moves with the tail; see `vinetrack.dynamics.audit.inertia_kg`."""
-        added = self.calls("added_mass", "added += {call}")
-        tail = "mass = max(film_mass + max(added, 0.0), rig.least_mass)"
-        total = "mass = max(mass + min(added, 0.0) + rig.payload_mass, rig.least_mass)"
-        return ["added = 0.0", *added, tail, total] if added else []
-
-    def forces(self) -> list[str]:
-        lines = self.calls("damping_gain", "gain = {call}")
-        lines += self.calls("tip_force", "tip += {call}")
-        return lines + self.calls("tail_force", "tail += {call}")
-
-    def camera_shortcut(self) -> list[str]:
-        """Return the position at once where no effect changes the position that the camera reports."""
-        acting = [f"on[{i}]" for i in sorted(i for i, _, _ in self.model.hooks["observed_position"])]
-        return [f"if not ({' or '.join(acting)}):", "    return seen"]
-
-    def function(self, name: str, arguments: str, motion: str, lines: Sequence[str]) -> str:
-        at_release = motion == _AT_RELEASE
-        return _SUM.format(
-            name=name,
-            arguments=arguments,
-            motion=motion,
-            rig_fields=", ".join(f"trial.inputs[{i}]" for i in range(len(TrialInputs._fields))),
-            angle="0.0" if at_release else "angle_passed(y, trial)",
-            measured="False" if at_release else "trial.trace_time.size > 0",
-            body="\n".join(f"    {line}" for line in lines),
-        )
-
-
-def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
-    """Source of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects. Mass that effects
-    add moves with the tail but has no weight of its own, so it is added after the forces.
-    """
-    writer = _Writer(effects)
-    common_terms = [*writer.mass(), *writer.pressure(), *writer.forces()]
-    added = writer.inertia()
-    seen = writer.calls("observed_position", "seen = {call}")
-    rest_forces = writer.calls("rest_force", "tip += {call}")
-    # The rate of the chamber depends on its own pressure, not on that at the tip.
-    chamber_rates = writer.calls("chamber_rate", "chamber_rate += {call}", _STATE.replace(" pressure,", " chamber,"))
-    per_mass = "return (tip / rig.travel_ratio + tail) / mass"
-    tension = "max(tip, 0.0) / rig.travel_ratio"
-    no_compression = ["if rig.tail_free > 0:", "    tip = max(tip, 0.0)"] if tail_free else []
-    camera_position = [*writer.camera_shortcut(), *common_terms, f"tension = {tension}", *seen]
-    functions = [
-        writer.function(
-            "rates", _MOTION, _MOVING, [*common_terms, *chamber_rates, *added, f"{per_mass}, chamber_rate"]
-        ),
-        writer.function(
-            "rest_acceleration",
-            _MOTION.replace("v, ", ""),
-            _AT_REST,
-            [*common_terms, *rest_forces, *no_compression, *added, per_mass],
-        ),
-        writer.function("observed", _MOTION, _MOVING, [*(camera_position if seen else []), "return seen"]),
-        writer.function(
-            "first_chamber",
-            "trial",
-            _AT_RELEASE,
-            [*writer.calls("gauge", "pressure = {call}"), "return pressure"],
-        ),
-    ]
-    for hook in ("row_delay", "averaged_over"):
-        summed = ["total = 0.0", *writer.calls(hook, "total += {call}"), "return total"]
-        functions += [writer.function(hook, "trial", _AT_RELEASE, summed)]
-    if tail_free:
-        resting = ["if resting:", *[f"    {line}" for line in rest_forces or ["pass"]]]
-        functions += [
-            writer.function(
-                "tip_tension",
-                _MOTION.replace("chamber,", "chamber, resting,"),
-                _MOVING,
-                [*common_terms, *resting, *chamber_rates, "return tip / rig.travel_ratio, chamber_rate"],
-            ),
-            writer.function(
-                "free_fall", _MOTION.replace("x, v,", "y, ydot, x, v,"), "", [*common_terms, "return tail / mass"]
-            ),
-        ]
-    names = ", ".join(effect.name for effect in effects)
-    functions += [f"@inlined\ndef has_chamber():\n    return {bool(writer.model.hooks['chamber_rate'])}\n"]
-    fields = ["rates", "rest_acceleration", "observed", "first_chamber", "has_chamber", "row_delay", "averaged_over"]
-    fields += ["slack_fraction", "slack_at_rest", "follow_slack", "tip_tension", "free_fall"] if tail_free else []
-    foot = _FOOT.format(fields=", ".join(fields), batch=", ".join(BATCH))
-    return "\n".join((_HEAD.format(names=names), *writer.loads.values(), *functions, foot))
 
 
 def _cache_folder() -> Path:
@@ -305,15 +259,12 @@ class Batch:
         # For fewer than 64 trials another thread costs more than it saves.
         threads = threads or max(1, min(available_cores(), count // 64))
         edges = np.linspace(0, count, threads + 1).astype(int).tolist()
-        if threads == 1:
-            self._part(0, count, relative_tolerance, out, ends)
-        else:
-            shared = relative_tolerance, out, ends
-            (begin, end), *others = itertools.pairwise(edges)
-            shares = [thread_pool(threads).submit(self._part, a, b, *shared) for a, b in others]
-            self._part(begin, end, *shared)
-            for share in shares:
-                share.result()
+        shared = relative_tolerance, out, ends
+        (begin, end), *others = itertools.pairwise(edges)
+        shares = [thread_pool(threads).submit(self._part, a, b, *shared) for a, b in others]
+        self._part(begin, end, *shared)
+        for share in shares:
+            share.result()
         return out, ends
 
     def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
