@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
     evaluated in motion, where every effect can act.
     """
     for hook in effect.functions:
-        yield from _compile_faults(effect, hook)
+        yield from _compile_faults(effect, hook, effect.path.read_bytes())
     for worked in effect.worked:
         yield from _worked_faults(effect, worked)
     if effect.parameters:
@@ -108,27 +109,18 @@ def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
         yield f"{worked.hook} gives {value:.6g} where worked out by hand it is {worked.expected:.6g} ({worked.how})"
 
 
-# Faults found in compiling a function in this process, by the text of its file and its name
-_COMPILED: dict[tuple[bytes, str], tuple[str, ...]] = {}
-
-
-def _compile_faults(effect: Effect, hook: str) -> tuple[str, ...]:
-    key = effect.path.read_bytes(), hook
-    if key not in _COMPILED:
-        _COMPILED[key] = tuple(_compiled_anew(effect, hook))
-    return _COMPILED[key]
-
-
-def _compiled_anew(effect: Effect, hook: str) -> Iterator[str]:
+@lru_cache(maxsize=1024)
+def _compile_faults(effect: Effect, hook: str, _text: bytes) -> tuple[str, ...]:
+    """Compile a function like the kernel, without the runtime that allocates arrays; once for each text of its file."""
     from numba import njit
     from numba.core.errors import NumbaError
 
+    flags: dict[str, Any] = {"_nrt": False}
     try:
-        # Compiled like the kernel, without the runtime that allocates arrays.
-        flags: dict[str, Any] = {"_nrt": False}
         compiled = njit(**flags)(effect.functions[hook])
         compiled(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
     except NumbaError:
-        yield f"{hook} cannot be compiled: it may use numbers, math and numpy functions only"
+        return (f"{hook} cannot be compiled: it may use numbers, math and numpy functions only",)
     except Exception as error:
-        yield f"{hook} fails in motion ({type(error).__name__}: {error})"
+        return (f"{hook} fails in motion ({type(error).__name__}: {error})",)
+    return ()

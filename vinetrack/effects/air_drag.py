@@ -24,7 +24,7 @@ EASILY_TAKEN_FOR = ("inlet_loss", "fold_inertia")
 PARAMETERS = (Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0), meaning="drag coefficient"),)
 
 
-def tip_force(s, rig, C_D):  # noqa: ARG001, D103
+def tip_force(s, rig, C_D):
     return -0.5 * AIR_DENSITY_KG_M3 * s.area * C_D * s.lead_velocity * s.lead_velocity
 
 

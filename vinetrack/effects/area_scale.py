@@ -39,11 +39,11 @@ PARAMETERS = (
 )
 
 
-def area(s, rig, eps):  # noqa: ARG001, D103
+def area(s, rig, eps):
     return s.area * (1.0 + eps) ** 2
 
 
-def film_gain(s, rig, eps):  # noqa: ARG001, D103
+def film_gain(s, rig, eps):
     return 1.0 + eps
 
 

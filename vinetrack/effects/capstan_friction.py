@@ -34,7 +34,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, C, mu_c, k):  # noqa: D103
+def tail_force(s, rig, C, mu_c, k):
     if rig.as_printed > 0.0:
         count = max(rig.bend_count, 1.0)
         return -C * count * np.exp(mu_c * rig.bend_total / count) + 0.0 * s.lead_position

@@ -36,11 +36,11 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, k, y_0):  # noqa: ARG001, D103
+def tail_force(s, rig, k, y_0):
     return -k * np.maximum(s.lead_position - y_0, 0.0)
 
 
-def breakpoints(rig, k, y_0):  # noqa: ARG001, D103
+def breakpoints(rig, k, y_0):
     return (y_0,)
 
 

@@ -33,7 +33,7 @@ PARAMETERS = (
 )
 
 
-def tip_force(s, rig, B, n):  # noqa: ARG001, D103
+def tip_force(s, rig, B, n):
     return -B * s.damping_gain * s.tail_velocity**n
 
 

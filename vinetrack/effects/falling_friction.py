@@ -54,7 +54,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, F_s, v_s, k):  # noqa: ARG001, D103
+def tail_force(s, rig, F_s, v_s, k):
     return -F_s * np.exp(-((np.maximum(s.tail_velocity, 0.0) / v_s) ** k))
 
 

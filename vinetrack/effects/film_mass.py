@@ -40,7 +40,7 @@ PARAMETERS = (
 )
 
 
-def film_gain(s, rig, eps):  # noqa: ARG001, D103
+def film_gain(s, rig, eps):
     return 1.0 + eps
 
 

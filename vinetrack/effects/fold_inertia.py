@@ -27,7 +27,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, eta):  # noqa: D103
+def tail_force(s, rig, eta):
     mass_loss = s.linear_density * (rig.travel_ratio - 1.0) / rig.travel_ratio
     return eta * 0.5 * mass_loss * s.tail_velocity * s.tail_velocity
 

@@ -36,12 +36,12 @@ PARAMETERS = (
 )
 
 
-def tip_force(s, rig, factor):  # noqa: D103
+def tip_force(s, rig, factor):
     gas_density = (s.pressure + rig.ambient_pressure) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
     return -factor * 0.5 * gas_density * s.area * s.lead_velocity * s.lead_velocity
 
 
-def added_mass(s, rig, factor):  # noqa: D103
+def added_mass(s, rig, factor):
     gas_density = (s.pressure + rig.ambient_pressure) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
     return factor * gas_density * s.area * s.lead_position / (rig.travel_ratio * rig.travel_ratio)
 

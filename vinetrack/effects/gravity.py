@@ -34,7 +34,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, g):  # noqa: D103
+def tail_force(s, rig, g):
     return s.moving_mass * g * rig.cos_angle
 
 

@@ -38,7 +38,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, f):  # noqa: D103
+def tail_force(s, rig, f):
     sine = np.sqrt(np.maximum(1.0 - rig.cos_angle**2, 0.0))
     return s.moving_mass * GRAVITY_M_S2 * f * (sine - rig.cos_angle)
 

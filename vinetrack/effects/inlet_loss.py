@@ -24,7 +24,7 @@ EASILY_TAKEN_FOR = ("air_drag", "gas_inertia")
 PARAMETERS = (Parameter("K", "K", "1", 1.5, bounds=(0.0, 50.0), plausible=(0.0, 3.0), meaning="loss coefficient"),)
 
 
-def pressure(s, rig, K):  # noqa: D103
+def pressure(s, rig, K):
     gas_density = (s.pressure + rig.ambient_pressure) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
     inlet_speed = s.lead_velocity * s.area / rig.inlet_area
     return s.pressure - K * 0.5 * gas_density * inlet_speed * inlet_speed

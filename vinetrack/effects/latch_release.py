@@ -27,7 +27,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, F, reach):  # noqa: ARG001, D103
+def tail_force(s, rig, F, reach):
     return -F * np.exp(-s.lead_position / reach)
 
 

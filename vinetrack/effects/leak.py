@@ -29,7 +29,7 @@ PARAMETERS = (
 )
 
 
-def pressure(s, rig, rate):  # noqa: ARG001, D103
+def pressure(s, rig, rate):
     return s.pressure * np.exp(-rate * s.time)
 
 

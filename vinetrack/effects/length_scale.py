@@ -38,7 +38,7 @@ PARAMETERS = (
 )
 
 
-def observed_position(s, rig, eps):  # noqa: ARG001, D103
+def observed_position(s, rig, eps):
     return s.observed * (1.0 + eps)
 
 

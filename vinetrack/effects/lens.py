@@ -36,7 +36,7 @@ PARAMETERS = (
 )
 
 
-def observed_position(s, rig, k3, y_c):  # noqa: ARG001, D103
+def observed_position(s, rig, k3, y_c):
     off_centre = s.observed - y_c
     return s.observed + k3 * (off_centre * off_centre * off_centre + y_c * y_c * y_c)
 

@@ -21,7 +21,7 @@ PARAMETERS = (
 )
 
 
-def tip_force(s, rig, b):  # noqa: ARG001, D103
+def tip_force(s, rig, b):
     return -b * s.tail_velocity
 
 

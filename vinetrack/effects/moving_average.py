@@ -29,7 +29,7 @@ PARAMETERS = (
 )
 
 
-def averaged_over(s, rig, T2):  # noqa: ARG001, D103
+def averaged_over(s, rig, T2):
     return T2
 
 

@@ -34,7 +34,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, drag_area):  # noqa: D103
+def tail_force(s, rig, drag_area):
     if rig.payload_mass <= 0.0:
         return 0.0 * s.pressure
     gas_density = (s.pressure + rig.ambient_pressure) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)

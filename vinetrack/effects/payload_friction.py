@@ -28,7 +28,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, mu_p):  # noqa: D103
+def tail_force(s, rig, mu_p):
     return -mu_p * rig.payload_mass * GRAVITY_M_S2 + 0.0 * s.lead_position
 
 

@@ -35,13 +35,13 @@ PARAMETERS = (
 )
 
 
-def added_mass(s, rig, delta):  # noqa: D103
+def added_mass(s, rig, delta):
     if rig.payload_mass <= 0.0:
         return 0.0 * s.lead_position
     return max(delta, -rig.payload_mass) + 0.0 * s.lead_position
 
 
-def tail_force(s, rig, delta):  # noqa: D103
+def tail_force(s, rig, delta):
     if rig.payload_mass <= 0.0:
         return 0.0 * s.lead_position
     return max(delta, -rig.payload_mass) * GRAVITY_M_S2 * rig.cos_angle + 0.0 * s.lead_position

@@ -25,7 +25,7 @@ PARAMETERS = (
 )
 
 
-def observed_position(s, rig, k):  # noqa: ARG001, D103
+def observed_position(s, rig, k):
     return s.observed * (1.0 + k * s.observed)
 
 

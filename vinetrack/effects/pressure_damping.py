@@ -32,7 +32,7 @@ PARAMETERS = (
 )
 
 
-def damping_gain(s, rig, beta):  # noqa: ARG001, D103
+def damping_gain(s, rig, beta):
     return s.damping_gain * np.maximum(1.0 + beta * s.pressure, 0.0)
 
 

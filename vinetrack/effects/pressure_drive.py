@@ -18,7 +18,7 @@ from vinetrack.effects import Worked
 KIND = "base"
 
 
-def tip_force(s, rig):  # noqa: ARG001, D103
+def tip_force(s, rig):
     return s.pressure * s.area
 
 

@@ -22,11 +22,11 @@ PARAMETERS = (
 )
 
 
-def gauge(s, rig, eps):  # noqa: ARG001, D103
+def gauge(s, rig, eps):
     return s.pressure * (1.0 + eps)
 
 
-def yield_gauge(s, rig, eps):  # noqa: ARG001, D103
+def yield_gauge(s, rig, eps):
     return s.yield_pressure * (1.0 + eps)
 
 

@@ -24,7 +24,7 @@ PARAMETERS = (
 )
 
 
-def gauge(s, rig, delta):  # noqa: ARG001, D103
+def gauge(s, rig, delta):
     return s.pressure + delta
 
 

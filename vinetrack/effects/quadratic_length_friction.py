@@ -25,7 +25,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, q):  # noqa: ARG001, D103
+def tail_force(s, rig, q):
     return -q * s.lead_position * s.lead_position
 
 

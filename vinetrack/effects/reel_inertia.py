@@ -28,7 +28,7 @@ PARAMETERS = (
 )
 
 
-def added_mass(s, rig, M):  # noqa: ARG001, D103
+def added_mass(s, rig, M):
     return M + 0.0 * s.lead_position
 
 

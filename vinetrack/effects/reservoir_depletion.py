@@ -41,7 +41,7 @@ PARAMETERS = (
 )
 
 
-def pressure(s, rig, gamma):  # noqa: D103
+def pressure(s, rig, gamma):
     volume_ratio = rig.chamber_volume / (rig.chamber_volume + s.area * s.lead_position)
     return (s.pressure + rig.ambient_pressure) * volume_ratio**gamma - rig.ambient_pressure
 

@@ -27,7 +27,7 @@ PARAMETERS = (
 )
 
 
-def row_delay(s, rig, delay):  # noqa: ARG001, D103
+def row_delay(s, rig, delay):
     return delay
 
 

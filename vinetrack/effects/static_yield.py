@@ -27,7 +27,7 @@ PARAMETERS = (
 )
 
 
-def rest_force(s, rig, P_s):  # noqa: ARG001, D103
+def rest_force(s, rig, P_s):
     return -np.maximum(P_s - s.yield_pressure, 0.0) * s.area
 
 

@@ -50,7 +50,7 @@ PARAMETERS = (
 )
 
 
-def pressure(s, rig, a, f, phi):  # noqa: ARG001, D103
+def pressure(s, rig, a, f, phi):
     return s.pressure * (1.0 + a * np.sin(2.0 * np.pi * f * np.maximum(s.time, 0.0) + phi))
 
 

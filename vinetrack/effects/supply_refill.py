@@ -43,7 +43,7 @@ PARAMETERS = (
 )
 
 
-def chamber_rate(s, rig, tau, gamma):  # noqa: D103
+def chamber_rate(s, rig, tau, gamma):
     if tau <= 0.0:
         return 0.0 * s.pressure
     drawn = gamma * (s.pressure + rig.ambient_pressure) * s.area * s.lead_velocity

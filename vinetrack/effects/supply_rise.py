@@ -41,7 +41,7 @@ PARAMETERS = (
 )
 
 
-def pressure(s, rig, tau, shape):  # noqa: ARG001, D103
+def pressure(s, rig, tau, shape):
     if tau <= 0.0:
         return s.pressure
     return s.pressure * (1.0 - np.exp(-((np.maximum(s.time, 0.0) / tau) ** shape)))

@@ -37,13 +37,13 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, mu_w):  # noqa: D103
+def tail_force(s, rig, mu_w):
     if rig.tail_on_reel > 0.0:
         return -mu_w * s.lead_position
     return -mu_w * np.minimum(s.lead_position, rig.length - s.lead_position)
 
 
-def breakpoints(rig):  # noqa: D103
+def breakpoints(rig):
     return () if rig.tail_on_reel > 0.0 else (rig.length / 2,)
 
 

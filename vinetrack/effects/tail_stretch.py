@@ -38,7 +38,7 @@ PARAMETERS = (
 )
 
 
-def observed_position(s, rig, compliance):  # noqa: D103
+def observed_position(s, rig, compliance):
     per_newton = compliance / (math.pi * rig.diameter * rig.thickness)
     tail = s.tail_tension * per_newton
     wall = (s.pressure * s.area - s.tail_tension) * per_newton

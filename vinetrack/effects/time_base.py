@@ -32,7 +32,7 @@ PARAMETERS = (
 )
 
 
-def true_time(s, rig, eps):  # noqa: ARG001, D103
+def true_time(s, rig, eps):
     return s.time / (1.0 + eps)
 
 

@@ -24,7 +24,7 @@ PARAMETERS = (
 )
 
 
-def trace_time(s, rig, delta):  # noqa: ARG001, D103
+def trace_time(s, rig, delta):
     return s.time + delta
 
 

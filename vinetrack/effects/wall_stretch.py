@@ -32,7 +32,7 @@ PARAMETERS = (
 )
 
 
-def area(s, rig, kappa):  # noqa: ARG001, D103
+def area(s, rig, kappa):
     widening = 1.0 + kappa * s.pressure
     return s.area * widening * widening
 

@@ -20,7 +20,7 @@ KIND = "base"
 NEEDS = ("yield_pressure_kPa",)
 
 
-def tip_force(s, rig):  # noqa: ARG001, D103
+def tip_force(s, rig):
     return -s.yield_pressure * s.area
 
 

@@ -20,7 +20,7 @@ PARAMETERS = (
 )
 
 
-def tail_force(s, rig, size, kind, centre, width):  # noqa: D103
+def tail_force(s, rig, size, kind, centre, width):
     position = s.lead_position / rig.length if rig.length > 0.0 else s.lead_position
     coordinate = position
     if kind == 1.0 or kind == 4.0:
