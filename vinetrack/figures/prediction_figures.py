@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.power import EffectPower, Power
+    from vinetrack.planning.fastest_vine import Choice
 
 _LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis
 
@@ -43,65 +44,50 @@ _LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter t
 # Figures of designs: the fastest vine, and the pressure loss of a chamber.
 
 
-@dataclass(frozen=True)
-class FilmChoice:
-    """One film."""
-
-    thickness_um: float
-    diameters_mm: np.ndarray
-    speeds_m_s: np.ndarray
-    best: tuple[float, float]
-    band: tuple[float, float]
-    odds: float
-
-
 @look()
-def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figure:
+def draw_choice(choices: Sequence[Choice]) -> Figure:
     """Draw the films side by side: speed against diameter, and the certainty of the choice."""
     fig = new_figure(9.6, 4.4, layout=None)
     curves, bars = fig.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-    for k, film in enumerate(films):
+    films = [f"{1e6 * choice.thickness_m:g}" for choice in choices]
+    for k, (choice, film) in enumerate(zip(choices, films, strict=True)):
         colour, marker = VINE_COLOURS[k % len(VINE_COLOURS)], VINE_MARKERS[k % len(VINE_MARKERS)]
-        curves.plot(film.diameters_mm, film.speeds_m_s, color=colour, label=f"{film.thickness_um:g} µm")
-        curves.plot(*film.best, marker, color=colour, ms=8, clip_on=False)
-        bars.plot([k, k], film.band, color=colour, lw=9, alpha=0.35, solid_capstyle="butt")
-        bars.plot(k, film.best[1], marker, color=colour, ms=8)
+        final, diameter_mm = choice.prediction.final, 1e3 * choice.prediction.inputs.trial.diameter_m
+        curves.plot(1e3 * choice.others[:, 0], choice.others[:, 1], color=colour, label=f"{film} µm")
+        curves.plot(diameter_mm, final.median, marker, color=colour, ms=8, clip_on=False)
+        bars.plot([k, k], [final.low, final.high], color=colour, lw=9, alpha=0.35, solid_capstyle="butt")
+        bars.plot(k, final.median, marker, color=colour, ms=8)
         style: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 10}
-        bars.annotate(f"{film.odds:.0%}", (k, film.band[1]), (0, 5), **style)
-    label = f"{name} (m/s)" if y_over_L == 1 else f"{name}\nat y/L = {y_over_L:g} (m/s)"
-    curves.set(xlabel="diameter (mm)", ylabel=label, ylim=(0.0, 1.12 * max(film.band[1] for film in films)))
+        bars.annotate(f"{choice.odds:.0%}", (k, final.high), (0, 5), **style)
+    final = choices[0].prediction.final
+    label = f"{final.name} (m/s)" if final.y_over_L == 1 else f"{final.name}\nat y/L = {final.y_over_L:g} (m/s)"
+    fastest = max(choice.prediction.final.high for choice in choices)
+    curves.set(xlabel="diameter (mm)", ylabel=label, ylim=(0.0, 1.12 * fastest))
     small_title(curves, "best length and pressure at each diameter", fontsize=10)
     curves.legend(title="film", fontsize=9.5)
     bars.set(xlabel="film (µm)", xlim=(-0.6, len(films) - 0.4))
-    bars.set_xticks(range(len(films)), [f"{film.thickness_um:g}" for film in films])
+    bars.set_xticks(range(len(films)), films)
     small_title(bars, "90 % band; percentage of draws in which it is the fastest", fontsize=10)
     fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
     fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=MUTED, fontsize=8.8)
     return fig
 
 
-@dataclass(frozen=True)
-class GasLawLoss:
-    """One gas law: its name, and the fraction of the gauge pressure lost at every volume, shape (n_volumes,)."""
-
-    name: str
-    losses: np.ndarray
-
-
 @look()
 def draw_reservoir(
-    volumes_m3: np.ndarray, laws: Sequence[GasLawLoss], loss: float, swept_m3: float, chosen_m3: float | None
+    volumes_m3: np.ndarray, losses: Mapping[str, np.ndarray], loss: float, swept_m3: float, chosen_m3: float | None
 ) -> Figure:
-    """Draw the gauge pressure that a closed chamber loses while a vine grows, against its volume. Shapes: volumes_m3
-    (n_volumes,).
+    """Draw the fraction of the gauge pressure that a closed chamber loses while a vine grows, by two gas laws, against
+    its volume. Shapes: volumes_m3, losses (n_volumes,).
     """
     # Below 10 mL the axis is in millilitres, so that its ticks need no exponent.
     factor, unit = (1e3, "L") if volumes_m3[0] >= 1e-5 else (1e6, "mL")
     fig = new_figure(7.2, 4.4)
     ax = fig.subplots()
-    for law, colour, style in zip(laws, (BLUE, VERMILLION), ("-", DASHED), strict=False):
-        ax.plot(factor * volumes_m3, 100 * law.losses, color=colour, ls=style, label=law.name)
-    band(ax, factor * volumes_m3, 100 * laws[0].losses, 100 * laws[1].losses, MUTED, 0.12)
+    for (law, lost), colour, style in zip(losses.items(), (BLUE, VERMILLION), ("-", DASHED), strict=True):
+        ax.plot(factor * volumes_m3, 100 * lost, color=colour, ls=style, label=law)
+    slow, fast = losses.values()
+    band(ax, factor * volumes_m3, 100 * slow, 100 * fast, MUTED, 0.12)
     words: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9.5}
     ax.axhline(100 * loss, color=INK, lw=1.0)
     at = (0.99, 100 * loss), (0, 3), ("axes fraction", "data")

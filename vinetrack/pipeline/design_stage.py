@@ -110,7 +110,9 @@ def design_vine(
     _refuse_standstill(room, choices)
     lines = list(_vine_lines(room, choices))
     if figure is not None:
-        write_figure(_vine_picture(choices), figure)
+        from vinetrack.figures.prediction_figures import draw_choice
+
+        write_figure(draw_choice(choices), figure)
         lines.append(f"Figure: {figure}")
     return lines, [_choice_entry(choice) for choice in choices]
 
@@ -203,23 +205,6 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield from table(rows_of)
     yield "  not included: the burst stress, a guess from one vine, and effects not in the model (`vinetrack predict`)"
     yield from (f"! {warning}" for warning in design_checks(best))
-
-
-def _vine_picture(choices: Sequence[Choice]) -> Figure:
-    from vinetrack.figures.prediction_figures import FilmChoice, draw_choice
-
-    films = [
-        FilmChoice(
-            thickness_um=1e6 * choice.thickness_m,
-            diameters_mm=1e3 * choice.others[:, 0],
-            speeds_m_s=choice.others[:, 1],
-            best=(1e3 * choice.prediction.inputs.trial.diameter_m, choice.prediction.final.median),
-            band=(choice.prediction.final.low, choice.prediction.final.high),
-            odds=choice.odds,
-        )
-        for choice in choices
-    ]
-    return draw_choice(films, choices[0].prediction.final.name, choices[0].prediction.final.y_over_L)
 
 
 REQUIRED_FOR_RESERVOIR = ("diameter_mm", "length_mm", "pressure_kPa")
@@ -322,20 +307,14 @@ def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> l
 def _reservoir_picture(trial: Trial, loss: float) -> Figure:
     import numpy as np
 
-    from vinetrack.figures.prediction_figures import GasLawLoss, draw_reservoir
+    from vinetrack.figures.prediction_figures import draw_reservoir
     from vinetrack.planning.fastest_vine import GAMMAS, chambers, gauge_loss, swept_m3
 
-    swept = swept_m3(trial)
+    swept, pressure_Pa, ambient_Pa = swept_m3(trial), trial.pressure_Pa, trial.ambient_pressure_Pa
     volumes = swept * np.geomspace(3.0, 300.0, 200)
-    laws = [
-        GasLawLoss(
-            name,
-            np.array([
-                gauge_loss(trial.pressure_Pa, swept, float(volume), gamma, trial.ambient_pressure_Pa)
-                for volume in volumes
-            ]),
-        )
+    losses = {
+        name: np.array([gauge_loss(pressure_Pa, swept, float(volume), gamma, ambient_Pa) for volume in volumes])
         for name, gamma in GAMMAS.items()
-    ]  # fmt: skip
+    }
     requested = [chamber for chamber in chambers(trial, loss) if chamber.name == "asked about"]
-    return draw_reservoir(volumes, laws, loss, swept, requested[0].volume_m3 if requested else None)
+    return draw_reservoir(volumes, losses, loss, swept, requested[0].volume_m3 if requested else None)
