@@ -28,9 +28,8 @@ from vinetrack.cli.command_frame import (
     print_result,
     settings_from_json,
 )
-from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
-from vinetrack.cli.power_commands import register as register_power
+from vinetrack.cli.planning_commands import register as register_planning
 from vinetrack.cli.start_commands import register as register_start
 from vinetrack.core.local_page import THREAD_PREFIX
 
@@ -183,8 +182,7 @@ def _overlays(
 
 
 register_diagnose(app)
-register_power(app)
-register_design(app)
+register_planning(app)
 
 
 @app.command("recording", rich_help_panel="Stages of the workflow")

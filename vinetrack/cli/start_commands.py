@@ -14,27 +14,15 @@ from vinetrack.cli.command_frame import (
     JsonFile,
     LogPath,
     ResultsPath,
-    activity_sign,
     errors_as_sentences,
     json_to_terminal,
     print_result,
 )
+from vinetrack.cli.options import with_options
 from vinetrack.core.problems import UserError
 
 Port = Annotated[int | None, typer.Option("--port", min=0, max=65535, help="Port to serve on; 0 for any that is free.")]
 Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a browser.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    for name, command in (
-        ("setup", _setup),
-        ("track", _track),
-        ("check", _check),
-        ("run", _run),
-        ("explore", _explore),
-    ):
-        app.command(name, rich_help_panel=START)(command)
 
 
 def _setup(
@@ -58,73 +46,23 @@ def _setup(
             write_templates(folder, typer.echo)
 
 
+@with_options("track")
 def _track(
     recording: Annotated[Path, typer.Argument(help="A film, a stack, or a folder of pictures.", metavar="RECORDING")],
-    capture_fps: Annotated[
-        float | None, typer.Option("--capture-fps", min=1e-6, help="Frames per second at capture.", show_default=False)
-    ] = None,
-    exposure_us: Annotated[
-        float | None, typer.Option("--exposure-us", min=0, help="Exposure of a frame, µs.", show_default=False)
-    ] = None,
-    mm_per_px: Annotated[
-        float | None, typer.Option("--mm-per-px", min=1e-9, help="Scale, for positions in metres.", show_default=False)
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option("--calibration", metavar="FILE", help="An experiment.yaml whose `calibration:` is the scale."),
-    ] = None,
-    axis: Annotated[
-        str | None,
-        typer.Option(
-            "--axis", metavar="x,y:x,y", help="Points of the growth axis, px; more than two for a curved one."
-        ),
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option("--frames", metavar="FROM:TO", help="First and last frame to use, from 0.")
-    ] = None,
-    body: Annotated[bool, typer.Option("--body", help="The object moves as a whole, such as a ball.")] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Output folder; default RECORDING_track.")
-    ] = None,
-    json_file: JsonFile = None,
-    log: LogPath = None,
+    options: dict[str, Any],
 ) -> None:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
-    with errors_as_sentences(log):
-        from vinetrack.core.units import or_nan
-        from vinetrack.pipeline.overlays_stage import TrackOptions, track_file
+    from vinetrack.core.terminal import waiting
+    from vinetrack.pipeline.overlays_stage import TrackOptions, track_file
 
-        options = TrackOptions(
-            capture_fps=or_nan(capture_fps), exposure_us=or_nan(exposure_us), mm_per_px=or_nan(mm_per_px),
-            calibration=calibration,
-            axis=_cell("axis", axis, "--axis"), frames_used=_cell("frames_used", frames, "--frames"),
-            body=body, out=out,
-        )  # fmt: skip
-        lines: list[str] = []
-        say = lines.append if json_to_terminal(json_file) else _say
-        with activity_sign(f"tracking {recording.name}", log):
-            content = track_file(recording, options, say)
-        print_result((), content, json_file)
+    def say(line: str) -> None:
+        if not json_to_terminal(json_file):
+            print_result([line], None, None)
 
-
-def _say(line: str) -> None:
-    from vinetrack.core.terminal import severity_first
-
-    typer.echo(severity_first(line))
-
-
-def _cell(column: str, text: str | None, option: str) -> Any:
-    """Read an option that is written like a cell of a column; None if it is not given."""
-    from vinetrack.experiment.schema import COLUMNS, CellError, read_cell
-
-    if text is None:
-        return None
-    try:
-        return read_cell(COLUMNS[column], text)
-    except CellError as error:
-        raise typer.BadParameter(
-            f"{text!r} {error.message}: {error.allowed or error.remedy}", param_hint=option
-        ) from None
+    json_file = options.pop("json")
+    with waiting(f"tracking {recording.name}"):
+        content = track_file(recording, TrackOptions(**options), say)
+    print_result((), content, json_file)
 
 
 def _check(
@@ -195,3 +133,10 @@ def _explore(
         from vinetrack.pages.explorer_server import explore
 
         explore(results, experiment, typer.echo, port, browser=browser)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    commands = {"setup": _setup, "track": _track, "check": _check, "run": _run, "explore": _explore}
+    for name, command in commands.items():
+        app.command(name, rich_help_panel=START)(command)

@@ -1,0 +1,109 @@
+"""Options of the commands that have many: `options.csv` beside this file declares them, a line each.
+
+A line holds the name of the value that the command gets, the option, its commands, kind, default, bounds and help. A
+number that is not given is NaN; `per` is what it is divided by (100 for per cent). An option named after a column of
+the trial sheet comes from the columns' own table and is checked like a cell of a sheet.
+"""
+
+from __future__ import annotations
+
+import csv
+import inspect
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vinetrack.cli.command_frame import errors_as_sentences
+from vinetrack.experiment.schema import COLUMNS, CellError, Column, option, read_cell
+
+# Columns about the vine itself; all others are about the rig
+_VINE_COLUMNS = frozenset(
+    {"diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3", "yield_pressure_kPa", "yield_pressure_sigma_kPa"}
+)
+
+# Type of an option by its kind; text for all other kinds
+_TYPES: dict[str, Any] = {"number": float | None, "count": int, "path": Path | None, "flag": bool, "texts": list[str]}
+
+_Command = Callable[..., None]
+
+
+def with_options(command_name: str, columns: tuple[str, ...] = (), **meanings: str) -> Callable[[_Command], _Command]:
+    """Give a command the options of the table in place of its argument `options`, a mapping of values by field. With
+    `columns`, options for these columns of the trial sheet come first, and `options["cells"]` holds the given texts;
+    `meanings` replaces the help of some of them. Errors are reported in sentences; `--log` holds tracebacks.
+    """
+    with Path(__file__).with_name("options.csv").open(encoding="utf-8", newline="") as file:
+        lines = [line for line in csv.DictReader(file) if command_name in line["commands"].split()]
+    parameters = [_column_parameter(COLUMNS[name], meanings.get(name, "")) for name in columns]
+    parameters += [_parameter(line) for line in lines]
+
+    def decorate(command: _Command) -> _Command:
+        def called(**given: Any) -> None:
+            cells = {name: text for name in columns if (text := given.pop(name)) is not None}
+            options = {line["field"]: _value(line, given.pop(line["field"])) for line in lines}
+            with errors_as_sentences(options.pop("log")):
+                command(**given, options={**options, "cells": cells} if columns else options)
+
+        own = [one for one in inspect.signature(command, eval_str=True).parameters.values() if one.name != "options"]
+        keywords = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in (*own, *parameters)]
+        called.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+        called.__annotations__ = {one.name: one.annotation for one in keywords}
+        called.__doc__ = command.__doc__
+        return called
+
+    return decorate
+
+
+def _parameter(line: Mapping[str, str]) -> inspect.Parameter:
+    """Return the parameter from which Typer makes the option of a line."""
+    kind, default = line["kind"], line["default"]
+    bounds = {end: json.loads(line[name]) for end, name in (("min", "low"), ("max", "high")) if line[name]}
+    value = json.loads(default) if default and kind in ("number", "count") else default or None
+    info = typer.Option(
+        line["option"],
+        help=line["help"],
+        metavar=line["metavar"] or None,
+        rich_help_panel=line["panel"] or None,
+        show_default=bool(default),
+        **bounds,
+    )
+    return _keyword(line["field"], _TYPES.get(kind, str) | None, info, False if kind == "flag" else value)
+
+
+def _column_parameter(column: Column, meaning: str) -> inspect.Parameter:
+    """Return the parameter from which Typer makes the option of a column."""
+    unset = "" if column.default in ("", "unknown") or column.default.startswith("required") else f" ({column.default})"
+    info = typer.Option(
+        option(column.name),
+        help=meaning or f"{column.meaning.rstrip('.')}{unset}.",
+        metavar=column.scale.metavar if column.scale else "NUMBER",
+        rich_help_panel="The vine" if column.name in _VINE_COLUMNS else "The rig",
+        show_default=False,
+    )
+    return _keyword(column.name, str | None, info, None)
+
+
+def _keyword(name: str, kind: Any, info: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
+
+
+def _value(line: Mapping[str, str], given: Any) -> Any:
+    """Return the value of an option for the command."""
+    if line["kind"] == "number":
+        return math.nan if given is None else given / float(line["per"] or 1)
+    if line["kind"] == "texts":
+        return tuple(given or ())
+    if line["kind"] == "choice" and given not in (None, *line["metavar"].split("|")):
+        words = line["metavar"].replace("|", " nor ")
+        raise typer.BadParameter(f"{given!r} is neither {words}", param_hint=line["option"])
+    if line["kind"] == "column" and given is not None:
+        try:
+            return read_cell(COLUMNS[line["field"]], given)
+        except CellError as error:
+            message = f"{given!r} {error.message}: {error.allowed or error.remedy}"
+            raise typer.BadParameter(message, param_hint=line["option"]) from None
+    return given
