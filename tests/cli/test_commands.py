@@ -224,11 +224,6 @@ def test_a_wrong_folder_exits_with_1(arguments: tuple[str, ...]) -> None:
 # `vinetrack propose`: from a verdict of `unexplained` to an effect file that `vinetrack add` takes.
 
 
-def run_command(*arguments: str | Path) -> tuple[int, str]:
-    done = CliRunner().invoke(app, [str(one) for one in arguments])
-    return done.exit_code, done.output
-
-
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""
@@ -238,10 +233,10 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     experiment, results = place / "bench", place / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
     for stage in (("tracks", experiment, results), ("gather", experiment, results), ("damping", results)):
-        code, output = run_command(*stage)
+        code, output = run_commands(*stage)
         assert code == 0, output
     for stage in ("model", "diagnosis"):
-        code, output = run_command(stage, experiment, results)
+        code, output = run_commands(stage, experiment, results)
         assert code == 0, output
     (results / "provenance.json").write_text(json.dumps({"experiment": str(experiment)}))
     return experiment, results
@@ -254,21 +249,21 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     assert json.loads((results / "diagnosis.json").read_text())["verdict"] == "unexplained"
     proposals = []
     monkeypatch.setattr(search, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
-    code, output = run_command("propose", results)
+    code, output = run_commands("propose", results)
     assert code == 0, output
     path = experiment / "proposed_time.py"
     effect = own_effects([path])["proposed_time"]
     assert "4 trials of bench" in effect.text
     monkeypatch.setattr(search, "propose", lambda *_: proposals[0])  # the same once more, without the search
-    code, output = run_command("propose", results)
+    code, output = run_commands("propose", results)
     assert code == 1
     assert "exists already" in output
     elsewhere = shutil.copy(path, tmp_path)
-    code, output = run_command("add", elsewhere, results, "--save")
+    code, output = run_commands("add", elsewhere, results, "--save")
     assert code == 1
     # Without the rest of the catalogue, with which this effect would be compiled once more.
     monkeypatch.setattr("vinetrack.diagnosis.ladder.host_for", lambda model, more: Model((*model.effects, *more)))
-    code, output = run_command("add", path, results, "--save")
+    code, output = run_commands("add", path, results, "--save")
     assert code == 0, output
     settings = read_experiment_settings(experiment / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("proposed_time", ("proposed_time.py",))
@@ -280,6 +275,6 @@ def test_nothing_is_proposed_where_the_verdict_is_another(bench: tuple[Path, Pat
     for asked in diagnosis["rounds"]:
         asked["verdict"] = "adequate"
     (copy / "diagnosis.json").write_text(json.dumps(diagnosis | {"verdict": "adequate", "final_verdict": "adequate"}))
-    code, output = run_command("propose", copy)
+    code, output = run_commands("propose", copy)
     assert code == 1
     assert "Traceback" not in output

@@ -44,12 +44,6 @@ def test_every_dialect_reads_to_the_same_rows(tmp_path: Path, data: bytes) -> No
     np.testing.assert_array_equal(table.numbers("pressure_kPa"), [28.5, 14.0])
 
 
-def test_semicolons_with_decimal_commas() -> None:
-    table = parse_table("t;x\n0,5;1,25\n1;2\n")
-    np.testing.assert_array_equal(table.numbers("x"), [1.25, 2.0])
-    np.testing.assert_array_equal(table.numbers("t"), [0.5, 1.0])
-
-
 def test_cp1252_is_the_fallback(tmp_path: Path) -> None:
     assert table_of(tmp_path, "trial,Größe\na,µ\n".encode("cp1252")).rows == ({"trial": "a", "Größe": "µ"},)
 
@@ -182,11 +176,6 @@ def test_a_link_inside_the_folder_may_point_out(tmp_path: Path) -> None:
 def test_result_names_cannot_leave_their_folder(name: str) -> None:
     with pytest.raises(TableError):
         result_file(Path("results/x/tracks"), name, ".csv")
-
-
-def test_a_condition_names_a_file() -> None:
-    name = "24mm-200um-280mm_28kPa_35.6g"
-    assert result_file(Path("r"), name, ".png") == Path(f"r/{name}.png")
 
 
 def test_csv_is_read_back_to_the_same_values(tmp_path: Path) -> None:

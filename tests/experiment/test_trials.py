@@ -172,13 +172,6 @@ def test_what_cannot_be_read_is_refused(column: str, text: str) -> None:
         read_cell(COLUMNS[column], text)
 
 
-def test_none_of_these_stands_in_the_settings(tmp_path: Path) -> None:
-    folder = folder_with(tmp_path, "t1,fall.csv,40,2.7,1,,,")
-    (folder / "experiment.yaml").write_text("frames_used: 3:9\n")
-    with pytest.raises(ExperimentError):
-        read_experiment(folder)
-
-
 @pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
 def test_either_of_two_point_masses_of_a_real_project() -> None:
     path = Path(REAL) / "falling_cups" / "cups.trk"
