@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -137,6 +138,12 @@ def _explore(
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    commands = {"setup": _setup, "track": _track, "check": _check, "run": _run, "explore": _explore}
+    commands: dict[str, Callable[..., None]] = {
+        "setup": _setup,
+        "track": _track,
+        "check": _check,
+        "run": _run,
+        "explore": _explore,
+    }
     for name, command in commands.items():
         app.command(name, rich_help_panel=START)(command)
