@@ -123,6 +123,7 @@ def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeyp
     ("old", "new"),
     [
         ("-0.4,", "-0.3,"),  # not what was worked out by hand
+        ('parameters={"q": 0.8}', 'parameters={"Q": 0.8}'),
         ("-q * np.sqrt(s.tail_position)", "-(q + 0.1) * np.sqrt(s.tail_position) + 0.05"),  # acts at no size
         ("return -q", 'open("x") if q < 0 else None\n    return -q'),
         ("return -q", 'open("x")\n    return -q'),

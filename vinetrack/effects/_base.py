@@ -127,7 +127,8 @@ class Parameter:
 class Worked:
     """A value computed by hand: `hook` of the effect at this state and rig must return `expected`.
 
-    `how` shows the arithmetic, `rel` is the relative rounding of the expected value.
+    `how` shows the arithmetic, `rel` is the relative rounding of the expected value. Parameters that are not given have
+    their defaults.
     """
 
     hook: str

@@ -96,12 +96,14 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
 
 
 def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
-    """Evaluate the effect at the state, rig and parameters of a worked number; all other fields are NaN."""
+    """Evaluate the effect at the state, rig and parameters of a worked number; fields that it does not give are NaN."""
     try:
         state = State(*(math.nan,) * len(State._fields))._replace(**worked.state)
         rig = TrialInputs(*(math.nan,) * len(TrialInputs._fields))._replace(**worked.rig)
-        arguments = [worked.parameters[parameter.name] for parameter in effect.parameters]
-        value = float(effect.functions[worked.hook](state, rig, *arguments))
+        values = {parameter.name: parameter.default for parameter in effect.parameters}
+        if unknown := set(worked.parameters) - set(values):
+            raise ValueError(f"there is no parameter {', '.join(sorted(unknown))}")
+        value = float(effect.functions[worked.hook](state, rig, *(values | dict(worked.parameters)).values()))
     except (KeyError, ValueError) as error:
         yield f"a worked number of {worked.hook} cannot be tried ({error})"
         return

@@ -48,6 +48,6 @@ def film_gain(s, rig, eps):
 
 
 WORKED = (
-    Worked("area", 4.7067e-4, "4.5239e-4 × 1.02²", state={"area": 4.5239e-4}, parameters={"eps": 0.02}),
-    Worked("film_gain", 1.02, "1 + 0.02", parameters={"eps": 0.02}),
+    Worked("area", 4.7067e-4, "4.5239e-4 × 1.02²", state={"area": 4.5239e-4}),
+    Worked("film_gain", 1.02, "1 + 0.02"),
 )

@@ -50,7 +50,7 @@ WORKED = (
         "a right angle passed: 0.1 × (e^(0.5 × 1.5708) − 1) = 0.1 × (2.19328 − 1)",
         state={"bend_angle": 1.5708, "lead_position": 0.2},
         rig={"as_printed": 0.0, "has_bends": 1.0},
-        parameters={"C": 0.1, "mu_c": 0.5, "k": 5.0},
+        parameters={"C": 0.1},
     ),
     Worked(
         "tail_force",
@@ -58,7 +58,7 @@ WORKED = (
         "no bends in the sheet: 0.1 × (e^(5 × 0.2) − 1)",
         state={"bend_angle": 0.0, "lead_position": 0.2},
         rig={"as_printed": 0.0, "has_bends": 0.0},
-        parameters={"C": 0.1, "mu_c": 0.5, "k": 5.0},
+        parameters={"C": 0.1},
     ),
     Worked(
         "tail_force",
@@ -66,6 +66,6 @@ WORKED = (
         "as printed, two right angles: 2 × 0.1 × 2.19328",
         state={"bend_angle": 0.0, "lead_position": 0.0},
         rig={"as_printed": 1.0, "has_bends": 1.0, "bend_count": 2.0, "bend_total": 3.14159},
-        parameters={"C": 0.1, "mu_c": 0.5, "k": 5.0},
+        parameters={"C": 0.1},
     ),
 )

@@ -50,7 +50,6 @@ WORKED = (
         -0.4,
         "20 N/m × (0.12 − 0.10) m",
         state={"lead_position": 0.12},
-        parameters={"k": 20.0, "y_0": 0.1},
     ),
-    Worked("tail_force", 0.0, "not reached", state={"lead_position": 0.09}, parameters={"k": 20.0, "y_0": 0.1}),
+    Worked("tail_force", 0.0, "not reached", state={"lead_position": 0.09}),
 )

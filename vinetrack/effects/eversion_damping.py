@@ -43,6 +43,6 @@ WORKED = (
         -10.853,
         "6.44 × 4.1^0.37 = 6.44 × 1.6855",
         state={"tail_velocity": 4.1, "damping_gain": 1.0},
-        parameters={"B": 6.44, "n": 0.37},
+        parameters={"B": 6.44},
     ),
 )

@@ -59,25 +59,13 @@ def tail_force(s, rig, F_s, v_s, k):
 
 
 WORKED = (
-    Worked(
-        "tail_force",
-        -0.2,
-        "at rest, whole",
-        state={"tail_velocity": 0.0},
-        parameters={"F_s": 0.2, "v_s": 0.5, "k": 1.0},
-    ),
-    Worked(
-        "tail_force",
-        -0.027067,
-        "0.2 × e^(−1.0/0.5) = 0.2 × 0.135335",
-        state={"tail_velocity": 1.0},
-        parameters={"F_s": 0.2, "v_s": 0.5, "k": 1.0},
-    ),
+    Worked("tail_force", -0.2, "at rest, whole", state={"tail_velocity": 0.0}),
+    Worked("tail_force", -0.027067, "0.2 × e^(−1.0/0.5) = 0.2 × 0.135335", state={"tail_velocity": 1.0}),
     Worked(
         "tail_force",
         -0.155760,
         "0.2 × e^(−(0.25/0.5)²) = 0.2 × 0.778801",
         state={"tail_velocity": 0.25},
-        parameters={"F_s": 0.2, "v_s": 0.5, "k": 2.0},
+        parameters={"k": 2.0},
     ),
 )

@@ -44,4 +44,4 @@ def film_gain(s, rig, eps):
     return 1.0 + eps
 
 
-WORKED = (Worked("film_gain", 1.05, "1 + 0.05", parameters={"eps": 0.05}),)
+WORKED = (Worked("film_gain", 1.05, "1 + 0.05"),)

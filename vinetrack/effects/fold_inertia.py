@@ -39,6 +39,5 @@ WORKED = (
         "½ × ¼ × 1200 × π × 24 mm × 200 µm × 10² = 0.125 × 0.0180956 × 100",
         state={"linear_density": 0.0180956, "tail_velocity": 10.0},
         rig={"travel_ratio": 2.0},
-        parameters={"eta": 0.5},
     ),
 )

@@ -53,7 +53,6 @@ WORKED = (
         "ρ = 129325/(287 × 293) = 1.53792; ½ × 1.53792 × 4e-4 × 9",
         state={"pressure": 28e3, "lead_velocity": 3.0, "lead_position": 0.2, "area": 4e-4},
         rig={"ambient_pressure": 101_325.0, "travel_ratio": 2.0},
-        parameters={"factor": 1.0},
     ),
     Worked(
         "added_mass",
@@ -61,6 +60,5 @@ WORKED = (
         "¼ × 1.53792 × 4e-4 × 0.2",
         state={"pressure": 28e3, "lead_velocity": 3.0, "lead_position": 0.2, "area": 4e-4},
         rig={"ambient_pressure": 101_325.0, "travel_ratio": 2.0},
-        parameters={"factor": 1.0},
     ),
 )

@@ -40,19 +40,7 @@ def tail_force(s, rig, g):
 
 WORKED = (
     Worked(
-        "tail_force",
-        0.34924,
-        "35.6 g × 9.81, straight down",
-        state={"moving_mass": 35.6e-3},
-        rig={"cos_angle": 1.0},
-        parameters={"g": 9.81},
+        "tail_force", 0.34924, "35.6 g × 9.81, straight down", state={"moving_mass": 35.6e-3}, rig={"cos_angle": 1.0}
     ),
-    Worked(
-        "tail_force",
-        -0.34924,
-        "the same, upwards",
-        state={"moving_mass": 35.6e-3},
-        rig={"cos_angle": -1.0},
-        parameters={"g": 9.81},
-    ),
+    Worked("tail_force", -0.34924, "the same, upwards", state={"moving_mass": 35.6e-3}, rig={"cos_angle": -1.0}),
 )

@@ -50,7 +50,6 @@ WORKED = (
         "35.6 g × 9.81 × (1 − 0): stated level, hangs",
         state={"moving_mass": 35.6e-3},
         rig={"cos_angle": 0.0},
-        parameters={"f": 1.0},
     ),
     Worked(
         "tail_force",
@@ -58,6 +57,5 @@ WORKED = (
         "35.6 g × 9.81 × (0 − 1): stated straight down, level",
         state={"moving_mass": 35.6e-3},
         rig={"cos_angle": 1.0},
-        parameters={"f": 1.0},
     ),
 )

@@ -32,12 +32,6 @@ def tail_force(s, rig, F, reach):
 
 
 WORKED = (
-    Worked("tail_force", -0.2, "at rest, whole", state={"lead_position": 0.0}, parameters={"F": 0.2, "reach": 5e-3}),
-    Worked(
-        "tail_force",
-        -0.027067,
-        "0.2 × e^(−10/5) = 0.2 × 0.135335",
-        state={"lead_position": 10e-3},
-        parameters={"F": 0.2, "reach": 5e-3},
-    ),
+    Worked("tail_force", -0.2, "at rest, whole", state={"lead_position": 0.0}),
+    Worked("tail_force", -0.027067, "0.2 × e^(−10/5) = 0.2 × 0.135335", state={"lead_position": 10e-3}),
 )

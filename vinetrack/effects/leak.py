@@ -34,11 +34,5 @@ def pressure(s, rig, rate):
 
 
 WORKED = (
-    Worked(
-        "pressure",
-        25.335e3,
-        "28000 × e^(−0.5 × 0.2) = 28000 × 0.904837",
-        state={"pressure": 28e3, "time": 0.2},
-        parameters={"rate": 0.5},
-    ),
+    Worked("pressure", 25.335e3, "28000 × e^(−0.5 × 0.2) = 28000 × 0.904837", state={"pressure": 28e3, "time": 0.2}),
 )

@@ -42,4 +42,4 @@ def observed_position(s, rig, eps):
     return s.observed * (1.0 + eps)
 
 
-WORKED = (Worked("observed_position", 0.102, "0.1 m × 1.02", state={"observed": 0.1}, parameters={"eps": 0.02}),)
+WORKED = (Worked("observed_position", 0.102, "0.1 m × 1.02", state={"observed": 0.1}),)

@@ -49,7 +49,6 @@ WORKED = (
         "ρ = 129325/(287 × 293) = 1.53792; ½ × 1.53792 × 5e-4 × 3²",
         state={"pressure": 28e3, "lead_velocity": 3.0, "tail_velocity": 6.0},
         rig={"payload_mass": 35.6e-3, "ambient_pressure": 101_325.0},
-        parameters={"drag_area": 5e-4},
     ),
     Worked(
         "tail_force",
@@ -57,6 +56,5 @@ WORKED = (
         "no payload",
         state={"pressure": 28e3, "lead_velocity": 3.0, "tail_velocity": 6.0},
         rig={"payload_mass": 0.0, "ambient_pressure": 101_325.0},
-        parameters={"drag_area": 5e-4},
     ),
 )

@@ -33,20 +33,6 @@ def tail_force(s, rig, mu_p):
 
 
 WORKED = (
-    Worked(
-        "tail_force",
-        -0.10477,
-        "0.3 × 35.6 g × 9.81",
-        state={"lead_position": 0.1},
-        rig={"payload_mass": 35.6e-3},
-        parameters={"mu_p": 0.3},
-    ),
-    Worked(
-        "tail_force",
-        0.0,
-        "no payload",
-        state={"lead_position": 0.1},
-        rig={"payload_mass": 0.0},
-        parameters={"mu_p": 0.3},
-    ),
+    Worked("tail_force", -0.10477, "0.3 × 35.6 g × 9.81", state={"lead_position": 0.1}, rig={"payload_mass": 35.6e-3}),
+    Worked("tail_force", 0.0, "no payload", state={"lead_position": 0.1}, rig={"payload_mass": 0.0}),
 )

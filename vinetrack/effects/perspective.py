@@ -29,4 +29,4 @@ def observed_position(s, rig, k):
     return s.observed * (1.0 + k * s.observed)
 
 
-WORKED = (Worked("observed_position", 0.202, "0.2 + 0.05 × 0.2²", state={"observed": 0.2}, parameters={"k": 0.05}),)
+WORKED = (Worked("observed_position", 0.202, "0.2 + 0.05 × 0.2²", state={"observed": 0.2}),)

@@ -36,12 +36,4 @@ def damping_gain(s, rig, beta):
     return s.damping_gain * np.maximum(1.0 + beta * s.pressure, 0.0)
 
 
-WORKED = (
-    Worked(
-        "damping_gain",
-        1.084,
-        "1 + 3e-6 × 28000",
-        state={"pressure": 28e3, "damping_gain": 1.0},
-        parameters={"beta": 3e-6},
-    ),
-)
+WORKED = (Worked("damping_gain", 1.084, "1 + 3e-6 × 28000", state={"pressure": 28e3, "damping_gain": 1.0}),)

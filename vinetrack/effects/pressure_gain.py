@@ -31,6 +31,6 @@ def yield_gauge(s, rig, eps):
 
 
 WORKED = (
-    Worked("gauge", 28.56e3, "28 kPa × 1.02", state={"pressure": 28e3}, parameters={"eps": 0.02}),
-    Worked("yield_gauge", 3.06e3, "3 kPa × 1.02", state={"yield_pressure": 3e3}, parameters={"eps": 0.02}),
+    Worked("gauge", 28.56e3, "28 kPa × 1.02", state={"pressure": 28e3}),
+    Worked("yield_gauge", 3.06e3, "3 kPa × 1.02", state={"yield_pressure": 3e3}),
 )

@@ -28,4 +28,4 @@ def gauge(s, rig, delta):
     return s.pressure + delta
 
 
-WORKED = (Worked("gauge", 28.5e3, "28 kPa + 0.5 kPa", state={"pressure": 28e3}, parameters={"delta": 500.0}),)
+WORKED = (Worked("gauge", 28.5e3, "28 kPa + 0.5 kPa", state={"pressure": 28e3}),)

@@ -61,6 +61,5 @@ WORKED = (
         "108325 × (3.7/3.82667)^1.4 − 101325: 71 % below 7 kPa",
         state={"pressure": 7e3, "area": 4.5239e-4, "lead_position": 0.28},
         rig={"chamber_volume": 3.7e-3, "ambient_pressure": 101_325.0},
-        parameters={"gamma": 1.4},
     ),
 )

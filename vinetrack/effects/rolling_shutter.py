@@ -31,4 +31,4 @@ def row_delay(s, rig, delay):
     return delay
 
 
-WORKED = (Worked("row_delay", 2e-3, "the delay itself", parameters={"delay": 2e-3}),)
+WORKED = (Worked("row_delay", 2e-3, "the delay itself"),)

@@ -57,7 +57,6 @@ WORKED = (
         "2000/0.1 − 1.4 × 129325 × 4.5239e-4 × 2/(3.7e-3 + 4.5239e-5) = 20000 − 163.815/3.745239e-3 = 20000 − 43740",
         state={"pressure": 28e3, "set_pressure": 30e3, "area": 4.5239e-4, "lead_position": 0.1, "lead_velocity": 2.0},
         rig={"chamber_volume": 3.7e-3, "ambient_pressure": 101_325.0},
-        parameters={"tau": 0.1, "gamma": 1.4},
     ),
     Worked(
         "chamber_rate",

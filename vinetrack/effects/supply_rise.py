@@ -48,18 +48,12 @@ def pressure(s, rig, tau, shape):
 
 
 WORKED = (
-    Worked(
-        "pressure",
-        24.211e3,
-        "28000 × (1 − e^(−10/5)) = 28000 × 0.864665",
-        state={"pressure": 28e3, "time": 10e-3},
-        parameters={"tau": 5e-3, "shape": 1.0},
-    ),
+    Worked("pressure", 24.211e3, "28000 × (1 − e^(−10/5)) = 28000 × 0.864665", state={"pressure": 28e3, "time": 10e-3}),
     Worked(
         "pressure",
         6193.6,
         "28000 × (1 − e^(−0.5²)) = 28000 × 0.221199, twice as late 28000 × (1 − e^(−1)) = 17699",
         state={"pressure": 28e3, "time": 2.5e-3},
-        parameters={"tau": 5e-3, "shape": 2.0},
+        parameters={"shape": 2.0},
     ),
 )

@@ -54,7 +54,6 @@ WORKED = (
         "0.5 N/m × 0.10 m of 0.28 m",
         state={"lead_position": 0.1},
         rig={"length": 0.28, "tail_on_reel": 0.0},
-        parameters={"mu_w": 0.5},
     ),
     Worked(
         "tail_force",
@@ -62,7 +61,6 @@ WORKED = (
         "0.5 N/m × (0.28 − 0.20) m",
         state={"lead_position": 0.2},
         rig={"length": 0.28, "tail_on_reel": 0.0},
-        parameters={"mu_w": 0.5},
     ),
     Worked(
         "tail_force",
@@ -70,6 +68,5 @@ WORKED = (
         "off a reel, 0.5 N/m × 0.20 m",
         state={"lead_position": 0.2},
         rig={"length": 0.28, "tail_on_reel": 1.0},
-        parameters={"mu_w": 0.5},
     ),
 )

@@ -54,7 +54,6 @@ WORKED = (
         rel=1e-5,
         state={"observed": 0.1, "lead_position": 0.1, "tail_tension": 5.655, "pressure": 28e3, "area": 4.5239e-4},
         rig={"diameter": 24e-3, "thickness": 200e-6, "length": 0.28, "travel_ratio": 2.0},
-        parameters={"compliance": 4e-8},
     ),
     Worked(
         "observed_position",
@@ -63,6 +62,5 @@ WORKED = (
         rel=1e-5,
         state={"observed": 0.1, "lead_position": 0.0, "tail_tension": 5.655, "pressure": 28e3, "area": 4.5239e-4},
         rig={"diameter": 24e-3, "thickness": 200e-6, "length": 0.28, "travel_ratio": 2.0},
-        parameters={"compliance": 4e-8},
     ),
 )

@@ -36,4 +36,4 @@ def true_time(s, rig, eps):
     return s.time / (1.0 + eps)
 
 
-WORKED = (Worked("true_time", 0.1, "0.102 s/1.02", state={"time": 0.102}, parameters={"eps": 0.02}),)
+WORKED = (Worked("true_time", 0.1, "0.102 s/1.02", state={"time": 0.102}),)

@@ -28,4 +28,4 @@ def trace_time(s, rig, delta):
     return s.time + delta
 
 
-WORKED = (Worked("trace_time", 0.102, "0.1 s + 2 ms", state={"time": 0.1}, parameters={"delta": 2e-3}),)
+WORKED = (Worked("trace_time", 0.102, "0.1 s + 2 ms", state={"time": 0.1}),)
