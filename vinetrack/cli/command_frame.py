@@ -76,21 +76,7 @@ def settings_from_json(text: str) -> RunSettings:
 
 @contextmanager
 def errors_as_sentences(log: Path | None) -> Iterator[None]:
-    """Report every exception in a sentence and exit with status 1; tracebacks go to the log.
-
-    Parameters
-    ----------
-    log : file for messages and tracebacks; None for none.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    typer.Exit
-        With status 1, after any exception.
-    """
+    """Report every exception in a sentence and exit with status 1; messages and tracebacks go to the log."""
     from vinetrack.core.problems import ExperimentError, UserError, format_problems
     from vinetrack.core.tables import is_disk_full
 

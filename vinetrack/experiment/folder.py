@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, Problem
+from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import CORRECTION_ACTIONS, IMAGES, Correction, Floats, Trial
 from vinetrack.core.tables import (
     Table,
@@ -41,6 +41,7 @@ from vinetrack.experiment.sheet import (
     find_missing,
     make_trial,
     read_row,
+    similar_entry,
     unknown_columns,
 )
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
@@ -506,19 +507,7 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
             return []
     except (FileNotFoundError, ValueError):
         code, (message, remedy) = "no_file", missing_file_message(path)
-        remedy = remedy if path.is_symlink() else _missing_video_remedy(path, named_videos)
+        remedy = remedy if path.is_symlink() else similar_entry(path, named_videos) or remedy
     except OSError as error:
         code, message = "unreadable", f"cannot be read: {error.strerror}"
     return [Problem(code, message, "video", value=path.name, remedy=remedy)]
-
-
-def _missing_video_remedy(path: Path, named_videos: Set[Path]) -> str:
-    """Remedy for a missing recording: a similar name in its folder that no other trial uses, if there is one."""
-    try:
-        names = sorted(entry.name for entry in path.parent.iterdir() if entry not in named_videos)
-    except (OSError, ValueError):
-        names = []
-    close = difflib.get_close_matches(path.name.lower(), [name.lower() for name in names], 1, CLOSE_NAME_RATIO)
-    if not close:
-        return "check the path and its upper and lower case"
-    return f"did you mean {next(name for name in names if name.lower() == close[0])}?"

@@ -5,7 +5,6 @@ Both pass the checks of a trial sheet, so that a wrong unit gets the same messag
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from vinetrack.experiment.sheet import (
     check_wall,
     make_trial,
     read_row,
+    similar_entry,
     unknown_columns,
 )
 
@@ -86,7 +86,7 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     """
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
-        remedy = _nearest(file) or f"give a folder with {SHEET}, or a sheet"
+        remedy = similar_entry(file) or f"give a folder with {SHEET}, or a sheet"
         raise ExperimentError([Problem("no_file", "does not exist", file=str(file), remedy=remedy)])
     try:
         table = read_table(file)
@@ -124,15 +124,6 @@ def _check_header(table: Table, settings: ExperimentSettings, file: str) -> list
         remedy = "give a trial sheet, one row a trial"
         raise ExperimentError([Problem("missing", message, file=file, remedy=remedy)])
     raise ExperimentError([Problem("missing", message, file=file, remedy="add what is missing"), *unknown])
-
-
-def _nearest(file: Path) -> str:
-    try:
-        names = [entry.name for entry in file.parent.iterdir()]
-    except OSError:
-        return ""
-    close = difflib.get_close_matches(file.name, names, 1, 0.6)
-    return f"did you mean {close[0]}?" if close else ""
 
 
 def _checked_rows(table: Table, settings: ExperimentSettings, needed: Sequence[str]) -> tuple[list[Row], list[Problem]]:

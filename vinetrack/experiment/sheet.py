@@ -5,14 +5,15 @@ This module never opens recordings; `vinetrack.experiment.folder` combines rows,
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.problems import Problem, did_you_mean
+from vinetrack.core.problems import CLOSE_NAME_RATIO, Problem, did_you_mean
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
 from vinetrack.core.tables import Table, TableError, safe_join
 from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, read_cell, unusual_value_hint
@@ -106,6 +107,18 @@ def unknown_columns(table: Table, file: str) -> list[Problem]:
         for name in table.columns
         if name not in COLUMNS
     ]
+
+
+def similar_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
+    """Suggest the entry of a missing file's folder with the most similar name, in upper or lower case, that is not
+    `taken`; blank if there is none.
+    """
+    try:
+        names = {entry.name.lower(): entry.name for entry in sorted(path.parent.iterdir()) if entry not in taken}
+    except (OSError, ValueError):
+        return ""
+    close = difflib.get_close_matches(path.name.lower(), names, 1, CLOSE_NAME_RATIO)
+    return f"did you mean {names[close[0]]}?" if close else ""
 
 
 def _check_name(row: Row) -> None:
