@@ -12,6 +12,14 @@ configfile: Path(workflow.basedir) / "config" / "config.yaml"
 include: "vinetrack/pipeline/Snakefile"
 
 
+onstart:  # Snakemake takes hooks from this file alone
+    begin_run_or_exit(plan)
+
+
+onerror:
+    atexit.unregister(print_report_path)
+
+
 rule everything:
     input:
         rules.all.input,

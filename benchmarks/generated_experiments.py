@@ -135,30 +135,16 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
     results : folder for its results.
     figures : whether figures are drawn and the report is written.
     """
-    from vinetrack.pipeline.diagnosis_stage import diagnose_results
-    from vinetrack.pipeline.model_stage import fit_model
-    from vinetrack.pipeline.report_stage import draw_campaign, draw_trials, write_report
-    from vinetrack.pipeline.tracks_stage import TRIAL_NOT_ANALYSED, analyse_tracks, fit_law, gather
+    from vinetrack.pipeline.stages import STAGES, Job
+    from vinetrack.pipeline.trials import TRIAL_NOT_ANALYSED
 
-    settings = run_settings(SETTINGS)
     read = read_experiment(folder)
-    stages = {
-        "tracks": lambda: analyse_tracks(read, results, settings),
-        "gather": lambda: gather(read, results, settings),
-        "damping": lambda: fit_law(results, settings.damping),
-        "model": lambda: fit_model(read, results, settings),
-        "diagnosis": lambda: diagnose_results(read, results, lambda _: None, settings),
-        "trial figures": lambda: draw_trials(read, results, settings.figures, 1),
-        "figures": lambda: draw_campaign(read, results, settings.figures),
-        "report": lambda: write_report(read, results, settings.model_dump(mode="json")),
-    }
-    for name, stage in stages.items():
-        if not figures and name in ("trial figures", "figures", "report"):
-            continue
+    job = Job(read, results, run_settings(SETTINGS))
+    for name in ("trials", "damping", "model", *(("figures", "report") if figures else ())):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                stage()
+                STAGES[name].run(job)
         except UserError:
             return []
         except Exception:

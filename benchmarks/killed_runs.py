@@ -64,7 +64,7 @@ def hashes(results: Path) -> dict[str, str]:
     return {
         path.relative_to(results).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(results.rglob("*"))
-        if path.is_file() and not {"logs", ".snakemake"} & set(path.relative_to(results).parts)
+        if path.is_file() and not {"logs", ".kept", ".snakemake"} & set(path.relative_to(results).parts)
     }
 
 

@@ -177,9 +177,8 @@ def experiment(tmp_path: Path) -> Path:
 def test_its_effect_goes_through_every_stage_and_stands_in_the_provenance(experiment: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     for arguments in (
-        ["tracks", experiment, results],
-        ["gather", experiment, results],
-        ["damping", results],
+        ["trials", experiment, results, "--settings", '{"figures": {"dpi": 50}}'],
+        ["damping", experiment, results],
         ["model", experiment, results],
         ["figures", experiment, results, "--settings", '{"figures": {"dpi": 50}}'],
         ["report", experiment, results],

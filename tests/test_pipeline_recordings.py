@@ -224,8 +224,8 @@ def plainly_filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trut
 
 def measured(folder: Path, results: Path, trial: str) -> dict[str, str]:
     """Two stages by their own commands, in this process; the row of the one trial."""
-    for arguments in (["recording", folder, trial, results], ["gather", folder, results]):
-        done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+    for stage in ("trials", "damping"):
+        done = CliRunner().invoke(app, [stage, str(folder), str(results)], catch_exceptions=False)
         assert done.exit_code == 0, done.output
     return read_rows(results / "trials.csv")[trial]
 

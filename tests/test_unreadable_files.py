@@ -68,7 +68,7 @@ def test_the_workflow_watches_readable_files_alone(vines: Path, tmp_path: Path) 
 
 
 def test_the_stage_of_tracks_fails_those_and_analyses_the_rest(vines: Path, tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["tracks", str(vines), str(tmp_path / "out")])
+    done = CliRunner().invoke(app, ["trials", str(vines), str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     rows = {name: json.loads((tmp_path / "out" / "analysed" / f"{name}.json").read_text())["row"] for name in NO_FILES}
     assert {name: row["status"] for name, row in rows.items()} == dict.fromkeys(NO_FILES, "failed")
@@ -107,7 +107,7 @@ def test_a_full_disk_is_said_as_such(vines: Path, tmp_path: Path, monkeypatch: p
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    done = CliRunner().invoke(app, ["tracks", str(vines), str(tmp_path / "out")])
+    done = CliRunner().invoke(app, ["trials", str(vines), str(tmp_path / "out")])
     assert done.exit_code == 1
     assert done.output.strip() == (
         "The disk is full: free some space and run the same command again; finished results are kept."

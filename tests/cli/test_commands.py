@@ -88,7 +88,7 @@ def test_effects_lists_every_effect_with_its_formula_and_units() -> None:
 @pytest.mark.parametrize(("settings", "status"), [("{}", 1), ("seed=3", 2), ('{"damping": {"resamples": 3}}', 1)])
 def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path, settings: str, status: int) -> None:
     """Without its input, with settings that are no JSON, with a setting out of bounds."""
-    done = run("damping", tmp_path, "--settings", settings)
+    done = run("damping", experiment(tmp_path / "v"), tmp_path, "--settings", settings)
     assert done.exit_code == status
     assert "Traceback" not in done.output
 
@@ -99,8 +99,8 @@ def test_a_fault_of_the_program_is_one_sentence_and_its_traceback_is_in_the_log(
     def break_down(*_: object) -> None:
         raise RuntimeError("the bottom fell out")
 
-    monkeypatch.setattr("vinetrack.pipeline.tracks_stage.fit_law", break_down)
-    done = run("damping", tmp_path, "--log", tmp_path / "logs" / "d.log")
+    monkeypatch.setattr("vinetrack.pipeline.trials.gather", break_down)
+    done = run("damping", experiment(tmp_path / "v"), tmp_path, "--log", tmp_path / "logs" / "d.log")
     assert done.exit_code == 1
     assert "Traceback" not in done.output
     assert "RuntimeError: the bottom fell out" in (tmp_path / "logs" / "d.log").read_text()
@@ -112,9 +112,9 @@ def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr("vinetrack.kinematics.summary.summarise_trial", break_down)
     folder = experiment(tmp_path / "v")
-    done = run("tracks", folder, tmp_path / "r", "--log", tmp_path / "t.log")
+    done = run("trials", folder, tmp_path / "r", "--log", tmp_path / "t.log")
     assert done.exit_code == 0
-    assert "1 trials, 1 failed" in run("gather", folder, tmp_path / "r").output
+    assert "1 trials, 1 failed" in run("damping", folder, tmp_path / "r").output
     assert "ZeroDivisionError: unforeseen" in (tmp_path / "t.log").read_text()
 
 
@@ -149,12 +149,9 @@ def experiment_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(experiment_commands: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("out") / "campaign"
-    for stage in (("tracks",), ("gather",), ("model",)):
-        if stage == ("model",):
-            assert run_commands("damping", folder)[0] == 0
-        code, output = run_commands(*stage, experiment_commands, folder)
+    for stage in ("trials", "damping", "model"):
+        code, output = run_commands(stage, experiment_commands, folder)
         assert code == 0, output
-    assert run_commands("diagnosis", experiment_commands, folder)[0] == 0
     (folder / "provenance.json").write_text(json.dumps({"experiment": str(experiment_commands)}))
     return folder
 
@@ -232,10 +229,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     virtual = grown(sheet_command((4,), replicates=1), 103, own=[effect_file(place)], values=values)
     experiment, results = place / "bench", place / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
-    for stage in (("tracks", experiment, results), ("gather", experiment, results), ("damping", results)):
-        code, output = run_commands(*stage)
-        assert code == 0, output
-    for stage in ("model", "diagnosis"):
+    for stage in ("trials", "damping", "model"):
         code, output = run_commands(stage, experiment, results)
         assert code == 0, output
     (results / "provenance.json").write_text(json.dumps({"experiment": str(experiment)}))

@@ -36,7 +36,7 @@ def results(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     folder = make_results(experiment, base / "results" / "vines")
     if request.param == "films":
         film(experiment, folder)
-    run("diagnosis", experiment, folder)
+    run("model", experiment, folder)
     return folder
 
 

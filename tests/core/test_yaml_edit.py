@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.yaml_document import parse_yaml, with_value
-from vinetrack.pipeline.effects_stage import save_model
+from vinetrack.experiment.folder import save_model
 
 # A key is set in place, and nothing else of the file changes.
 

@@ -16,8 +16,11 @@ import pandas as pd
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.__main__ import DEMO
 from vinetrack.laboratory.__main__ import main as grow
+from vinetrack.pipeline.model_stage import fit_model
 from vinetrack.results.folder_layout import Results
 
 DEMO_SHEET = Path(__file__).parents[2] / "data" / "demo" / "trials.csv"
@@ -54,11 +57,9 @@ def run(*arguments: object) -> str:
 
 def make_results(experiment: Path, results: Path) -> Path:
     """The results of the workflow, as far as the explorer reads them."""
-    few = ("--settings", '{"damping": {"resamples": 100}}')
-    run("tracks", experiment, results)
-    run("gather", experiment, results)
-    run("damping", results, *few)
-    run("model", experiment, results)
+    run("trials", experiment, results)
+    run("damping", experiment, results, "--settings", '{"damping": {"resamples": 100}}')
+    fit_model(read_experiment(experiment), results, run_settings({}))
     Results(results).provenance.write_text(json.dumps({"experiment": experiment.absolute().as_posix()}))
     return results
 

@@ -15,8 +15,7 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     experiment = make_experiment(folder / "demo", SMALL, SETTINGS + FEW_CANDIDATES)
     results = folder / "results" / "demo"
     make_results(experiment, results)
-    run("diagnosis", experiment, results)
-    run("figures", experiment, results, "--of", "campaign")
-    run("figures", experiment, results, "--of", "trials")
+    run("model", experiment, results)
+    run("figures", experiment, results)
     run("report", experiment, results)
     return results

@@ -46,11 +46,12 @@ def small_part(folder: Path, published: str) -> Path:
 def beside(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Results folder, and what the command said."""
     folder = tmp_path_factory.mktemp("paper")
-    experiment, results = small_part(folder / "part", "published: simulated\n"), folder / "results"
+    experiment, results = (
+        small_part(folder / "part", "published: simulated\ncandidates: [air_drag]\n"),
+        folder / "results",
+    )
     settings = ("--settings", '{"damping": {"resamples": 100}, "figures": {"formats": ["svg"], "dpi": 60}}')
-    for stage in ("tracks", "gather", "model", "paper"):
-        if stage == "model":
-            assert run("damping", results, *settings).exit_code == 0
+    for stage in ("trials", "damping", "model", "paper"):
         done = run(stage, experiment, results, *settings)
         assert done.exit_code == 0, done.output
     return results, done.output

@@ -17,22 +17,20 @@ from vinetrack.core import published
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis, Round
-from vinetrack.figures.registry import diagnosis_figures, draw
-from vinetrack.figures.style import render
-from vinetrack.inference.fit_result import BetweenTrialSpread, Number
-from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
-from vinetrack.pipeline import report_stage
-from vinetrack.pipeline.diagnosis_stage import (
+from vinetrack.figures.diagnosis_figures import (
     DiagnosisTables,
     cosines_by_rank,
     predicted_trials,
     read_diagnosis_tables,
-    sheet_contradictions,
-    with_contradictions,
     worst_condition,
 )
+from vinetrack.figures.registry import diagnosis_figures, draw, with_final_model
+from vinetrack.figures.style import render
+from vinetrack.inference.fit_result import BetweenTrialSpread, Number
+from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
+from vinetrack.pipeline import report_stage
+from vinetrack.pipeline.model_stage import sheet_contradictions, with_contradictions
 from vinetrack.pipeline.predict_stage import choose_fit
-from vinetrack.pipeline.report_stage import with_final_model
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 

@@ -105,20 +105,6 @@ def test_a_folder_of_pictures_is_one_recording(scene: Scene, tmp_path: Path) -> 
     assert done.exit_code == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("notes.txt", b"the vine grew well today\n" * 400, "a text, not a recording"),
-        ("noise.mp4", bytes(range(256)) * 40, "not a video"),
-        ("sheet.pdf", b"%PDF-1.7\n" + bytes(range(256)) * 40, "not a video"),
-        ("empty.mp4", b"", "the file is empty"),
-    ],
-)
-def test_what_is_no_film_is_told(tmp_path: Path, name: str, content: bytes, words: str) -> None:
-    (tmp_path / name).write_bytes(content)
-    assert words in refused(tmp_path / name)
-
-
 def test_a_film_without_motion_is_told(scene: Scene, tmp_path: Path) -> None:
     still = write_video(tmp_path / "still.mp4", np.repeat(scene.frames[:1], 40, axis=0))
     assert refused(still, "--out", tmp_path / "out") == "still.mp4: nothing moves in the picture"

@@ -25,7 +25,7 @@ from vinetrack.video.frames import RecordingError, inspect_recording, read_frame
 from vinetrack.video.point_quality import (
     PointQuality,
     calibrated_sigma,
-    is_grown,
+    ending_of,
     moving_range,
 )
 from vinetrack.video.small_pictures import SmallPictures
@@ -230,7 +230,10 @@ def quality(first_moving: int = 10, last_moving: int = 49) -> PointQuality:
 
 @pytest.mark.parametrize(("length_px", "complete"), [(400, True), (405, True), (395, True), (430, False), (370, False)])
 def test_travel_is_compared_with_the_length(length_px: float, complete: bool) -> None:
-    assert is_grown(EDGE_PX, quality(), length_px) is complete
+    luma = np.zeros((EDGE_PX.size, 4, 4), np.uint8)
+    ending = ending_of(luma, quality(), EDGE_PX, "a.mp4", np.arange(EDGE_PX.size), whole=True, place=0)
+    assert ending.remarks
+    assert (ending.notes(length_px) == []) is complete
 
 
 # ---- a tip that is lit differently from the tube behind it, tracked where film looks like background ----

@@ -17,7 +17,7 @@ from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import Tube, preset
-from vinetrack.pipeline.recordings_stage import analyse_recording
+from vinetrack.pipeline.trials import analyse_trials
 from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video import survey as module
 from vinetrack.video.axis import Axis
@@ -30,7 +30,6 @@ from vinetrack.video.survey import (
     direction_notes,
     measure_recording,
     size_problems,
-    survey,
     tracked_facts,
 )
 from vinetrack.video.track import track_recording
@@ -61,7 +60,7 @@ def check(folder: Path, *videos: str, settings: str = SCALE) -> list[Problem]:
     rows = [f"t{i},{video},24,200,280,28,3" for i, video in enumerate(videos)]
     (folder / "trials.csv").write_text("\n".join([HEADER, *rows, ""]))
     (folder / "experiment.yaml").write_text(settings)
-    return check_experiment(folder, survey)
+    return check_experiment(folder, Surveyor())
 
 
 def test_a_sound_recording_and_scale_give_no_problem(folder: Path) -> None:
@@ -320,7 +319,7 @@ def test_a_scale_a_fifth_off_is_kept_with_the_trial_for_the_verdict(clip: Path, 
     columns = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,mm_per_px,capture_fps"
     for name, scale in (("right", SCALE_MM), ("off", 0.8 * SCALE_MM)):
         (folder / "trials.csv").write_text(f"{columns}\n{name},a.mp4,12,100,140,60,3,{scale},{FPS}\n")
-        analyse_recording(read_experiment(folder), name, tmp_path / "out", run_settings({}))
+        analyse_trials(read_experiment(folder), tmp_path / "out", run_settings({}))
     noted = {name: read_json(Results(tmp_path / "out").analysed(name)) for name in ("right", "off")}
     assert (noted["right"]["contradictions"], noted["right"]["row"]["status"]) == ([], "ok")
     (entry,) = noted["off"]["contradictions"]

@@ -1,4 +1,4 @@
-"""Commands of the diagnosis: `diagnose`, `add` and `propose`, and the stage `diagnosis`."""
+"""Commands of the diagnosis: `diagnose`, `add` and `propose`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,11 @@ import typer
 
 from vinetrack.cli.command_frame import (
     MORE,
-    ExperimentPath,
     JsonFile,
     LogPath,
     ResultsPath,
-    SettingsText,
     errors_as_sentences,
     print_result,
-    settings_from_json,
 )
 from vinetrack.core.problems import UserError
 
@@ -36,7 +33,6 @@ def register(app: typer.Typer) -> None:
     app.command("diagnose", rich_help_panel=MORE)(_diagnose)
     app.command("add", rich_help_panel=MORE)(_add)
     app.command("propose", rich_help_panel=MORE)(_propose)
-    app.command("diagnosis", rich_help_panel="Stages of the workflow")(_diagnosis)
 
 
 def _diagnose(
@@ -54,12 +50,10 @@ def _diagnose(
         from vinetrack.diagnosis.diagnose import diagnose
         from vinetrack.pipeline.workflow import find_experiment
 
-        with _progress_line() as report:
+        with progress_line() as report:
             if (target / PROVENANCE).exists():
-                from vinetrack.pipeline.diagnosis_stage import diagnose_pairs, write_diagnosis
-                from vinetrack.pipeline.effects_stage import read_source_experiment
-                from vinetrack.pipeline.model_stage import measured_trials
-                from vinetrack.results.folder_layout import Results
+                from vinetrack.pipeline.model_stage import diagnose_pairs, write_diagnosis
+                from vinetrack.results.folder_layout import Results, measured_trials, read_source_experiment
 
                 read = read_source_experiment(target, experiment)
                 diagnosis = diagnose_pairs(read, measured_trials(read, Results(target))[0], report)
@@ -80,8 +74,8 @@ def _add(
 ) -> None:
     """Add an effect to the model, refit, and show the error before and after."""
     with errors_as_sentences(log):
-        from vinetrack.pipeline.diagnosis_stage import add_effect
-        from vinetrack.pipeline.effects_stage import read_source_experiment
+        from vinetrack.pipeline.model_stage import add_effect
+        from vinetrack.results.folder_layout import read_source_experiment
 
         read = read_source_experiment(results, experiment)
         own_file = Path(effect) if effect.endswith(".py") else None
@@ -89,10 +83,10 @@ def _add(
             raise UserError(
                 f"{effect}: to save the model, move the file into {read.folder} first; an experiment is one folder."
             )
-        with _progress_line() as report:
+        with progress_line() as report:
             lines = add_effect(read, results, effect, report)
         if save:
-            from vinetrack.pipeline.effects_stage import save_model
+            from vinetrack.experiment.folder import save_model
             from vinetrack.pipeline.workflow import command_for_results
 
             name = effect if own_file is None else own_file.stem
@@ -110,32 +104,13 @@ def _propose(
 ) -> None:
     """Write the force law that explains best what no known effect explains, as an effect file of your own."""
     with errors_as_sentences(log):
-        from vinetrack.pipeline.effects_stage import propose_effect, read_source_experiment
+        from vinetrack.pipeline.effects_stage import propose_effect
+        from vinetrack.results.folder_layout import read_source_experiment
 
-        with _progress_line() as report:
+        with progress_line() as report:
             proposal = propose_effect(read_source_experiment(results, experiment), results, to, report)
         lines, files = list(proposal.lines), [path.as_posix() for path in proposal.files]
         print_result(lines, {"lines": lines, "files": files}, json_file)
-
-
-def _diagnosis(
-    experiment: ExperimentPath,
-    results: ResultsPath,
-    settings: SettingsText = "{}",
-    log: LogPath = None,
-) -> None:
-    """Diagnose what the model lacks: diagnosis.json, ladder.csv and the folder diagnosis."""
-    with errors_as_sentences(log):
-        from vinetrack.experiment.folder import read_experiment
-        from vinetrack.pipeline.diagnosis_stage import diagnose_results, diagnosis_lines
-        from vinetrack.pipeline.workflow import find_experiment
-
-        with _progress_line() as report:
-            diagnose_results(
-                read_experiment(find_experiment(experiment)), results, report, settings_from_json(settings)
-            )
-        for line in diagnosis_lines(results):
-            typer.echo(line)
 
 
 def _tracks_only(folder: Path) -> Experiment:
@@ -153,7 +128,7 @@ def _tracks_only(folder: Path) -> Experiment:
 
 
 @contextmanager
-def _progress_line() -> Iterator[Callable[[str], None]]:
+def progress_line() -> Iterator[Callable[[str], None]]:
     """Show the current step on one line of a terminal, which is erased at the end; print nothing elsewhere."""
     on_terminal = sys.stderr.isatty()
 

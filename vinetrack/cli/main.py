@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,10 +29,12 @@ from vinetrack.cli.command_frame import (
     print_result,
     settings_from_json,
 )
+from vinetrack.cli.diagnose_commands import progress_line
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.planning_commands import register as register_planning
 from vinetrack.cli.start_commands import register as register_start
 from vinetrack.core.local_page import THREAD_PREFIX
+from vinetrack.pipeline.stages import STAGES, Job, Stage
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -46,7 +49,10 @@ app = typer.Typer(
 )
 
 TrialNames = Annotated[
-    str | None, typer.Option("--trials", help="Names of the trials, a JSON list; all by default.", show_default=False)
+    str | None,
+    typer.Option(
+        "--trials", help="Names of the trials, a JSON list; all by default, and if it is empty.", show_default=False
+    ),
 ]
 Threads = Annotated[int, typer.Option("--threads", min=1, help="Processes to use.")]
 
@@ -165,163 +171,42 @@ def _overlay(
         print_result([f"Clip: {path}"], {"clip": path}, json_file)
 
 
-@app.command("overlays", rich_help_panel="Stages of the workflow")
-def _overlays(
-    experiment: ExperimentPath,
-    results: ResultsPath,
-    settings: SettingsText = "{}",
-    threads: Threads = 1,
-    log: LogPath = None,
-) -> None:
-    """Write clips of the recordings that the settings choose, with tracked and modelled edges."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.overlays_stage import draw_overlays
-
-        for line in draw_overlays(_read(experiment), results, settings_from_json(settings).overlays, threads):
-            typer.echo(f"  {line}")
-
-
 register_diagnose(app)
 register_planning(app)
 
 
-@app.command("recording", rich_help_panel="Stages of the workflow")
-def _recording(
-    experiment: ExperimentPath,
-    trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
-    results: ResultsPath,
-    settings: SettingsText = "{}",
-    log: LogPath = None,
-) -> None:
-    """Analyse one recording: track, kinematics and strip figure."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.recordings_stage import analyse_recording
+def _stage_command(stage: Stage) -> Callable[..., None]:
+    def command(
+        experiment: ExperimentPath,
+        results: ResultsPath,
+        trials: TrialNames = None,
+        settings: SettingsText = "{}",
+        threads: Threads = 1,
+        log: LogPath = None,
+    ) -> None:
+        from vinetrack.experiment.folder import read_experiment
+        from vinetrack.pipeline.run_stage import RUN
+        from vinetrack.pipeline.workflow import find_experiment
 
-        read = _read(experiment)
-        if trial not in [filmed.name for filmed in read.trials if filmed.video is not None]:
-            raise typer.BadParameter(f"{trial!r} is not a trial with a recording in {experiment}", param_hint="TRIAL")
-        with activity_sign(f"tracking {trial}", log):
-            outcome = analyse_recording(read, trial, results, settings_from_json(settings))
-        typer.echo(outcome)
-
-
-@app.command("tracks", rich_help_panel="Stages of the workflow")
-def _tracks(
-    experiment: ExperimentPath,
-    results: ResultsPath,
-    trials: TrialNames = None,
-    settings: SettingsText = "{}",
-    threads: Threads = 1,
-    log: LogPath = None,
-) -> None:
-    """Analyse trials that are tracks: tracks, kinematics and steady windows."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.tracks_stage import analyse_tracks
-
-        read = _read(experiment)
-        failed = analyse_tracks(read, results, settings_from_json(settings), threads, _trial_names(trials, read))
-        for line in failed[:10]:
-            typer.echo(f"  {line}")
-
-
-@app.command("gather", rich_help_panel="Stages of the workflow")
-def _gather(
-    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
-) -> None:
-    """Gather the results of all trials in trials.csv, conditions.csv, steady.csv and damping_points.csv."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.tracks_stage import gather as gather_trials
-
-        table = gather_trials(_read(experiment), results, settings_from_json(settings))
-        typer.echo(f"{len(table)} trials, {int((table['status'] == 'failed').sum())} failed.")
-
-
-@app.command("damping", rich_help_panel="Stages of the workflow")
-def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
-    """Fit the damping law to the steady points: damping.json."""
-    with errors_as_sentences(log):
-        from vinetrack.narrative.diagnosis_text import damping_headline
-        from vinetrack.pipeline.tracks_stage import fit_law
-
-        with activity_sign("fitting the damping law, with bootstrap", log):
-            law = fit_law(results, settings_from_json(settings).damping)
-        typer.echo(damping_headline(law))
-
-
-@app.command("model", rich_help_panel="Stages of the workflow")
-def _model(
-    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
-) -> None:
-    """Fit the model in use to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.model_stage import comparison_lines, fit_model
-
-        with activity_sign("fitting the model", log):
-            fit_model(_read(experiment), results, settings_from_json(settings))
-        for line in comparison_lines(results):
+        with errors_as_sentences(log), progress_line() as say:
+            read = read_experiment(find_experiment(experiment))
+            in_run = RUN in os.environ
+            chosen = _trial_names(trials, read)
+            job = Job(read, results, settings_from_json(settings), chosen, threads, typer.echo if in_run else say)
+            lines = stage.run(job)
+        for line in [stage.done] if in_run else lines:
             typer.echo(line)
 
-
-@app.command("figures", rich_help_panel="Stages of the workflow")
-def _figures(
-    experiment: ExperimentPath,
-    results: ResultsPath,
-    of: Annotated[str, typer.Option("--of", help="`trials`, `campaign` or `all`.")] = "all",
-    trials: TrialNames = None,
-    settings: SettingsText = "{}",
-    threads: Threads = 1,
-    log: LogPath = None,
-) -> None:
-    """Draw the figures of the trials, of the whole experiment, or both."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.report_stage import draw_campaign, draw_trials
-
-        if of not in ("trials", "campaign", "all"):
-            raise typer.BadParameter(f"{of!r} is not one of trials, campaign, all", param_hint="--of")
-        chosen = settings_from_json(settings).figures
-        read = _read(experiment)
-        if of != "campaign":
-            draw_trials(read, results, chosen, threads, _trial_names(trials, read))
-        if of != "trials":
-            with activity_sign("drawing the experiment", log):
-                draw_campaign(read, results, chosen)
+    command.__doc__ = stage.run.__doc__
+    return command
 
 
-@app.command("paper", rich_help_panel="Stages of the workflow")
-def _paper(
-    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
-) -> None:
-    """Compare with the published numbers and figures of the paper: paper.csv."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.report_stage import compare_with_paper, draw_paper
-        from vinetrack.report.paper_section import tally
-
-        typer.echo(f"Comparison with the paper: {tally(compare_with_paper(_read(experiment), results))}")
-        draw_paper(results, settings_from_json(settings).figures)
+def _register_stages() -> None:
+    for name, stage in STAGES.items():
+        app.command(name, rich_help_panel="Stages of the workflow")(_stage_command(stage))
 
 
-@app.command("report", rich_help_panel="Stages of the workflow")
-def _report(
-    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
-) -> None:
-    """Write report.html and provenance.json."""
-    with errors_as_sentences(log):
-        from vinetrack.pipeline.report_stage import write_report
-
-        with activity_sign("writing the report", log):
-            path = write_report(
-                _read(experiment),
-                results,
-                settings_from_json(settings).model_dump(mode="json", exclude={"experiment", "results"}),
-            )
-        typer.echo(f"Report: {path}")
-
-
-def _read(folder: Path) -> Experiment:
-    from vinetrack.experiment.folder import read_experiment
-    from vinetrack.pipeline.workflow import find_experiment
-
-    return read_experiment(find_experiment(folder))
+_register_stages()
 
 
 def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
@@ -337,7 +222,7 @@ def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
         raise typer.BadParameter('is not a JSON list such as ["t1", "t2"]', param_hint="--trials")
     if unknown := [name for name in names if name not in experiment.names]:
         raise typer.BadParameter(f"{unknown[0]!r} is not a trial of the sheet", param_hint="--trials")
-    return names
+    return names or None
 
 
 if __name__ == "__main__":

@@ -108,7 +108,7 @@ def _run(
             typer.echo(line, err=json_to_terminal(json_file))
 
         paths = run_paths(folder, results)
-        check_before_run(paths.experiment, say)
+        check_before_run(paths, say)
         run_chain(paths, cores, say)
         content: dict[str, Any] = {
             "results": paths.results,

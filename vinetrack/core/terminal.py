@@ -119,13 +119,10 @@ class Progress(Generic[Item]):
         """Advance by a number of steps."""
         self._bar.update(count)
 
-    def reach(self, done: int) -> None:
-        """Set the number of completed steps."""
+    def reach(self, done: int, total: int) -> None:
+        """Set the number of completed steps, and of how many."""
+        self._bar.total = total
         self._bar.update(done - self._bar.n)
-
-    def say(self, words: str) -> None:
-        """Show the current activity after the bar."""
-        self._bar.set_postfix_str(words, refresh=False)
 
     def __iter__(self) -> Iterator[Item]:
         with self:

@@ -77,8 +77,9 @@ def diagnose(
     ladder: bool = True,
     advice: bool = True,
     report: Report = _quiet,
+    fitted: Fit | None = None,
 ) -> Diagnosis:
-    """Find what is missing from a model."""
+    """Find what is missing from a model; `fitted` is its `initial_fit` to the same tracks, if there is one already."""
     outliers_note = ""
     if isinstance(source, Fit):
         effects = candidates_of(source.model, candidates, user_effects)
@@ -96,7 +97,7 @@ def diagnose(
         pairs, dropped = correct_dropped_frames(pairs)
         outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
-        fit = initial_fit(model, pairs, effects, profile=False)
+        fit = fitted if fitted is not None and not dropped else initial_fit(model, pairs, effects, profile=False)
         fit = replace(fit, left_out={**left_out, **fit.left_out})
     result = _diagnosis_of(fit, effects, report)
     if not isinstance(source, Fit):
@@ -266,7 +267,8 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
         if name not in tests.fit.model
     ]
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
-    return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_finite_or_lowest(row.delta_chi2)))
+    gain = {id(row): row.delta_chi2 if math.isfinite(row.delta_chi2) else -math.inf for row in rows}
+    return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -gain[id(row)]))
 
 
 def _slack_candidate(hypothesis: LikelihoodRatio, step: SelectionStep) -> Candidate:
@@ -297,10 +299,6 @@ def _subset_fit_behind(step: SelectionStep, name: str) -> Remark:
         return Remark()
     behind = subset_fits[name].deviance - min(subset_fit.deviance for subset_fit in subset_fits.values())
     return remark("behind_in_one_trial_each", delta_chi2=behind) if behind > 0 else Remark()
-
-
-def _finite_or_lowest(value: float) -> float:
-    return value if math.isfinite(value) else -math.inf
 
 
 def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:

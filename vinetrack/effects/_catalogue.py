@@ -76,7 +76,11 @@ def _known() -> dict[str, str]:
 
 
 class EffectError(UserError, ValueError):
-    """A file that is not a valid effect, or a name that is not in the catalogue; the message gives the remedy."""
+    """A file that is not a valid effect, or a name that is not in the catalogue; the message gives the remedy. `effect`
+    needs `column`, which is blank, where that is the error.
+    """
+
+    effect = column = ""
 
 
 # Executed effect files, by path and module name, so that each path keeps its own functions

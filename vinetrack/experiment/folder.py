@@ -29,7 +29,9 @@ from vinetrack.core.tables import (
     missing_file_message,
     parse_number,
     read_table,
+    read_text,
     safe_join,
+    write_bytes,
 )
 from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, with_names
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units, read_experiment_settings
@@ -511,3 +513,29 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
     except OSError as error:
         code, message = "unreadable", f"cannot be read: {error.strerror}"
     return [Problem(code, message, "video", value=path.name, remedy=remedy)]
+
+
+# ------------------------------------------------------------------------------
+# Saving a model to the settings.
+
+BOM = b"\xef\xbb\xbf"
+
+
+def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
+    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
+    ends of the file are kept; other encodings are converted to UTF-8.
+    """
+    from vinetrack.core.yaml_document import with_value
+
+    path = folder / SETTINGS
+    before = path.read_bytes() if path.exists() else b""
+    text = read_text(path) if before else ""
+    listed = list(read_experiment_settings(path).effects) if before and files else []
+    new = [name for name in files if name not in listed]
+    if new:
+        text = with_value(text, "effects", [*listed, *new], path.name)
+    text = with_value(text, "model", names, path.name)
+    if b"\r\n" in before:
+        text = text.replace("\n", "\r\n")
+    write_bytes(path, (BOM if before.startswith(BOM) else b"") + text.encode("utf-8"))
+    return path

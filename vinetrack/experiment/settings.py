@@ -311,16 +311,16 @@ class FigureSettings(_Strict):
     """File formats of the figures."""
 
     formats: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
-    """Formats of every figure; svg is always among them, since the report holds it."""
+    """Formats of every figure; the report holds the svg, or the png where there is none."""
     dpi: Annotated[Count, Field(ge=50, le=1200)] = 150
     """Resolution of png files, dots per inch."""
 
     @field_validator("formats")
     @classmethod
-    def _with_svg(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+    def _some(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
         if not formats:
             raise CellError("is empty", "name at least one of png, svg, pdf", code="empty")
-        return tuple(dict.fromkeys([*formats, "svg"]))
+        return tuple(dict.fromkeys(formats))
 
 
 class OverlaySettings(_Strict):

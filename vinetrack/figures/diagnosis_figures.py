@@ -5,8 +5,12 @@ The model before the added effects is vermillion and dashed, the model after blu
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,15 +40,16 @@ from vinetrack.figures.style import (
     thinned,
     with_minus,
 )
+from vinetrack.narrative.verdict_text import estimates_text, listed_names
+from vinetrack.results.folder_layout import Results, empty_table, read_diagnosis, read_result
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Floats
+    from vinetrack.diagnosis.result import Diagnosis, Round
 
 BEFORE, AFTER = VERMILLION, BLUE
 AHEAD, BEHIND = BLUE, VERMILLION  # Colours of a vine ahead of the model, and behind it
@@ -537,3 +542,241 @@ def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list
     ax.figure.colorbar(filled, ax=ax).set_label(label)
     ax.set(xlabel=x_words, ylabel=y_words, xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.grid(visible=False)
+
+
+# ------------------------------------------------------------------------------
+# Tables of a stored diagnosis for figures and report.
+#
+# Any part may be missing: there may be no diagnosis, it may have failed, or it may have added no effect.
+
+CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
+
+
+@dataclass(frozen=True)
+class DiagnosisTables:
+    """Data of the figures; a table is empty if there is nothing to draw. `rounds` are (heading, ranking) pairs, `worst`
+    is the label of the condition that `before_after` shows, `added` the added effects in words.
+    """
+
+    ladder: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    trials: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    before_after: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    where: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    cosines: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    drift: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    missing_force: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    learned_force: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    rounds: Sequence[tuple[str, pd.DataFrame]] = ()
+    worst: str = ""
+    added: str = ""
+
+    @property
+    def ranking(self) -> pd.DataFrame:
+        """The rankings of all rounds in one table."""
+        import pandas as pd
+
+        parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(self.rounds) if len(table)]
+        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+
+
+def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
+    """Read the tables of a results folder; None if it has no diagnosis, or that failed."""
+    diagnosis = read_diagnosis(results)
+    if diagnosis is None or not diagnosis.verdict:
+        return None
+    names = ("along_position.csv", "drift_groups.csv", "missing_force.csv", "learned_force.csv")
+    located, drifting, force, learned = (_table(results.diagnosed(name)) for name in names)
+    trials = predicted_trials(results, conditions)
+    return assemble_tables(diagnosis, conditions, trials, located, drifting, force, learned)
+
+
+def assemble_tables(
+    diagnosis: Diagnosis,
+    conditions: pd.DataFrame,
+    trials: pd.DataFrame,
+    located: pd.DataFrame,
+    drifting: pd.DataFrame,
+    force: pd.DataFrame,
+    learned: pd.DataFrame | None = None,
+) -> DiagnosisTables:
+    """Assemble the data of the figures."""
+    import pandas as pd
+
+    labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
+    worst = worst_condition(trials)
+    names, matrix = cosines_by_rank(diagnosis.rounds[0])
+    return DiagnosisTables(
+        ladder=pd.DataFrame() if diagnosis.ladder is None else diagnosis.ladder,
+        trials=trials,
+        before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
+        where=_where_table(trials, labels, located),
+        cosines=_cosine_cells(names, matrix),
+        drift=drifting,
+        missing_force=force,
+        rounds=[
+            (round_heading(i, diagnosis.rounds), ranking_table(ranked)) for i, ranked in enumerate(diagnosis.rounds)
+        ],
+        worst=labels.get(worst, worst),
+        added=listed_names(diagnosis.effects),
+        learned_force=pd.DataFrame() if learned is None else learned,
+    )
+
+
+def _table(path: Path) -> pd.DataFrame:
+    return read_result(path) if path.exists() else empty_table(())
+
+
+def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
+    """Return measured and predicted positions of all trials, relative to release and origin."""
+    import pandas as pd
+
+    parts = []
+    compared: dict[str, pd.DataFrame] = {}
+    for trial, condition in zip(conditions["trial"], conditions["condition"], strict=True):
+        path = results.predictions(trial)
+        table = read_result(path) if path.exists() else None
+        if table is None or not len(table):
+            continue
+        if condition not in compared:
+            exists = bool(condition) and results.trajectories(condition).exists()
+            compared[condition] = read_result(results.trajectories(condition)) if exists else pd.DataFrame()
+        release_s, origin_m = _start(trial, table, compared[condition])
+        positions = {name: table[name] - origin_m for name in CURVE_COLUMNS[3:]}
+        time_s = table["time_s"] - release_s
+        parts.append(pd.DataFrame({"trial": trial, "condition": condition, "time_s": time_s, **positions}))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
+
+
+def _start(trial: str, table: pd.DataFrame, compared: pd.DataFrame) -> tuple[float, float]:
+    """Return release and origin of a trial: those of the comparison, which starts at the same point, else estimates."""
+    of_trial = compared[compared["trial"] == trial] if len(compared) else compared
+    time_s, position_m = float(table["time_s"].iloc[0]), float(table["lead_position_m"].iloc[0])
+    if len(of_trial) == len(table):
+        return time_s - float(of_trial["time_s"].iloc[0]), position_m - float(of_trial["lead_position_m"].iloc[0])
+    origin_m = float(np.nanmin(table["lead_position_m"]))
+    return _first_moving_s(table, origin_m), origin_m
+
+
+def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:
+    growth = table["lead_position_m"].to_numpy(dtype=float) - origin_m
+    return float(table["time_s"].iloc[int(np.argmax(growth > 0.01 * np.nanmax(growth)))])
+
+
+def worst_condition(trials: pd.DataFrame) -> str:
+    """Return the condition with the largest RMS error of the initial model; blank without predictions."""
+    if not len(trials):
+        return ""
+    errors_m = {name: rms_m(part, "model_before_m") for name, part in trials.groupby("condition", sort=False)}
+    finite_m = {name: value for name, value in errors_m.items() if math.isfinite(value)}
+    return str(max(finite_m, key=finite_m.__getitem__)) if finite_m else ""
+
+
+def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean misfit of every condition in sections of its growth, for the figure `where`. The misfit
+    of the initial model and its error are taken from the diagnosis if it contains them.
+    """
+    import pandas as pd
+
+    rows: list[dict[str, Any]] = []
+    for condition, label in labels.items():
+        members = trials[trials["condition"] == condition]
+        if len(members):
+            of_condition = located[located["condition"] == condition] if len(located) and condition else located[:0]
+            sections = _located_sections(of_condition, located) if len(of_condition) else _equal_sections(members)
+            name = {"condition": condition, "condition_label": label, "n_trials": int(members["trial"].nunique())}
+            rows += [name | row for row in _sections(members, *sections)]
+    return pd.DataFrame(rows)
+
+
+Section = tuple[float, float, float, float]  # Its ends, the mean misfit in it and the error of that, m
+
+
+def _located_sections(of_condition: pd.DataFrame, located: pd.DataFrame) -> tuple[str, float, list[Section]]:
+    """Return the sections of the diagnosis: along which column, the whole growth, and the sections."""
+    whole_m = float(located.loc[located["vine"] == of_condition["vine"].iloc[0], "to_m"].max())
+    columns = of_condition[["from_m", "to_m", "mean_residual_m", "sigma_m"]].to_numpy(dtype=float)
+    return "model_before_m", whole_m, [(low, high, mean, sigma) for low, high, mean, sigma in columns]
+
+
+def _equal_sections(members: pd.DataFrame) -> tuple[str, float, list[Section]]:
+    """Return equal sections of the measured growth, as `_located_sections`, without a misfit."""
+    from vinetrack.diagnosis.result import MAX_STRETCHES
+
+    whole_m = float(members["lead_position_m"].max())
+    edges = itertools.pairwise(np.linspace(0.0, whole_m, MAX_STRETCHES + 1))
+    return "lead_position_m", whole_m, [(low, high, math.nan, math.nan) for low, high in edges]
+
+
+def _sections(
+    members: pd.DataFrame, along: str, whole_m: float, sections: Sequence[Section]
+) -> Iterator[dict[str, float]]:
+    """Yield each section with its misfits; a misfit that is not given is the mean over the trials, with its standard
+    error.
+    """
+    for low, high, mean, sigma in sections if whole_m > 0 else ():
+        to_end = math.isnan(mean) and not high < whole_m
+        means = _mean_misfits(members, along, low, math.inf if to_end else high)
+        before, after = means["model_before_m"], means["model_after_m"]
+        if math.isnan(mean):
+            count = np.isfinite(before).sum()
+            if not count:
+                continue
+            mean = float(np.nanmean(before))
+            spread = float(np.nanstd(before, ddof=1)) if count > 1 else math.nan
+            sigma = spread / math.sqrt(members["trial"].nunique())
+        yield {
+            "growth_from": low / whole_m,
+            "growth_to": high / whole_m,
+            "misfit_before_m": mean,
+            "misfit_after_m": float(np.nanmean(after)) if np.isfinite(after).any() else math.nan,
+            "scatter_m": sigma,
+        }
+
+
+def _mean_misfits(members: pd.DataFrame, along: str, low: float, high: float) -> dict[str, np.ndarray]:
+    """Return the mean misfit of each trial, by model, where `low <= along < high`; NaN for a trial without points."""
+    chosen = members[(members["time_s"] >= 0) & (members[along] >= low) & (members[along] < high)]
+    means: dict[str, list[float]] = {"model_before_m": [], "model_after_m": []}
+    for trial in dict.fromkeys(members["trial"]):
+        part = chosen[chosen["trial"] == trial]
+        for model, values in means.items():
+            misfit = (part["lead_position_m"] - part[model]).to_numpy(dtype=float)
+            misfit = misfit[np.isfinite(misfit)]
+            values.append(float(misfit.mean()) if misfit.size else math.nan)
+    return {model: np.array(values) for model, values in means.items()}
+
+
+def round_heading(index: int, rounds: Sequence[Round]) -> str:
+    """Return the heading of a round of the diagnosis, as a question."""
+    if index == 0:
+        return "Which effect is missing from the initial model?"
+    added = [name for name in rounds[index].model if name not in rounds[0].model]
+    return f"Which is missing with {listed_names(added)} added?"
+
+
+def ranking_table(ranked: Round) -> pd.DataFrame:
+    """Return the ranking of a round as a table; Δχ² of candidates that are not testable is NaN."""
+    import pandas as pd
+
+    columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
+    rows = [
+        (c.effect, c.kind, c.status, c.delta_chi2, c.sigma, c.in_answer_set, c.plausible, estimates_text(c), c.reason)
+        for c in ranked.ranking
+    ]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def cosines_by_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
+    """Return the cosines of a round, ordered by rank, with the answer set first. Returns names, matrix."""
+    names, matrix = ranked.cosine_names, ranked.cosines
+    ranks = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(ranked.ranking)}
+    order = sorted(range(len(matrix)), key=lambda i: ranks.get(names[i], (True, len(ranked.ranking))))
+    return [names[i] for i in order], [[matrix[i][j] for j in order] for i in order]
+
+
+def _cosine_cells(names: Sequence[str], matrix: Sequence[Sequence[float]]) -> pd.DataFrame:
+    """Return the matrix of cosines as a table with one row per pair."""
+    import pandas as pd
+
+    rows = [(names[i], names[j], matrix[i][j]) for i in range(len(matrix)) for j in range(i)]
+    return pd.DataFrame(rows, columns=["effect", "other", "cosine"])

@@ -8,15 +8,23 @@ as attributes. A function without anything to show returns None, and the figure 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
 from vinetrack.figures.style import look
+from vinetrack.results.folder_layout import Results, read_diagnosis, read_json, read_result
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
+
+    from vinetrack.core.records import Trial
+    from vinetrack.figures.diagnosis_figures import DiagnosisTables
 
 # Additions to the captions of figures that show the initial model, if the diagnosis refutes it
 SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
@@ -96,3 +104,164 @@ def draw(name: str, tables: Any) -> Figure | None:
     """Draw a figure from the attributes of `tables`; None if there is nothing to show."""
     entry = all_figures()[name]
     return entry.drawing(*(getattr(tables, table) for table in entry.reads))
+
+
+# ------------------------------------------------------------------------------
+# The tables of a results folder, as figures name them.
+
+MAX_CURVE_ROWS = 6000  # Largest number of rows of the downloadable curves (chosen)
+
+
+class FigureTables:
+    """The tables of a results folder by the names that figures give them; each is read when a figure first needs it.
+    Those of the diagnosis are empty if there is none; those named `paper…` are the files of that name.
+    """
+
+    def __init__(self, folder: Path, known: tuple[Trial, ...]) -> None:
+        self.results = Results(folder)
+        self.known = known
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("paper"):
+            return read_result(self.results.folder / f"{name}.csv")
+        from vinetrack.figures.diagnosis_figures import DiagnosisTables
+
+        return getattr(self.diagnosed or DiagnosisTables(), name)
+
+    @cached_property
+    def damping(self) -> dict[str, Any]:
+        """The damping law, `damping.json`."""
+        return read_json(self.results.damping)
+
+    @cached_property
+    def scaling(self) -> dict[str, Any]:
+        """Powers of the size, `scaling.json`."""
+        return read_json(self.results.scaling)
+
+    @cached_property
+    def points(self) -> pd.DataFrame:
+        """Points of the damping law; none counts as used if there is no fit."""
+        from vinetrack.narrative.diagnosis_text import METHOD_NAMES
+
+        points = read_result(self.results.points)
+        is_fitted = any(self.damping[method]["vines"] for method in METHOD_NAMES)
+        return points.assign(used=points["used"] & is_fitted)
+
+    @cached_property
+    def trials(self) -> pd.DataFrame:
+        """`trials.csv` with pressure and label of the condition."""
+        return describe_conditions(read_result(self.results.trials), self.known)
+
+    @cached_property
+    def kinematics(self) -> dict[str, pd.DataFrame]:
+        """Motion of every trial that is not left out, by name."""
+        return {name: read_result(self.results.kinematics(name)) for name in self._names}
+
+    @property
+    def _names(self) -> list[str]:
+        return self.trials.loc[self.trials["status"] != "left_out", "trial"].tolist()
+
+    @property
+    def subpixel_px(self) -> np.ndarray:
+        """Positions of all edges within a pixel."""
+        from vinetrack.figures.overlay import subpixel_positions
+
+        return subpixel_positions({name: read_result(self.results.track(name)) for name in self._names})
+
+    @cached_property
+    def comparison(self) -> pd.DataFrame:
+        """`comparison.csv` with vines and labels; a refuted model says so in its name."""
+        compared = label_conditions(read_result(self.results.comparison), self.trials)
+        diagnosis = read_diagnosis(self.results)
+        if diagnosis is not None and diagnosis.refutes:
+            compared = compared.assign(model="refuted initial model: " + compared["model"])
+        return compared
+
+    @cached_property
+    def trajectories(self) -> dict[str, pd.DataFrame]:
+        """Measurement and models by condition, with the final model if effects were added."""
+        tables = {name: read_result(self.results.trajectories(name)) for name in self.comparison["condition"]}
+        return with_final_model(tables, self.diagnosed)
+
+    @property
+    def curves(self) -> pd.DataFrame:
+        """Measured and modelled growth of all trials, at most `MAX_CURVE_ROWS` rows at an even stride."""
+        return _curves(self.results)
+
+    @cached_property
+    def diagnosed(self) -> DiagnosisTables | None:
+        """Tables of the diagnosis; None if there is none."""
+        from vinetrack.figures.diagnosis_figures import read_diagnosis_tables
+
+        return read_diagnosis_tables(self.results, self.trials)
+
+
+def _curves(results: Results) -> pd.DataFrame:
+    """Return measured and modelled growth of all trials, at most `MAX_CURVE_ROWS` rows at an even stride."""
+    import pandas as pd
+
+    conditions = read_result(results.comparison)["condition"]
+    parts = [read_result(results.trajectories(name)).assign(condition=name) for name in conditions]
+    if not parts:
+        return pd.DataFrame()
+    whole = pd.concat(parts, ignore_index=True)
+    return whole.iloc[:: -(-len(whole) // MAX_CURVE_ROWS)]
+
+
+def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
+    """Add pressure and a short label of the condition to `trials.csv`, for the panels of the overview."""
+    by_name: dict[str, Any] = {trial.name: trial for trial in known}
+    labels, pressures = [], []
+    for row in trials.itertuples():
+        trial = by_name.get(str(row.trial))
+        if trial is None:
+            labels.append(str(row.condition) or "not readable")
+            pressures.append(float("nan"))
+            continue
+        labels.append(", ".join([f"{1e3 * trial.diameter_m:g} mm", *features(trial)[1:]]))
+        pressures.append(1e-3 * trial.pressure_Pa)
+    return trials.assign(condition_label=labels, pressure_kPa=pressures)
+
+
+def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
+    """Add vine and label of each condition to `comparison.csv`, sorted by vine and then pressure."""
+    first = described.drop_duplicates("condition").set_index("condition")
+    vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
+    labelled = comparison[comparison["condition"].isin(first.index)]
+    labels = first.loc[labelled["condition"]]
+    table = labelled.assign(vine=labels["vine"].to_numpy(), condition_label=labels["condition_label"].to_numpy())
+    order = sorted(range(len(table)), key=lambda i: (vines[table["vine"].iloc[i]], labels["pressure_kPa"].iloc[i]))
+    return table.iloc[order].reset_index(drop=True)
+
+
+def with_final_model(
+    trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None
+) -> dict[str, pd.DataFrame]:
+    """Add the predictions of the final model to trajectories, if effects were added. Returns with a column
+    `model_after_m`, m, if the table has as many rows as the prediction.
+    """
+    if diagnosed is None or not diagnosed.added or not len(diagnosed.trials):
+        return dict(trajectories)
+    final_m = {
+        str(trial): part["model_after_m"].to_numpy() for trial, part in diagnosed.trials.groupby("trial", sort=False)
+    }
+    extended = {}
+    for condition, table in trajectories.items():
+        parts = [final_m.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
+        after_m = np.concatenate(parts)
+        extended[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
+    return extended
+
+
+def describe_trial(trial: Trial) -> str:
+    """Return a title for a trial: name, vine, pressure and payload."""
+    return f"{trial.name} · {' · '.join(features(trial))}"
+
+
+def features(trial: Trial) -> list[str]:
+    """Return sizes, pressure and payload of a trial in words."""
+    sizes = f"{1e3 * trial.diameter_m:g} mm"
+    sizes += f" × {1e6 * trial.thickness_m:.4g} µm" if np.isfinite(trial.thickness_m) else ""
+    sizes += f" × {1e3 * trial.length_m:.4g} mm" if np.isfinite(trial.length_m) else ""
+    payload = [f"{1e3 * trial.payload_kg:.3g} g"] if trial.payload_kg else []
+    return [sizes, f"{1e-3 * trial.pressure_Pa:.3g} kPa", *payload]

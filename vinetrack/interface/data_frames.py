@@ -151,9 +151,7 @@ class TrialSource:
 def read_source(source: Source) -> TrialSource:
     """Read trials and tracks from any source."""
     from vinetrack.inference.fit_data import pairs_of
-    from vinetrack.pipeline.effects_stage import read_source_experiment
-    from vinetrack.pipeline.model_stage import measured_trials
-    from vinetrack.results.folder_layout import Results
+    from vinetrack.results.folder_layout import Results, measured_trials, read_source_experiment
 
     if isinstance(source, LoadedResults):
         source = source.folder

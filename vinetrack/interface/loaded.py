@@ -43,7 +43,7 @@ class LoadedResults:
     @cached_property
     def experiment(self) -> Experiment:
         """The experiment that the results were made from; raises a ResultsError if it has moved."""
-        from vinetrack.pipeline.effects_stage import read_source_experiment
+        from vinetrack.results.folder_layout import read_source_experiment
 
         return read_source_experiment(self.folder)
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Trial
-    from vinetrack.pipeline.diagnosis_stage import DiagnosisTables
+    from vinetrack.figures.diagnosis_figures import DiagnosisTables
 
 
 def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
@@ -77,7 +77,7 @@ def _with_content(drawn: Figure | None, name: str) -> Figure:
 
 
 def _comparison_tables(shown: Comparison) -> SimpleNamespace:
-    from vinetrack.pipeline.report_stage import label_conditions
+    from vinetrack.figures.registry import label_conditions
 
     table = label_conditions(shown.table, _condition_labels([compared.trial for compared in shown.trials]))
     return SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
@@ -86,7 +86,7 @@ def _comparison_tables(shown: Comparison) -> SimpleNamespace:
 def _condition_labels(trials: list[Trial]) -> Any:
     import pandas as pd
 
-    from vinetrack.pipeline.report_stage import describe_conditions
+    from vinetrack.figures.registry import describe_conditions
 
     rows = pd.DataFrame(
         {
@@ -104,7 +104,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
 
     from vinetrack.diagnosis.drift import drift_groups
     from vinetrack.diagnosis.ladder import in_sample
-    from vinetrack.pipeline.diagnosis_stage import CURVE_COLUMNS, assemble_tables
+    from vinetrack.figures.diagnosis_figures import CURVE_COLUMNS, assemble_tables
 
     nothing = pd.DataFrame()
     if not shown.fits:
@@ -134,7 +134,8 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
 
 
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
-    from vinetrack.pipeline.report_stage import FigureTables, draw_trial
+    from vinetrack.figures.registry import FigureTables
+    from vinetrack.pipeline.trials import draw_trial
 
     trials: tuple[Trial, ...] = ()
     try:
@@ -142,11 +143,11 @@ def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
     except Exception as error:  # without the sheet, the figures have simpler labels
         if name == "trial_motion":
             raise ResultsError(f"{error}") from None
+    tables = FigureTables(shown.folder, trials)
     if name == "trial_motion":
         names = list(shown.trials["trial"])
         if trial not in names:
             raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
-        drawn = draw_trial(shown.folder, next((row for row in trials if row.name == trial), None), trial)
-        return _with_content(drawn, name)
-    tables = FigureTables(shown.folder, trials)
+        stated = next((row for row in trials if row.name == trial), None)
+        return _with_content(draw_trial(tables.results, stated, trial), name)
     return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))

@@ -34,8 +34,7 @@ from vinetrack.inference.fit_result import Fit, Number, TrialFit
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, group_names
 from vinetrack.inference.sensitivity import initial_trial_effects
-from vinetrack.pipeline.model_stage import measured_trials
-from vinetrack.results.folder_layout import Results, ResultsError, read_fit, read_result
+from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result
 
 if TYPE_CHECKING:
     import pandas as pd

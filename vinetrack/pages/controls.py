@@ -26,6 +26,7 @@ from bokeh.models import (
 from vinetrack.core.problems import ExperimentError, UserError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.effects import Effect, load_effect
+from vinetrack.experiment.folder import save_model
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
@@ -42,7 +43,7 @@ from vinetrack.pages.campaign import (
     slider_range,
 )
 from vinetrack.pages.plots import command_block, escaped, html_div, progress_bar, stylesheet
-from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect, save_model
+from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect
 
 if TYPE_CHECKING:
     from vinetrack.pages.page import Page

@@ -24,7 +24,7 @@ from vinetrack.core.local_page import (
     serve_on_free_port,
     stop_on_signals,
 )
-from vinetrack.pages.campaign import BackgroundFit
+from vinetrack.pages.campaign import BackgroundFit, read_campaign
 
 if TYPE_CHECKING:
     from vinetrack.pages.campaign import Campaign
@@ -119,8 +119,8 @@ def serve(
 
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """Open a results folder and its experiment."""
-    from vinetrack.pages.campaign import read_campaign
-    from vinetrack.pipeline.effects_stage import effects_of, read_source_experiment
+    from vinetrack.pipeline.effects_stage import effects_of
+    from vinetrack.results.folder_layout import read_source_experiment
 
     source = read_source_experiment(folder, experiment)
     return read_campaign(folder, source, effects_of(source.folder))

@@ -2,76 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.experiment.folder import Experiment
-from vinetrack.pipeline.model_stage import measured_trials
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
+from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis
 
 if TYPE_CHECKING:
     from vinetrack.effects import Effect
 
 
-# ------------------------------------------------------------------------------
-# The experiment that a results folder was made from, and saving a model to its `experiment.yaml`.
-
-
-def read_source_experiment(folder: Path, experiment: Path | None = None) -> Experiment:
-    """Read the experiment that a results folder was made from, as stated by its `provenance.json`."""
-    from vinetrack.experiment.folder import read_experiment
-
-    results = Results(folder)
-    if not folder.is_dir():
-        raise ResultsError(f"{folder} is not a folder: give the results folder of a run, such as results/NAME")
-    if not results.provenance.exists():
-        raise ResultsError(
-            f"{folder} is not a results folder, because it has no {results.provenance.name}: run vinetrack run or "
-            "snakemake first"
-        )
-    path = experiment or Path(str(read_json(results.provenance)["experiment"]))
-    if not path.is_dir():
-        raise ResultsError(
-            f"{folder} was made from {path}, which does not exist any more: give its new path with --experiment PATH"
-        )
-    return read_experiment(path)
-
-
-SETTINGS = "experiment.yaml"
-BOM = b"\xef\xbb\xbf"
-
-
-def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
-    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
-    ends of the file are kept; other encodings are converted to UTF-8.
-    """
-    from vinetrack.core.tables import read_text, write_bytes
-    from vinetrack.core.yaml_document import with_value
-    from vinetrack.experiment.settings import read_experiment_settings
-
-    path = folder / SETTINGS
-    before = path.read_bytes() if path.exists() else b""
-    text = read_text(path) if before else ""
-    listed = list(read_experiment_settings(path).effects) if before and files else []
-    new = [name for name in files if name not in listed]
-    if new:
-        text = with_value(text, "effects", [*listed, *new], path.name)
-    text = with_value(text, "model", names, path.name)
-    if b"\r\n" in before:
-        text = text.replace("\n", "\r\n")
-    write_bytes(path, (BOM if before.startswith(BOM) else b"") + text.encode("utf-8"))
-    return path
-
-
-FORMATS = (".png", ".svg", ".pdf")
-
-
 def describe_effects(name: str | None, experiment: Path | None, figure: Path | None) -> list[str]:
     """List all effects, or explain one and draw it."""
+    from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
     from vinetrack.effects import catalogue, explanation, find_effect, listing
+    from vinetrack.figures.prediction_figures import draw_effect
+    from vinetrack.pipeline.predict_stage import check_figure, write_figure
 
     user_effects = {} if experiment is None else effects_of(experiment)
     if name is None:
@@ -85,7 +34,9 @@ def describe_effects(name: str | None, experiment: Path | None, figure: Path | N
     effect = find_effect(name, user_effects)
     lines = explanation(effect)
     if figure is not None:
-        _write_picture(effect, figure)
+        check_figure(figure)
+        shown = effect.name, size_words(effect), reference_words(effect), effect_motion(effect)
+        write_figure(draw_effect(*shown), figure)
         lines.append(f"Picture: {figure}")
     return lines
 
@@ -132,28 +83,6 @@ def model_problems(experiment: Path) -> list[Problem]:
     except EffectError as error:
         return [Problem(message=str(error).rstrip("."), file="experiment.yaml", column=column)]
     return []
-
-
-def _write_picture(effect: Effect, path: Path) -> None:
-    """Draw the influence of an effect on the reference vine; the suffix of the file names the format."""
-    from vinetrack.core.tables import write_bytes
-    from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
-    from vinetrack.figures.prediction_figures import draw_effect
-    from vinetrack.figures.style import render
-
-    if path.suffix.lower() not in FORMATS:
-        raise ExperimentError(
-            [
-                Problem(
-                    message="is not the name of a picture",
-                    file=str(path),
-                    remedy=f"end it in one of {', '.join(FORMATS)}",
-                )
-            ]
-        )
-    fig = draw_effect(effect.name, size_words(effect), reference_words(effect), effect_motion(effect))
-    form = path.suffix.lower()[1:]
-    write_bytes(path, render(fig, [form])[form])
 
 
 def effects_content(name: str | None, experiment: Path | None) -> list[dict[str, Any]]:

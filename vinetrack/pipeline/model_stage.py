@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,12 +18,27 @@ import numpy as np
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.results.folder_layout import Results, ResultsError, read_fit, read_json, read_result
+from vinetrack.core.units import with_error
+from vinetrack.narrative.diagnosis_text import contradicted_in_words, sentences_of, to_go_on, verdict_line
+from vinetrack.narrative.power_text import power_brief
+from vinetrack.narrative.verdict_text import settled_rows, summary_facts
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    empty_table,
+    measured_trials,
+    read_diagnosis,
+    read_fit,
+    read_json,
+    read_result,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.ladder import Comparison
+    from vinetrack.diagnosis.locate import Failure
+    from vinetrack.diagnosis.result import Diagnosis
     from vinetrack.dynamics.audit import Audit
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
@@ -31,15 +47,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> dict[str, Any]:
+def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple[dict[str, Any], Fit | None]:
     """Fit the model in use to all trials. Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv` and
-    `audit.csv`. Returns `fit.json` as written; `refused` is None or the reason.
+    `audit.csv`. Returns `fit.json` as written, whose `refused` is None or the reason; and the fit for a diagnosis.
     """
-    from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS
+    from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS, compare
     from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
     from vinetrack.inference.fit_result import CHECK_COLUMNS
     from vinetrack.inference.fit_summary import FitSummary, summary_of
-    from vinetrack.results.folder_layout import empty_table
 
     results = Results(folder)
     damping = read_json(results.damping)
@@ -48,8 +63,10 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     written: dict[Path, pd.DataFrame] = {}
     content: dict[str, Any] = {}
     trajectories: dict[str, pd.DataFrame] = {}
+    initial: Fit | None = None
     try:
-        fit, comparison = _fit_and_compare(experiment, pairs, kinematics, settings)
+        initial, fit = _fits(experiment, pairs)
+        comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
         damping_check, check_message = _damping_check(fit, damping)
         audited = _audit(fit, comparison, pairs, kinematics)
     except Exception as error:
@@ -67,89 +84,34 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     _write_trajectories(results, trajectories)
     write_json(results.fit, content)
     log.info("%s", content["refused"] or f"fitted {len(content['trials'])} trials")
-    return content
+    return content, initial
 
 
-def measured_trials(
-    experiment: Experiment, results: Results
-) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
-    """Read the tracks and kinematics of all trials that did not fail from a results folder. Returns pairs, kinematics
-    (by name of trial).
+def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit | None, Fit]:
+    """Fit the model in use once: the fit as a diagnosis starts from it, and with intervals near bounds. A body that
+    falls by gravity alone, whose fitted g tests the whole chain, is fitted otherwise than for a diagnosis.
     """
-    pairs, kinematics = [], {}
-    failed: set[str] = set()
-    if results.trials.exists():
-        gathered = read_result(results.trials)
-        failed = set(gathered.loc[gathered["status"] == "failed", "trial"])
-    for trial in experiment.trials:
-        table = read_result(results.track(trial.name))
-        if len(table) and trial.name not in failed:
-            pairs.append((trial, read_stored_track(trial, table)))
-            kinematics[trial.name] = _kinematics(read_result(results.kinematics(trial.name)), trial.travel_ratio)
-    return pairs, kinematics
+    from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
+    from vinetrack.effects import own_effects
+    from vinetrack.inference.assemble import assemble
+    from vinetrack.pipeline.trials import model_of
 
-
-def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
-    """Make a track of `tracks/<trial>.csv`, with the measured pressure. The results do not contain the pressure: it is
-    read from the user's track or pressure trace.
-    """
-    from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
-
-    systematic_m = table["lead_position_systematic_m"].to_numpy(dtype=float)
-    track = Track(
-        time_s=table["time_s"].to_numpy(dtype=float),
-        lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
-        lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
-        flag=table["flag"].to_numpy(dtype=str),
-        edge_px=table["edge_px"].to_numpy(dtype=float),
-        lead_position_systematic_m=systematic_m if np.isfinite(systematic_m).any() else None,
+    model, settings = model_of(experiment), experiment.settings
+    candidates = candidates_of(
+        model, settings.candidates, own_effects([experiment.folder / path for path in settings.effects])
     )
-    try:
-        if trial.pressure_trace is not None:
-            return attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
-        source_track = load_track(trial) if trial.track is not None else None
-    except TrackError as error:
-        raise ResultsError(f"trial {trial.name}: {error}; then run snakemake again") from None
-    if source_track is None or source_track.pressure_Pa is None:
-        return track
-    return replace(track, pressure_Pa=np.interp(track.time_s, source_track.time_s, source_track.pressure_Pa))
-
-
-def _kinematics(table: pd.DataFrame, travel_ratio: float) -> Kinematics:
-    """Make kinematics of `kinematics/<trial>.csv`, which does not store smoothing windows and noise."""
-    names = ("time_s", "lead_position_m", "lead_velocity_m_s", "lead_velocity_sigma_m_s", "lead_acceleration_m_s2")
-    columns = {name: table[name].to_numpy(dtype=float) for name in names}
-    return Kinematics(
-        **columns,
-        window_points=np.zeros(len(table), dtype=int),
-        noise_m=np.nan,
-        noise_correlation=np.nan,
-        travel_ratio=travel_ratio,
-    )
-
-
-def _fit_and_compare(
-    experiment: Experiment,
-    pairs: list[tuple[Trial, Track]],
-    kinematics: dict[str, Kinematics],
-    settings: RunSettings,
-) -> tuple[Fit, Comparison]:
-    from vinetrack.diagnosis.ladder import candidates_of, compare, initial_fit
-    from vinetrack.pipeline.tracks_stage import model_of
-
-    model = model_of(experiment)
-    candidates = candidates_of(model, experiment.settings.candidates, model.user_effects)
-    # A model of gravity alone describes a falling body, whose fitted g tests the whole chain from recording to fit.
-    free = ("gravity.g",) if model.names == ("gravity",) else ()
-    fit = initial_fit(model, pairs, candidates, free=free)
-    return fit, compare(fit, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
+    if model.names == ("gravity",):
+        return None, initial_fit(model, pairs, candidates, free=("gravity.g",))
+    initial = initial_fit(model, pairs, candidates, profile=False)
+    own = with_host(initial, initial.predictor.host)  # a predictor of its own: what uses one adapts its steps
+    fit = assemble(own.predictor, own.solution, own.left_out, own.options, profile=True)
+    return initial, replace(fit, pairs=initial.pairs)
 
 
 def _damping_check(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
     """Return the table `model_check.csv`, and the reason if it is empty."""
     from vinetrack.inference.fit_data import FitError
     from vinetrack.inference.fit_result import CHECK_COLUMNS, check_damping
-    from vinetrack.results.folder_layout import empty_table
 
     method = "log_log" if damping["both_axes"].get("refused") else "both_axes"
     try:
@@ -182,10 +144,10 @@ def model_errors() -> tuple[type[Exception], ...]:
 
 
 def _reason(error: Exception) -> str:
-    """Return the reason why there is no fit; the traceback of an unexpected exception goes to the log."""
+    """Return why there is no fit or verdict; the traceback of an unexpected exception goes to the log."""
     if isinstance(error, model_errors()):
         return str(error)
-    log.exception("the model could not be fitted")
+    log.exception("no fit or no diagnosis could be made")
     return INTERNAL_ERROR
 
 
@@ -225,3 +187,241 @@ def comparison_lines(folder: Path) -> list[str]:
 
 def _shown(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if np.isfinite(value) else "–"
+
+
+# ------------------------------------------------------------------------------
+# Diagnosis of a results folder: which effects the model lacks, and how much they reduce its errors.
+#
+# A diagnosis that fails does not stop the run: `diagnosis.json` then has no verdict and states the reason.
+
+Report = Callable[[str], None]
+PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
+
+
+def _quiet(_: str) -> None:
+    pass
+
+
+def diagnose_results(
+    experiment: Experiment,
+    folder: Path,
+    report: Report = _quiet,
+    settings: RunSettings | None = None,
+    fitted: Fit | None = None,
+) -> dict[str, Any]:
+    """Diagnose the trials of a results folder; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`. Returns
+    `diagnosis.json` as written; `refused` is None, or the reason why there is no verdict.
+    """
+    results = Results(folder)
+    pairs, _ = measured_trials(experiment, results)
+    try:
+        diagnosis = with_contradictions(diagnose_pairs(experiment, pairs, report, fitted), results, pairs)
+    except Exception as error:
+        return _write_refusal(results, experiment, _reason(error))
+    log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
+    content = write_diagnosis(results, diagnosis)
+    report("fitting the damping law under every model")
+    _write_laws(results, diagnosis, pairs, settings)
+    return content
+
+
+def diagnose_pairs(
+    experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet, fitted: Fit | None = None
+) -> Diagnosis:
+    """Diagnose trials with the model, candidates, user effects and limits that the experiment states."""
+    from vinetrack.diagnosis.diagnose import diagnose
+
+    return diagnose(experiment, tracks={trial.name: track for trial, track in pairs}, report=report, fitted=fitted)
+
+
+def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[tuple[Trial, Track]]) -> Diagnosis:
+    """Add contradictions between measurements and sheet to a diagnosis: a wrong scale or unit can look like physics."""
+    contradictions = sheet_contradictions(results, pairs)
+    if not contradictions:
+        return diagnosis
+    return replace(
+        diagnosis,
+        explanation=f"{diagnosis.explanation} {contradicted_in_words(tuple(contradictions))}",
+        contradicted_columns=tuple(contradictions),
+        notes=(*diagnosis.notes, *contradictions.values()),
+    )
+
+
+def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, str]:
+    """Return a sentence for each column of the sheet that recordings or speeds contradict. Returns by name of the
+    column.
+    """
+    from vinetrack.planning.predictive_inputs import pressure_problems
+    from vinetrack.tracks.frame_timing import mean_speed
+
+    noted: dict[str, list[tuple[str, str]]] = {}
+    for trial, _ in pairs:
+        for entry in read_json(results.analysed(trial.name)).get("contradictions", []):
+            noted.setdefault(entry["column"], []).append((trial.name, entry["reason"]))
+    sentences = {
+        column: f"{of_trial[0][0]}: {of_trial[0][1]}"
+        + (f" (and {len(of_trial) - 1} more trial{'s' if len(of_trial) > 2 else ''})" if len(of_trial) > 1 else "")
+        for column, of_trial in noted.items()
+    }
+    speeds = [(trial, mean_speed(track)) for trial, track in pairs]
+    return sentences | {problem.column: problem.reason for problem in pressure_problems(speeds)}
+
+
+def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dict[str, Any]:
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS
+    from vinetrack.diagnosis.result import Diagnosis
+
+    explanation = f"No diagnosis could be made: {reason}"
+    refusal = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
+    content = {**refusal.to_json(), "model": list(experiment.settings.model)}
+    _emptied_folder(results)
+    write_csv(results.ladder, empty_table(LADDER_COLUMNS))
+    write_json(results.diagnosis, content)
+    log.info("%s", content["explanation"])
+    return content
+
+
+def _emptied_folder(results: Results) -> Path:
+    folder = results.folder / "diagnosis"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`. Returns `diagnosis.json` as written."""
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
+
+    folder = _emptied_folder(results)
+    for name, table in _tables_of(diagnosis).items():
+        write_csv(folder / name, table)
+    has_added = len(diagnosis.fits) > 1
+    parameter_changes = moved(diagnosis.fits, ("", *diagnosis.effects)) if has_added else empty_table(MOVED_COLUMNS)
+    write_csv(folder / "moved.csv", parameter_changes)
+    if has_added:
+        from vinetrack.inference.fit_summary import summary_of
+
+        write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
+    for name, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]).items():
+        path = results.predictions(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_csv(path, table)
+    write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
+    content = diagnosis.to_json()
+    write_json(results.diagnosis, content)
+    return content
+
+
+def _write_laws(
+    results: Results, diagnosis: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
+) -> None:
+    """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
+    from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
+
+    path = results.folder / "diagnosis" / "damping_laws.csv"
+    laws: dict[str, Any] = {}
+    if len(diagnosis.fits) > 1:
+        motions = look_at_motions(pairs, settings)
+        for fit in diagnosis.fits:
+            try:
+                laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings).laws
+            except ValueError as error:
+                log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
+    write_csv(path, law_table(laws) if laws else empty_table(LAW_COLUMNS))
+
+
+def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
+    """Return the tables of the initial model's misfit and of the missing force, by file name."""
+    from vinetrack.diagnosis.drift import drift_groups
+
+    tables: dict[str, pd.DataFrame] = {}
+    failure: Failure | None = diagnosis.failure
+    if failure is not None:
+        tables |= {
+            "conditions.csv": failure.by_condition,
+            "along_time.csv": failure.along_time,
+            "along_position.csv": failure.along_position,
+            "along_speed.csv": failure.along_speed,
+            "drift_groups.csv": drift_groups(failure.drift, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
+        }
+    if diagnosis.force_table is not None:
+        tables["missing_force.csv"] = diagnosis.force_table
+    if diagnosis.learned_table is not None:
+        tables["learned_force.csv"] = diagnosis.learned_table
+    return tables
+
+
+def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
+    """Predict every trial with the initial and the final model. As in `comparison.csv` and the ladder, only release and
+    origin are fitted per trial. `model_after_m` is NaN if no effect was added. Returns by name of trial, columns
+    `PREDICTION_COLUMNS`: s and m.
+    """
+    import pandas as pd
+
+    from vinetrack.diagnosis.ladder import in_sample
+
+    first = in_sample(before).trials
+    last = in_sample(after).trials if after is not before else first
+    tables = {}
+    for under_first, under_last in zip(first, last, strict=True):
+        later = under_last.predicted_position_m if after is not before else np.full(under_first.time_s.size, np.nan)
+        columns = (under_first.time_s, under_first.lead_position_m, under_first.predicted_position_m, later)
+        tables[under_first.name] = pd.DataFrame(dict(zip(PREDICTION_COLUMNS, columns, strict=True)))
+    return tables
+
+
+def add_effect(experiment: Experiment, folder: Path, name: str, report: Report = _quiet) -> list[str]:
+    """Add an effect to the model and refit; the errors are appended to `ladder.csv`."""
+    import pandas as pd
+
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved
+    from vinetrack.diagnosis.propose import add
+    from vinetrack.narrative.diagnosis_text import added_in_words
+
+    results = Results(folder)
+    pairs, _ = measured_trials(experiment, results)
+    before, after, table = add(experiment, {trial.name: track for trial, track in pairs}, name, report)
+    history = read_result(results.ladder) if results.ladder.exists() else empty_table(LADDER_COLUMNS)
+    rows = table if not len(history) else table.iloc[1:]
+    settled = settled_rows(history)
+    recorded = set(zip(settled["model"], settled["added"].fillna(""), strict=True))
+    new = rows[[(model, added) not in recorded for model, added in zip(rows["model"], rows["added"], strict=True)]]
+    if len(new):
+        write_csv(results.ladder, pd.concat([history, new], ignore_index=True) if len(history) else new)
+    return added_in_words(before, after, table, moved((before, after), ("", name)))
+
+
+def diagnosis_lines(folder: Path) -> list[str]:
+    """Return the verdict of a results folder in one line, then its reasons, one sentence per line."""
+    diagnosis = read_diagnosis(Results(folder))
+    if diagnosis is None:
+        raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
+    if not diagnosis.verdict:
+        return [diagnosis.explanation]
+    power = power_brief(diagnosis.power) if diagnosis.power is not None else ""
+    columns = diagnosis.contradicted_columns
+    warning = f" {contradicted_in_words(columns)}" if columns else ""
+    sizes = [fact.answer for fact in summary_facts(diagnosis, None) if fact.code in ("significance", "size")]
+    headline = verdict_line(diagnosis) + (f" ({'; '.join(sizes)})" if sizes else "")
+    return [
+        f"{headline}.{warning}" if columns else headline,
+        *(f"  {line}" for line in sentences_of(diagnosis.explanation.removesuffix(warning))),
+        *([f"{power[0].upper()}{power[1:]}"] if power and power not in headline else []),
+        *_damping_line(diagnosis),
+        *(f"! {note}" for note in diagnosis.notes),
+        *filter(None, [to_go_on(diagnosis)]),
+    ]
+
+
+def _damping_line(diagnosis: Diagnosis) -> list[str]:
+    """Return the damping law of the final model, F = B·ẋⁿ, as a line; empty if that model has none."""
+    numbers = [number for number in diagnosis.parameters if number.key in ("eversion_damping.B", "eversion_damping.n")]
+    if not numbers:
+        return []
+    parts = [
+        f"{number.symbol}{f' ({number.vine})' if number.vine else ''} = {with_error(number.value, number.sigma)}"
+        f"{f' {number.unit}' if number.unit != '1' else ''}"
+        for number in sorted(numbers, key=lambda number: number.key != "eversion_damping.n")
+    ]
+    with_effects = f" with {' + '.join(diagnosis.effects)} in the model" if diagnosis.effects else ""
+    return [f"F = B·ẋⁿ{with_effects}: {', '.join(parts)}; ± is one standard error"]

@@ -21,7 +21,7 @@ from vinetrack.core.units import number
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
 from vinetrack.figures.style import GREEN
 from vinetrack.narrative.verdict_text import spaced_name
-from vinetrack.pipeline.tracks_stage import map_trials
+from vinetrack.pipeline.trials import map_unordered
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from vinetrack.experiment.folder import Experiment
     from vinetrack.figures.overlay import ClipView, Edge
+    from vinetrack.video.axis import Axis
     from vinetrack.video.frames import Recording
     from vinetrack.video.survey import Measurement
 
@@ -52,8 +53,8 @@ def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySetting
     results.overlays.mkdir(parents=True, exist_ok=True)
     chosen = chosen_trials(experiment, results, settings.of)
     work = partial(_try_overlay, results=results, settings=settings)
-    messages = map_trials(work, [experiment.trial(name) for name in chosen], n_workers, "overlay clips")
-    return [line for line in messages if line]
+    messages = map_unordered(work, [experiment.trial(name) for name in chosen], n_workers)
+    return sorted(line for line in messages if line)
 
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float | None = None) -> Path:
@@ -104,22 +105,44 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
 
 def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
     """Write the clip of one trial; return its path."""
-    from vinetrack.video.frames import RecordingError
-    from vinetrack.video.write import write_clip
+    from vinetrack.video.curved_axis import axis_from_entry
+    from vinetrack.video.frames import RecordingError, inspect_recording
 
     if trial.video is None:
         raise ResultsError(f"{trial.name} has no recording to draw on")
-    track = read_result(results.track(trial.name))
-    shown = frames_to_show(track)
-    rate = 1.0 / float(np.median(np.diff(track["time_s"].to_numpy()))) if len(track) > 1 else math.nan
-    play_fps, stride = playback_rate(shown.stop - shown.start, settings.seconds)
+    track, analysed = read_result(results.track(trial.name)), read_json(results.analysed(trial.name))
+    shown, line = frames_to_show(track), analysed.get("axis")
+    if line is None:
+        raise ResultsError(f"{results.analysed(trial.name)} does not state the axis: run snakemake again")
+    mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
+    shake_px = shake_along(line, len(track))
+    edges, release_s = edges_to_draw(trial.name, results, track)
+    edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]
+    since_s = track["time_s"].to_numpy(dtype=float) - release_s
+    scale = 1e3 * trial.diameter_m / mm_per_px, mm_per_px
     path = results.overlay(trial.name)
     try:
-        pictures = _pictures(trial, results, track, shown, stride, rate / play_fps / stride, settings)
-        write_clip(path, pictures, play_fps)
+        recording = inspect_recording(trial.video)
+        _write_clip(path, trial.name, recording, axis_from_entry(line), *scale, edges, since_s, shown, settings)
     except RecordingError as error:
         raise ResultsError(str(error)) from None
     return path
+
+
+def _write_clip(
+    path: Path, title: str, recording: Recording, axis: Axis, tube_px: float, mm_per_px: float, edges: list[Edge],
+    since_s: Floats, shown: range, settings: OverlaySettings,
+) -> None:  # fmt: skip
+    """Write a clip of the shown frames; `since_s` is the time since release. Shapes: since_s (n_frames,)."""
+    from vinetrack.figures.overlay import ClipView
+    from vinetrack.video.write import write_clip
+
+    rate = 1.0 / float(np.median(np.diff(since_s))) if len(since_s) > 1 else math.nan
+    play_fps, stride = playback_rate(len(shown), settings.seconds)
+    size = recording.width, recording.height
+    tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(size)
+    view = ClipView(title, axis, tube_px, size, mm_per_px, rate / play_fps / stride, settings.width_px)
+    write_clip(path, draw_over(recording, view, edges, 1e3 * since_s, shown, stride), play_fps)
 
 
 def frames_to_show(track: pd.DataFrame) -> range:
@@ -140,39 +163,6 @@ def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
     """
     stride = max(round(n_frames / seconds / FASTEST_FPS), 1)
     return float(np.clip(n_frames / stride / seconds, SLOWEST_FPS, FASTEST_FPS)), stride
-
-
-def _pictures(
-    trial: Trial,
-    results: Results,
-    track: pd.DataFrame,
-    shown: range,
-    stride: int,
-    slowed: float,
-    settings: OverlaySettings,
-) -> Iterator[NDArray[np.uint8]]:
-    from vinetrack.figures.overlay import ClipView
-    from vinetrack.video.curved_axis import axis_from_entry
-    from vinetrack.video.frames import inspect_recording
-
-    assert trial.video is not None
-    recording = inspect_recording(trial.video)
-    analysed = read_json(results.analysed(trial.name))
-    line = analysed.get("axis")
-    if line is None:
-        raise ResultsError(f"{results.analysed(trial.name)} does not state the axis: run snakemake again")
-    axis = axis_from_entry(line)
-    mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
-    tube_px = 1e3 * trial.diameter_m / mm_per_px
-    tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(recording.width, recording.height)
-    view = ClipView(
-        trial.name, axis, tube_px, (recording.width, recording.height), mm_per_px, slowed, settings.width_px
-    )
-    edges, release_s = edges_to_draw(trial.name, results, track)
-    shake_px = shake_along(line, len(track))
-    edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]
-    time_ms = 1e3 * (track["time_s"].to_numpy(dtype=float) - release_s)
-    yield from draw_over(recording, view, edges, time_ms, shown, stride)
 
 
 def draw_over(
@@ -219,7 +209,8 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
         return [*edges, *corrected], float(_first_moving_s(track))
     predicted = read_result(path)
     to_px = position_to_px(track)
-    added = _added_effects(results)
+    diagnosis = read_diagnosis(results)
+    added = " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
     labels = {"model_before_m": "initial model", "model_after_m": f"with {added}" if added else ""}
     time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
     for column, label in labels.items():
@@ -230,7 +221,8 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
         position_m = np.interp(time_s, prediction["time_s"], prediction[column], left=math.nan, right=math.nan)
         error_mm = 1e3 * (position_m - measured_m)
         edges.append(Edge(label, BEFORE if column == "model_before_m" else AFTER, to_px(position_m), error_mm))
-    return [*edges, *corrected], _release_s(trial, results, track)
+    fitted = read_fit(results).trials if results.fit.exists() else {}
+    return [*edges, *corrected], fitted[trial].release_s if trial in fitted else _first_moving_s(track)
 
 
 def position_to_px(track: pd.DataFrame) -> Any:
@@ -244,17 +236,6 @@ def position_to_px(track: pd.DataFrame) -> Any:
     middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
     quadratic = np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
     return quadratic
-
-
-def _added_effects(results: Results) -> str:
-    """Return the effects that the diagnosis added, in words; blank if there are none."""
-    diagnosis = read_diagnosis(results)
-    return " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
-
-
-def _release_s(trial: str, results: Results, track: pd.DataFrame) -> float:
-    fitted = read_fit(results).trials if results.fit.exists() else {}
-    return fitted[trial].release_s if trial in fitted else _first_moving_s(track)
 
 
 def _first_moving_s(track: pd.DataFrame) -> float:
@@ -323,7 +304,7 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
     except RecordingError as error:
         raise UserError(str(error)) from None
     table = _table(measurement, options.scaled)
-    written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled, rate)
+    written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled)
     tracking_facts = _tracking_facts(measurement, table, options, rate)
     for line in _tracking_lines(tracking_facts):
         say(line)
@@ -442,12 +423,9 @@ def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
     return pd.DataFrame(columns | {"flag": track.flag})
 
 
-def _write(
-    folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: bool, rate: float
-) -> dict[str, Path]:  # fmt: skip
-    from vinetrack.figures.overlay import TRACKED, ClipView, Edge, draw_strip
+def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: bool) -> dict[str, Path]:
+    from vinetrack.figures.overlay import TRACKED, Edge, draw_strip
     from vinetrack.figures.style import render
-    from vinetrack.video.write import write_clip
 
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; name a folder with --out")
@@ -457,17 +435,12 @@ def _write(
     write_csv(written["table"], table)
     m_per_px = measurement.m_per_px if scaled else math.nan
     write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
-    shown = frames_to_show(table)
-    play_fps, stride = playback_rate(len(shown), settings.seconds)
-    size = recording.width, recording.height
+    shown, time_s = frames_to_show(table), tracking.track.time_s
     tube_px = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else tracking.axis.width_px
-    tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(size)
-    slowed = rate / play_fps / stride
-    view = ClipView(name, tracking.axis, tube_px, size, 1e3 * m_per_px, slowed, settings.width_px)
     edges = [Edge("tracked edge", TRACKED, tracking.track.edge_px + tracking.shake_px)]
-    time_s = tracking.track.time_s
-    time_ms = 1e3 * (time_s - time_s[min(shown.start + MARGIN_FRAMES, len(time_s) - 1)])
-    write_clip(written["clip"], draw_over(recording, view, edges, time_ms, shown, stride), play_fps)
+    since_s = time_s - time_s[min(shown.start + MARGIN_FRAMES, len(time_s) - 1)]
+    scale = tube_px, 1e3 * m_per_px
+    _write_clip(written["clip"], name, recording, tracking.axis, *scale, edges, since_s, shown, settings)
     return written
 
 

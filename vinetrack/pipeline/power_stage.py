@@ -23,7 +23,7 @@ from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerIn
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.settings import ExperimentSettings, Limits
 from vinetrack.experiment.sheet import expected_systematic_m
-from vinetrack.pipeline.tracks_stage import map_unordered
+from vinetrack.pipeline.trials import map_unordered
 from vinetrack.planning.simulated_campaigns import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
@@ -61,6 +61,16 @@ class PowerRequest:
     reach: float = math.nan
     recommend: bool = False
     experiment: Path | None = None
+
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Stated noise of a position, m, and its correlation."""
+        return self.noise_mm / 1e3, self.noise_correlation
+
+    @property
+    def spreads(self) -> tuple[float, float]:
+        """Stated relative standard deviations between trials, of pressure and B."""
+        return self.spread_P, self.spread_B
 
 
 @dataclass(frozen=True)
@@ -128,9 +138,7 @@ def campaign_in_memory(request: PowerRequest, given: Fit | Pairs) -> PowerCampai
 def _trials_of_results(request: PowerRequest) -> MeasuredTrials:
     from vinetrack.diagnosis.result import ADEQUATE
     from vinetrack.effects import own_effects
-    from vinetrack.pipeline.effects_stage import read_source_experiment
-    from vinetrack.pipeline.model_stage import measured_trials
-    from vinetrack.results.folder_layout import Results, read_diagnosis
+    from vinetrack.results.folder_layout import Results, measured_trials, read_diagnosis, read_source_experiment
 
     results = Results(request.target)
     experiment = read_source_experiment(request.target, request.experiment)
@@ -153,8 +161,8 @@ def measured_campaign(request: PowerRequest, measured: MeasuredTrials) -> PowerC
     model = make_model(measured.names, measured.user_effects)
     host = host_for(model, candidates_of(model, candidates, measured.user_effects))
     first = fit(model, pairs, host=host, profile=False, thorough=False)
-    stated = _stated_noise(request, first.noise_m, first.noise_correlation)
-    spreads = _stated_spreads(request, (float(first.state.spread[0]), float(first.state.spread[1])))
+    stated = _stated(request.noise, (first.noise_m, first.noise_correlation))
+    spreads = _stated(request.spreads, (float(first.state.spread[0]), float(first.state.spread[1])))
     inputs: list[PowerInput] = []
     if stated is not None or spreads is not None:
         first = fit(model, pairs, spreads=spreads, noise=stated, host=host, profile=False, thorough=False)
@@ -165,22 +173,10 @@ def measured_campaign(request: PowerRequest, measured: MeasuredTrials) -> PowerC
     return PowerCampaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates), measured.limits)
 
 
-def _stated_noise(request: PowerRequest, noise_m: float, correlation: float) -> tuple[float, float] | None:
-    if math.isnan(request.noise_mm) and math.isnan(request.noise_correlation):
-        return None
-    return (
-        noise_m if math.isnan(request.noise_mm) else request.noise_mm / 1e3,
-        correlation if math.isnan(request.noise_correlation) else request.noise_correlation,
-    )
-
-
-def _stated_spreads(request: PowerRequest, otherwise: tuple[float, float]) -> tuple[float, float] | None:
-    if math.isnan(request.spread_P) and math.isnan(request.spread_B):
-        return None
-    return (
-        otherwise[0] if math.isnan(request.spread_P) else request.spread_P,
-        otherwise[1] if math.isnan(request.spread_B) else request.spread_B,
-    )
+def _stated(given: tuple[float, float], otherwise: tuple[float, float]) -> tuple[float, float] | None:
+    """Two numbers of which those not given are taken from elsewhere; None if neither is given."""
+    first, second = (other if math.isnan(one) else one for one, other in zip(given, otherwise, strict=True))
+    return None if math.isnan(given[0]) and math.isnan(given[1]) else (first, second)
 
 
 def _input_rows(
@@ -208,9 +204,9 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
             by_vine[trial.vine] = predictive_inputs(trial, stated)
     vine_inputs = list(by_vine.values())
     first = vine_inputs[0]
-    noise = _stated_noise(request, DEFAULT_NOISE_MM / 1e3, 0.0)
+    noise = _stated(request.noise, (DEFAULT_NOISE_MM / 1e3, 0.0))
     noise_m, correlation = noise or (DEFAULT_NOISE_MM / 1e3, 0.0)
-    spreads = _stated_spreads(request, first.spreads)
+    spreads = _stated(request.spreads, first.spreads)
     systematic_m, systematic_origin = _planned_systematic(request, settings)
     trials = tuple(
         replace(_with_yield(trial, by_vine[trial.vine].trial), position_systematic_m=systematic_m)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -199,13 +198,12 @@ def inputs_of(basis: PredictionBasis) -> list[PredictiveInputs]:
 
 def name_missing_option(error: Exception) -> Exception:
     """Convert an error about a missing input of an effect to one that names the option; return others unchanged."""
-    match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
-    if match is None:
+    from vinetrack.effects import EffectError
+
+    if not isinstance(error, EffectError) or not error.column:
         return error
-    message = f"is blank, and the effect {match[1]} needs it"
-    return ExperimentError(
-        [Problem(message=message, column=match[2], remedy=f"give it as {option(match[2])} or in the sheet")]
-    )
+    message, remedy = f"is blank, and the effect {error.effect} needs it", f"give it as {option(error.column)}"
+    return ExperimentError([Problem(message=message, column=error.column, remedy=f"{remedy} or in the sheet")])
 
 
 def warnings_of(basis: PredictionBasis) -> list[str]:
@@ -445,21 +443,8 @@ def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
         "condition": prediction.inputs.trial.condition,
         "model": list(prediction.inputs.model.names),
         "samples": prediction.samples,
-        "inputs": [
-            {"name": i.name, "unit": i.unit, "median": i.median, "low_90": i.low, "high_90": i.high, "from": i.origin}
-            for i in prediction.inputs.bands()
-        ],
-        "quantities": [
-            {
-                "name": q.name,
-                "y_over_L": q.y_over_L,
-                "unit": q.unit,
-                "median": q.median,
-                "low_90": q.low,
-                "high_90": q.high,
-            }
-            for q in prediction.quantities
-        ],
+        "inputs": [_band(one) | {"from": one.origin} for one in prediction.inputs.bands()],
+        "quantities": [_band(one) | {"y_over_L": one.y_over_L} for one in prediction.quantities],
         "uncertainties": [
             {"name": s.name, "words": s.words, "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
             for s in prediction.shares
@@ -472,3 +457,7 @@ def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
         "slack": prediction.slack,
         "warnings": list(entry.hazards),
     }
+
+
+def _band(one: Input | Quantity) -> dict[str, Any]:
+    return {"name": one.name, "unit": one.unit, "median": one.median, "low_90": one.low, "high_90": one.high}

@@ -9,24 +9,26 @@ import os
 import re
 import subprocess
 import sys
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import Progress, progress
+from vinetrack.pipeline.kept import PACKAGE, Kept
+from vinetrack.pipeline.stages import STAGES
 from vinetrack.pipeline.workflow import (
-    LOCK_REMOVED,
-    PACKAGE,
     SNAKEFILE,
     find_experiment,
     find_ground_truth,
     refuse_running,
     refuse_shared_results,
 )
+
+if TYPE_CHECKING:
+    from vinetrack.video.survey import Keep
 
 # ------------------------------------------------------------------------------
 # The command `vinetrack check`: facts about the recordings of an experiment, and all problems, before any analysis.
@@ -57,8 +59,8 @@ class CheckReport:
         return {"recordings": list(self.recordings), "notes": list(self.notes), "problems": problems}
 
 
-def check_folder(folder: Path) -> CheckReport:
-    """Check sheet, settings, effects, tracks and recordings of an experiment."""
+def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
+    """Check sheet, settings, effects, tracks and recordings of an experiment; `keep` keeps what is tracked."""
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
     from vinetrack.pipeline.workflow import path_problems
@@ -69,7 +71,7 @@ def check_folder(folder: Path) -> CheckReport:
     from vinetrack.tracks.smoothed_positions import detect_smoothing
     from vinetrack.video.survey import Surveyor, axis_notes, direction_notes, facts_entry, facts_rows
 
-    surveyor = Surveyor()
+    surveyor = Surveyor(keep)
     problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor), *model_problems(folder)]
     try:
         experiment = read_experiment(folder, strict=False)
@@ -108,33 +110,9 @@ def check_folder(folder: Path) -> CheckReport:
 
 Say = Callable[[str], None]
 
-_FINISHED = re.compile(r"^Finished jobid: \d+ \(Rule: (\w+?)(?:_(\d+))?\)")
-_STEPS = re.compile(r"^(\d+) of (\d+) steps")
-_FAILED = re.compile(r"^Error in rule (\w+)")
-_STAGE_LOG = re.compile(r"^\s+log: (\S.*\.log)")
-# Lines that Snakemake prints about itself; format of version 9
-_SNAKEMAKE_LINES = re.compile(
-    r"^(\[|\s|$|Finished jobid|\d+ of \d+ steps|Select jobs|Execute \d|Using |Config file|Assuming|Building|Provided|"
-    r"Rules claiming|Job stats|job  |-----|total  |Error in rule|Complete log|Elapsed|Shutting down|Exiting|"
-    r"Removing output|Nothing to be done|Report: |RuleException|CalledProcessError|Trying to restart|At least one job)"
-)
-
-MAX_EXPLANATION_LINES = 12  # Lines printed by stages that are kept to explain a failure (chosen)
-
-STAGE_DONE_TEXT = {
-    "laboratory": "virtual measurements made",
-    "recording": "recordings tracked",
-    "tracks": "tracks analysed",
-    "gather": "trials gathered",
-    "damping": "damping law fitted",
-    "model": "model fitted",
-    "diagnosis": "model diagnosed",
-    "trial_figures": "figures of the trials drawn",
-    "campaign_figures": "figures of the experiment drawn",
-    "paper": "comparison with the paper made",
-    "overlays": "clips drawn",
-    "report_page": "report written",
-}
+RUN = "VINETRACK_RUN"  # Variable that asks stages to say in a line what they have done
+_PROGRESS = re.compile(r"(\d+) of (\d+) \w+")  # What a stage says while it works
+EXPLANATION_LINES = 12  # Last lines of a run that failed which are printed (chosen)
 
 
 class RunError(UserError):
@@ -158,16 +136,15 @@ def run_paths(folder: Path, base: Path | None) -> RunPaths:
     return RunPaths(experiment, results)
 
 
-def check_before_run(experiment: Path, say: Say) -> None:
+def check_before_run(paths: RunPaths, say: Say) -> None:
     """Print the problems of an experiment before its run."""
-    from vinetrack.core.problems import format_problems
     from vinetrack.experiment.folder import read_experiment
 
-    if find_ground_truth(experiment, PACKAGE.parent):
+    if find_ground_truth(paths.experiment, PACKAGE.parent):
         return  # The recordings of the demonstration do not exist yet: the run makes them.
-    report = check_folder(experiment)
+    report = check_folder(paths.experiment, Kept(paths.results).track)
     errors = [problem for problem in report.problems if problem.severity == "error"]
-    trials = {trial.name for trial in read_experiment(experiment).trials}
+    trials = {trial.name for trial in read_experiment(paths.experiment).trials}
     faulty_trials = {problem.trial for problem in errors}  # "" stands for the experiment as a whole
     if errors and ("" in faulty_trials or trials <= faulty_trials):
         raise ExperimentError(report.problems)
@@ -185,80 +162,33 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     write_text(config_file, json.dumps({"experiment": str(paths.experiment), "results": str(paths.results)}))
     command = [
         sys.executable, "-m", "snakemake", "--snakefile", str(SNAKEFILE), "--directory", str(paths.results),
-        "--cores", str(cores), "--rerun-incomplete", "--quiet", "rules", "host",
-        "--configfile", str(config_file),
+        "--cores", str(cores), "--rerun-incomplete", "--nolock", "--quiet", "all", "--configfile", str(config_file),
     ]  # fmt: skip
-    with log.open("w", encoding="utf-8") as log_file:
-        # In a process of its own, Snakemake stops its jobs itself when the user interrupts the run.
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace"
-        ) as process:
-            assert process.stdout is not None
-            failed, last_lines = _follow(_copied_to(process.stdout, log_file), say)
-        if process.returncode:
-            raise RunError(_failure_text(failed, last_lines, log))
-
-
-def _copied_to(lines: Iterable[str], file: TextIO) -> Iterator[str]:
-    """Yield the lines without line ends, and copy each to the file."""
-    for line in lines:
-        file.write(line)
-        yield line.rstrip("\n")
-
-
-def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
-    """Show the progress of a run; return the logs of the stages that failed, and the last lines that stages printed."""
-    failed: dict[str, str] = {}
-    last_lines: deque[str] = deque(maxlen=MAX_EXPLANATION_LINES)
-    done: Counter[str] = Counter()
-    on_terminal, rule, part = sys.stderr.isatty(), "", None
-    bar: Progress[int] | None = None
-    for line in lines:
-        if match := _FINISHED.match(line):
-            rule, part = match[1], match[2]
-            done[rule] += 1
-        elif (match := _STEPS.match(line)) and rule in STAGE_DONE_TEXT:
-            steps, total = int(match[1]), int(match[2])
-            text = STAGE_DONE_TEXT[rule]
-            if part:
-                text += f", part {part}"
-            elif done[rule] > 1:
-                text = f"{done[rule]} {text}"
-            if on_terminal:
-                bar = bar or progress(total, "run", unit="step")
-                bar.say(text)
-                bar.reach(steps)
-            else:
-                say(f"step {steps} of {total} done: {text}")
-        elif match := _FAILED.match(line):
-            rule = match[1]
-            failed.setdefault(rule, "")
-        elif failed and (match := _STAGE_LOG.match(line)):
-            failed[rule] = failed[rule] or match[1].split(" (check log")[0]
-        elif line.startswith(LOCK_REMOVED):
-            say(line)
-        elif not _SNAKEMAKE_LINES.match(line):
-            last_lines.append(line)
-    if bar is not None:
-        bar.__exit__(None, None, None)
-    return failed, list(last_lines)
-
-
-def _failure_text(failed: dict[str, str], last_lines: list[str], log: Path) -> str:
-    """Name the stage that stopped a run, with its last output and its log."""
-    sentences = [line for line in last_lines if line.strip()]
-    if not failed:
-        return "\n".join([*sentences, f"The run stopped; its whole output is in {log}."])
-    stages = ", ".join(failed)
-    logs = ", ".join(path for path in failed.values() if path) or str(log)
-    return "\n".join(
-        [*sentences[-3:], f"The run stopped in {stages}; its log is {logs}, its whole output is in {log}."]
-    )
+    bar: Progress[None]
+    # Its standard output is what the stages say, since Snakemake itself is quiet; in a process of its own it stops its
+    # jobs itself when the user interrupts the run.
+    with (
+        log.open("w", encoding="utf-8") as errors,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=errors, env=os.environ | {RUN: "1"}, text=True, encoding="utf-8"
+        ) as process,
+        progress(0, "trials") as bar,
+    ):
+        assert process.stdout is not None
+        finished = {stage.done for stage in STAGES.values()}
+        for line in map(str.rstrip, process.stdout):
+            if match := _PROGRESS.fullmatch(line):
+                bar.reach(int(match[1]), int(match[2]))
+            elif line in finished:
+                say(line)
+    if process.returncode:
+        explanation = log.read_text(encoding="utf-8").splitlines()[-EXPLANATION_LINES:]
+        raise RunError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
 
 
 def run_lines(results: Path) -> list[str]:
     """Summarise finished results for the terminal: failed trials, path of the report, reasons, and last the verdict."""
-    from vinetrack.pipeline.diagnosis_stage import diagnosis_lines
+    from vinetrack.pipeline.model_stage import diagnosis_lines
     from vinetrack.results.folder_layout import Results, read_result
 
     trials = read_result(Results(results).trials)

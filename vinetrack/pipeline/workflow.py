@@ -8,22 +8,22 @@ from __future__ import annotations
 import atexit
 import contextlib
 import difflib
-import hashlib
 import json
 import os
 import re
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.tables import is_readable, write_text
 from vinetrack.figures.registry import figures_of
+from vinetrack.pipeline.kept import PACKAGE, code_hash
+from vinetrack.pipeline.stages import STAGES, Stage
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 # ------------------------------------------------------------------------------
 # The folders of a run: that of the experiment, and that of its results, which belong to one experiment only.
-
-PACKAGE = Path(__file__).parents[1]
 
 CLAIM_FILE = "experiment.json"  # File of a results folder that names its experiment from the start of a run
 
@@ -137,30 +135,13 @@ def has_wildcard(path: Path) -> bool:
 # Ownership of a results folder: only one run writes it at a time, and a killed run does not block the next one.
 #
 # A run holds a lock of the operating system as long as its process lives. Snakemake's own locks are files, which stay
-# when a run is killed: those that are found where nobody holds the lock of the results are left over.
+# when a run is killed; the profile and `vinetrack run` do without them.
 
 MIN_UNFINISHED_AGE_S = 60.0  # Age from which an unfinished file counts as abandoned; others may be written now (chosen)
 RUN_LOCK = ".run.lock"
 
-LOCK_REMOVED = "Removed the lock of an interrupted run"
 # Temporary names of files that are being written
 UNFINISHED_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
-
-# Options of Snakemake with which it executes no jobs, as its own parser names them
-NON_EXECUTING_OPTIONS = (
-    "dryrun", "unlock", "lint", "report", "summary", "detailed_summary", "dag", "rulegraph", "filegraph", "d3dag",
-    "list_rules", "list_target_rules", "list_changes", "list_input_changes", "list_params_changes",
-    "list_code_changes", "list_untracked", "archive", "cleanup_metadata", "cleanup_shadow", "delete_all_output",
-    "delete_temp_output", "containerize", "print_compilation",
-)  # fmt: skip
-
-
-def executes_nothing(options: Sequence[str]) -> bool:
-    """Whether Snakemake executes no jobs with these options, as in a dry run, a listing, or an unlock."""
-    from snakemake.cli import get_argument_parser
-
-    given, _ = get_argument_parser().parse_known_args(list(options))
-    return any(getattr(given, name, None) not in (None, False) for name in NON_EXECUTING_OPTIONS)
 
 
 def refuse_running(results: Path) -> None:
@@ -188,12 +169,10 @@ def _locked(results: Path) -> FileLock:
     return lock
 
 
-def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str], None]) -> FileLock:
+def begin_run(results: Path, experiment: Path) -> FileLock:
     """Make this process the owner of a results folder until it ends, and clean up after a killed run."""
     lock = _locked(results)
     claim_results(results, experiment)
-    if _remove_locks(working, results):
-        say(f"{LOCK_REMOVED}; the results that it finished are kept.")
     for path in [*results.rglob("*"), *experiment.glob("*")]:
         with contextlib.suppress(OSError):
             if UNFINISHED_FILES.fullmatch(path.name) and time.time() - path.stat().st_mtime >= MIN_UNFINISHED_AGE_S:
@@ -201,31 +180,8 @@ def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str
     return lock
 
 
-def _remove_locks(working: Path, results: Path) -> int:
-    """Remove Snakemake's locks on files of these results, not those of other results; return how many."""
-    removed = 0
-    inside = str(results.absolute()) + os.sep
-    for lock in sorted((working / ".snakemake" / "locks").glob("*.lock")):
-        with contextlib.suppress(OSError):
-            files = lock.read_text(encoding="utf-8").splitlines()
-            if any(str(working / file).startswith(inside) for file in files):
-                lock.unlink()
-                removed += 1
-    return removed
-
-
 # ------------------------------------------------------------------------------
 # What the Snakefile asks: the plan of a run with its inputs and outputs.
-
-
-@lru_cache(maxsize=1)
-def code_hash(package: Path = PACKAGE) -> str:
-    """Return a hash of the package, which as a parameter of every rule makes Snakemake rerun it after an edit."""
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 # Additional tables of an experiment that is compared with published numbers
@@ -242,25 +198,23 @@ PAPER_TABLES = (
 
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 
+TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings of a job take a minute or a few)
+
 # The rules: `vinetrack run` runs this file from anywhere, and the Snakefile of a checkout includes it
 SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
-
-# Largest number of tracks analysed, or of trial figures drawn, in one job of the workflow (chosen)
-TRIALS_PER_JOB = 100
 
 
 @dataclass(frozen=True)
 class WorkflowPlan:
     """Inputs and outputs of one run of the workflow. `trials` are all trials that get files (a trial with a faulty row
-    gets empty ones); `filmed` maps those that are recordings to their input files, `track_inputs` the others to their
-    tracks and traces.
+    gets empty ones), `filmed` those that are recordings; `inputs` are all input files that Snakemake can watch, and
+    `unwatched` is the state of the others.
     """
 
     experiment: Path
     results: Path
     trials: tuple[str, ...]
-    filmed: Mapping[str, tuple[str, ...]]
-    track_inputs: Mapping[str, tuple[str, ...]]
+    filmed: tuple[str, ...]
     inputs: tuple[Path, ...]
     unwatched: str
     settings: RunSettings
@@ -268,95 +222,65 @@ class WorkflowPlan:
     published: bool
 
     @property
-    def code(self) -> str:
-        """Hash of the package: an edit of its code reruns everything."""
-        return code_hash()
+    def version(self) -> str:
+        """Hash of the package, whose edit reruns everything, and the state of inputs that Snakemake cannot watch."""
+        return f"{code_hash()} {self.unwatched}"
 
     @property
-    def sheets(self) -> list[str]:
-        """The trial sheet, and the settings and corrections if they exist."""
-        return [path.as_posix() for path in self.inputs if path.name in SHARED_FILES]
+    def stages(self) -> dict[str, Stage]:
+        """The stages of this run: the comparison with the paper and clips only where they were asked for."""
+        clips = self.filmed and self.settings.overlays.of != "none"
+        wanted = {"paper": self.published, "overlays": clips}
+        return {name: stage for name, stage in STAGES.items() if wanted.get(name, True)}
 
     @property
-    def own_effects(self) -> list[str]:
-        """Files of the user's own effects."""
-        return [path.as_posix() for path in self.inputs if path.suffix == ".py"]
+    def jobs(self) -> dict[str, tuple[str, Stage, Sequence[str]]]:
+        """Jobs by name: the name of the stage, the stage, and the trials it is for. Trials are shared out over several
+        jobs where they are many, so that a cluster works on them at the same time.
+        """
+        jobs: dict[str, tuple[str, Stage, Sequence[str]]] = {}
+        for name, stage in self.stages.items():
+            step = TRIALS_PER_JOB if name == "trials" else len(self.trials)
+            parts = [self.trials[first : first + step] for first in range(0, len(self.trials), max(step, 1))] or [()]
+            jobs |= {name if len(parts) == 1 else f"{name}_{k}": (name, stage, part) for k, part in enumerate(parts, 1)}
+        return jobs
 
-    @property
-    def measurements(self) -> list[str]:
-        """Files that the virtual laboratory makes for a shipped experiment: recordings and a target, or tracks."""
-        return [path.as_posix() for path in self.inputs if path.name not in SHARED_FILES]
+    def files(self, group: str, trials: Sequence[str] | None = None) -> list[str]:
+        """Paths of a file or folder of the results, or of a group of files, as the table of stages names them; those of
+        some trials alone, or of all.
+        """
+        trials = self.trials if trials is None else trials
+        if not group.startswith("<"):
+            return [self.result(group)]
+        if group.startswith("<made of"):
+            stage = self.stages.get(group[9:-1])
+            return [path for part in stage.writes for path in self.files(part)] if stage else []
+        stated = [path for path in self.inputs if path.name in SHARED_FILES or path.suffix == ".py"]
+        measured = [path for path in self.inputs if path not in stated]
+        per_trial = {"<tracks>": ".csv", "<kinematics>": ".csv", "<analysed>": ".json"}
+        if group in per_trial:
+            return [self.result(group[1:-1], f"{trial}{per_trial[group]}") for trial in trials]
+        if group == "<pictures>":
+            filmed = [trial for trial in trials if trial in self.filmed]
+            return [*self._figures("trial_", trials), *self._figures("strip_", filmed)]
+        if group == "<paper>":
+            return [*(self.result(f"{name}.csv") for name in PAPER_TABLES), *self._figures("", figures_of("paper"))]
+        chosen = {"<experiment>": stated, "<measurements>": measured, "<inputs>": self.inputs}[group]
+        return [path.as_posix() for path in chosen]
 
     def result(self, *parts: str) -> str:
         """Path of a result."""
         return self.results.joinpath(*parts).as_posix()
 
-    @property
-    def tracked(self) -> tuple[str, ...]:
-        """Trials that are not recordings."""
-        return tuple(trial for trial in self.trials if trial not in self.filmed)
-
-    def track_files(self, trials: Iterable[str]) -> list[str]:
-        """Return the tracks and traces of trials that are not recordings."""
-        return [path for trial in trials for path in self.track_inputs.get(trial, ())]
-
-    @staticmethod
-    def parts(stage: str, trials: Sequence[str]) -> dict[str, list[str]]:
-        """Distribute trials over the jobs of a stage. Returns names of trials by name of the job, which is that of the
-        stage if there is only one job.
-        """
-        shares = [list(trials[first : first + TRIALS_PER_JOB]) for first in range(0, len(trials), TRIALS_PER_JOB)]
-        return {stage if len(shares) == 1 else f"{stage}_{number}": share for number, share in enumerate(shares, 1)}
-
-    def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
-        """Return the path of one result for each trial."""
-        return [self.result(folder, f"{trial}{suffix}") for trial in (self.trials if trials is None else trials)]
-
-    @property
-    def clips(self) -> list[str]:
-        """The folder of clips, if there are recordings and the settings ask for clips."""
-        return [self.result("overlays")] if self.filmed and self.settings.overlays.of != "none" else []
-
-    @staticmethod
-    def one_of(names: Iterable[str]) -> str:
-        """Return a regular expression that matches exactly these names."""
-        return "|".join(sorted(names)) or "there-is-none"
-
-    @property
-    def figure_list(self) -> str:
-        """The list of the figures of the whole experiment that were drawn; figures without content are not."""
-        return self.result("figures", "campaign.json")
-
-    @property
-    def paper_tables(self) -> list[str]:
-        """Tables of the comparison with the paper; none if it was not requested."""
-        return [self.result(f"{name}.csv") for name in PAPER_TABLES] if self.published else []
-
-    def paper_figures(self) -> list[tuple[str, str, str]]:
-        """Figures of the comparison with the paper: name, format and path."""
-        if not self.published:
-            return []
-        titles = {name: one.title for name, one in figures_of("paper").items()}
-        return [(titles[name], form, path) for name, form, path in self._figures(titles, "")]
-
-    def trial_figures(self, trials: Iterable[str] | None = None) -> list[tuple[str, str, str]]:
-        """Return the figures of single trials."""
-        return self._figures(self.trials if trials is None else trials, "trial_")
-
-    def figure_files(self) -> list[str]:
-        """Paths of all figures."""
-        figures = (*self.trial_figures(), *self._figures(self.filmed, "strip_"), *self.paper_figures())
-        return [self.figure_list, *(path for _, _, path in figures)]
-
-    def _figures(self, names: Iterable[str], prefix: str) -> list[tuple[str, str, str]]:
+    def _figures(self, prefix: str, names: Iterable[str]) -> list[str]:
         formats = self.settings.figures.formats
-        return [(name, form, self.result("figures", f"{prefix}{name}.{form}")) for name in names for form in formats]
+        return [self.result("figures", f"{prefix}{name}.{form}") for name in names for form in formats]
 
-    def stage_settings(self, *keys: str) -> str:
-        """Settings that a stage depends on, as JSON; without keys, all but the paths. A stage reruns only if one of
-        these changes. Paths are left out, since the same folder can be written in several ways.
+    def settings_of(self, stage: Stage) -> str:
+        """Settings that a stage depends on, as JSON; all but the paths if it names none. Paths are left out, since the
+        same folder can be written in several ways.
         """
-        chosen = set(keys) or set(type(self.settings).model_fields) - {"experiment", "results"}
+        chosen = set(stage.settings) or set(type(self.settings).model_fields) - {"experiment", "results"}
         return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
 
@@ -390,28 +314,11 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     targets = [folder / target] if target is not None and (is_virtual or is_readable(folder / target)) else []
     inputs = dict.fromkeys([*shared, *targets, *present])
     watched = {path: None for path in inputs if not has_wildcard(path)}
-    filmed = {
-        trial.name: tuple(
-            path.as_posix()
-            for path in (*shared, *targets, trial.video, trial.pressure_trace)
-            if path is not None and path in watched
-        )
-        for trial in experiment.trials
-        if trial.video is not None
-    }
-    track_inputs = {
-        trial.name: tuple(
-            path.as_posix() for path in (trial.track, trial.pressure_trace) if path is not None and path in watched
-        )
-        for trial in experiment.trials
-        if trial.video is None
-    }
     return WorkflowPlan(
         experiment=folder,
         results=results,
         trials=trials,
-        filmed=filmed,
-        track_inputs=track_inputs,
+        filmed=tuple(trial.name for trial in experiment.trials if trial.video is not None),
         inputs=tuple(watched),
         unwatched=_fingerprint(inputs),
         settings=settings,
@@ -439,30 +346,21 @@ def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
 
 
 def begin_run_or_exit(plan: WorkflowPlan) -> None:
-    """Call `begin_run`; print a refusal and exit with status 1. For the Snakefile, like `make_plan_or_exit`. Nothing is
-    begun if Snakemake executes no jobs (a dry run, for example), which only its command line tells.
-    """
-    if executes_nothing(sys.argv[1:]):
-        return
+    """Call `begin_run`; print a refusal and exit with status 1. For the Snakefile, like `make_plan_or_exit`."""
     try:
-        lock = begin_run(plan.results, plan.experiment, Path.cwd(), lambda line: print(line, flush=True))
+        lock = begin_run(plan.results, plan.experiment)
     except ExperimentError as error:
         print("\n".join(format_problems(error.problems)), file=sys.stderr, flush=True)
         raise SystemExit(1) from None
-    # At exit, since `onsuccess` runs before Snakemake's closing lines, and not at all if there was nothing to do.
-    atexit.register(_print_report_path, plan)
     atexit.register(lock.release)
 
 
-def keep_report_path_back() -> None:
-    """Do not print the path of the report of an earlier run at the end of one that failed."""
-    atexit.unregister(_print_report_path)
-
-
-def _print_report_path(plan: WorkflowPlan) -> None:
-    """Print the path of the report as the last line of this process, if it is newer than all inputs."""
+def print_report_path(plan: WorkflowPlan, workflow: Any) -> None:
+    """Print the path of the report at the end of this process, if Snakemake ran jobs or found nothing to do, and the
+    report is newer than all inputs; not after a listing, a dry run, or a run that failed.
+    """
     path = plan.results / "report.html"
-    if not path.exists():
+    if workflow.execution_settings is None or workflow.dryrun or not path.exists():
         return
     made = path.stat().st_mtime
     if all(source.stat().st_mtime <= made for source in plan.inputs if source.exists()):

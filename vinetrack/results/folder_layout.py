@@ -6,131 +6,52 @@ Names of trials are always text: `007` stays `007`, and a trial may be called `N
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vinetrack.core.problems import UserError
+from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import result_file
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.result import Diagnosis
+    from vinetrack.experiment.folder import Experiment
     from vinetrack.inference.fit_summary import FitSummary
 
 
 TRACK_COLUMNS = (
-    "frame",
-    "time_s",
-    "edge_px",
-    "lead_position_m",
-    "lead_position_sigma_m",
-    "flag",
-    "tracked_edge_px",
+    "frame", "time_s", "edge_px", "lead_position_m", "lead_position_sigma_m", "flag", "tracked_edge_px",
     "lead_position_systematic_m",
-)
+)  # fmt: skip
 KINEMATICS_COLUMNS = (
-    "time_s",
-    "lead_position_m",
-    "lead_velocity_m_s",
-    "lead_velocity_sigma_m_s",
-    "tail_velocity_m_s",
+    "time_s", "lead_position_m", "lead_velocity_m_s", "lead_velocity_sigma_m_s", "tail_velocity_m_s",
     "lead_acceleration_m_s2",
-)
+)  # fmt: skip
 TRIALS_COLUMNS = (
-    "trial",
-    "vine",
-    "condition",
-    "status",
-    "reason",
-    "n_frames",
-    "mm_per_px",
-    "scale_rel_sigma",
-    "noise_m",
-    "steady_from_s",
-    "steady_to_s",
-    "steady_rule",
-    "x_ss_m_s",
-    "x_ss_sigma_m_s",
-    "x_ss_paper_m_s",
-    "cv",
-    "force_N",
-    "final_lead_velocity_m_s",
-    "efficiency",
-    "tube_width_mm",
-    "growth_mm",
-)
+    "trial", "vine", "condition", "status", "reason", "n_frames", "mm_per_px", "scale_rel_sigma", "noise_m",
+    "steady_from_s", "steady_to_s", "steady_rule", "x_ss_m_s", "x_ss_sigma_m_s", "x_ss_paper_m_s", "cv", "force_N",
+    "final_lead_velocity_m_s", "efficiency", "tube_width_mm", "growth_mm",
+)  # fmt: skip
 STEADY_COLUMNS = (
-    "trial",
-    "rule",
-    "accepted",
-    "from_s",
-    "to_s",
-    "points",
-    "x_ss_m_s",
-    "x_ss_sigma_m_s",
-    "drift",
-    "drift_95_low",
-    "drift_95_high",
-    "cv",
-    "reason",
-)
+    "trial", "rule", "accepted", "from_s", "to_s", "points", "x_ss_m_s", "x_ss_sigma_m_s", "drift", "drift_95_low",
+    "drift_95_high", "cv", "reason",
+)  # fmt: skip
 POINT_COLUMNS = (
-    "trial",
-    "vine",
-    "condition",
-    "diameter_mm",
-    "thickness_um",
-    "pressure_kPa",
-    "window_pressure_kPa",
-    "pressure_source",
-    "x_ss_m_s",
-    "x_ss_sigma_m_s",
-    "force_N",
-    "force_sigma_N",
-    "yield_force_sigma_N",
-    "scale_rel_sigma",
-    "x_ss_paper_m_s",
-    "force_paper_N",
-    "eligible",
-    "used",
-    "reason",
-)
-TEXT_COLUMNS = frozenset(
-    {
-        "trial",
-        "vine",
-        "condition",
-        "status",
-        "reason",
-        "steady_rule",
-        "rule",
-        "flag",
-        "pressure_source",
-        "model",
-        "term",
-        "size",
-        "note",
-        "added",
-        "parameter",
-        "symbol",
-        "unit",
-        "against",
-        "sentence",
-        "row",
-        "where",
-        "quantity",
-        "setting",
-        "as_printed",
-        "mark",
-        "how",
-        "beside",
-        "figure",
-        "departure",
-        "method",
-    }
-)
+    "trial", "vine", "condition", "diameter_mm", "thickness_um", "pressure_kPa", "window_pressure_kPa",
+    "pressure_source", "x_ss_m_s", "x_ss_sigma_m_s", "force_N", "force_sigma_N", "yield_force_sigma_N",
+    "scale_rel_sigma", "x_ss_paper_m_s", "force_paper_N", "eligible", "used", "reason",
+)  # fmt: skip
+TEXT_COLUMNS = frozenset({
+    "trial", "vine", "condition", "status", "reason", "steady_rule", "rule", "flag", "pressure_source", "model",
+    "term", "size", "note", "added", "parameter", "symbol", "unit", "against", "sentence", "row", "where",
+    "quantity", "setting", "as_printed", "mark", "how", "beside", "figure", "departure", "method",
+})  # fmt: skip
 COUNT_COLUMNS = frozenset({"n_frames", "points"})
 TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative"})
 
@@ -139,136 +60,68 @@ class ResultsError(UserError):
     """A folder that is not a results folder, or lacks a file that is needed; one sentence with a remedy."""
 
 
+class _File:
+    """A file or folder of the results, as an attribute of `Results`."""
+
+    def __init__(self, *parts: str) -> None:
+        self.parts = parts
+
+    def __get__(self, results: Results, _: type[Results]) -> Path:
+        return results.folder.joinpath(*self.parts)
+
+
+class _Named:
+    """A file of each trial, condition or figure, as a method of `Results` that takes its name, and a suffix if it may
+    have several.
+    """
+
+    def __init__(self, folder: str, suffix: str = "", prefix: str = "") -> None:
+        self.folder, self.suffix, self.prefix = folder, suffix, prefix
+
+    def __get__(self, results: Results, _: type[Results]) -> Callable[..., Path]:
+        def path(name: str, suffix: str = self.suffix) -> Path:
+            return result_file(results.folder / self.folder, f"{self.prefix}{name}", suffix)
+
+        return path
+
+
 @dataclass(frozen=True)
 class Results:
     """Paths of a results folder."""
 
     folder: Path
 
-    @property
-    def trials(self) -> Path:
-        """One row per trial of the sheet."""
-        return self.folder / "trials.csv"
+    trials = _File("trials.csv")  # One row per trial of the sheet
+    steady = _File("steady.csv")  # Steady windows, one row per trial and rule
+    points = _File("damping_points.csv")  # Points of the damping fit, with the reason if a point is not used
+    conditions = _File("conditions.csv")  # Results of each condition, its replicates combined
+    damping = _File("damping.json")  # The damping law by both methods
+    scaling = _File("scaling.json")  # Scaling of B with the size of the vine
+    fit = _File("fit.json")  # The model in use, fitted to the trajectories
+    comparison = _File("comparison.csv")  # Comparison of model and measurement, one row per condition
+    model_check = _File("model_check.csv")  # B and n from steady windows, compared with those from whole trajectories
+    audit = _File("audit.csv")  # Size of neglected effects along the motion of each trial
+    diagnosis = _File("diagnosis.json")  # The diagnosis of the model in use
+    ladder = _File("ladder.csv")  # Errors of the initial model and of each later model
+    final_fit = _File("diagnosis", "final_fit.json")  # The fit with all added effects; exists only if there are any
+    overlays = _File("overlays")  # Folder of the clips
+    figure_list = _File("figures", "campaign.json")  # The figures of the whole experiment that were drawn
+    provenance = _File("provenance.json")  # Versions, settings and hashes of all inputs
+    report = _File("report.html")  # The report
 
-    @property
-    def steady(self) -> Path:
-        """Steady windows, one row per trial and rule."""
-        return self.folder / "steady.csv"
-
-    @property
-    def points(self) -> Path:
-        """Points of the damping fit, one row per trial, with the reason if a point is not used."""
-        return self.folder / "damping_points.csv"
-
-    @property
-    def conditions(self) -> Path:
-        """Results of each condition, its replicates combined."""
-        return self.folder / "conditions.csv"
-
-    @property
-    def damping(self) -> Path:
-        """The damping law by both methods."""
-        return self.folder / "damping.json"
-
-    @property
-    def scaling(self) -> Path:
-        """Scaling of B with the size of the vine."""
-        return self.folder / "scaling.json"
-
-    @property
-    def comparison(self) -> Path:
-        """Comparison of model and measurement, one row per condition."""
-        return self.folder / "comparison.csv"
-
-    @property
-    def model_check(self) -> Path:
-        """B and n from steady windows, compared with those from whole trajectories."""
-        return self.folder / "model_check.csv"
-
-    @property
-    def audit(self) -> Path:
-        """Size of neglected effects along the motion of each trial."""
-        return self.folder / "audit.csv"
-
-    @property
-    def fit(self) -> Path:
-        """The model in use, fitted to the trajectories."""
-        return self.folder / "fit.json"
-
-    def trajectories(self, condition: str) -> Path:
-        """Return the file of measured and modelled trajectories of one condition."""
-        return result_file(self.folder / "comparison", condition, ".csv")
-
-    @property
-    def diagnosis(self) -> Path:
-        """The diagnosis of the model in use."""
-        return self.folder / "diagnosis.json"
-
-    @property
-    def ladder(self) -> Path:
-        """Errors of the initial model and of each later model."""
-        return self.folder / "ladder.csv"
+    track = _Named("tracks", ".csv")  # Positions of one leading edge
+    kinematics = _Named("kinematics", ".csv")  # Motion of one leading edge
+    analysed = _Named("analysed", ".json")  # A trial's contribution to the tables of the experiment
+    trajectories = _Named("comparison", ".csv")  # Measured and modelled trajectories of one condition
+    predictions = _Named("diagnosis/predictions", ".csv")  # Predictions of one trial, by the initial and final model
+    overlay = _Named("overlays", ".mp4")  # The clip of one trial with the edges drawn
+    figure = _Named("figures")  # A figure of the whole experiment
+    trial_figure = _Named("figures", prefix="trial_")  # The figure of one trial
+    strip_figure = _Named("figures", prefix="strip_")  # The strip of one recording with its tracked edge
 
     def diagnosed(self, name: str) -> Path:
         """Return a file of the folder `diagnosis`."""
         return self.folder / "diagnosis" / name
-
-    @property
-    def final_fit(self) -> Path:
-        """The fit of the model with all effects that the diagnosis added; exists only if it added any."""
-        return self.folder / "diagnosis" / "final_fit.json"
-
-    def predictions(self, trial: str) -> Path:
-        """Return the file of one trial with the predictions of the initial and the final model."""
-        return result_file(self.folder / "diagnosis" / "predictions", trial, ".csv")
-
-    @property
-    def overlays(self) -> Path:
-        """Folder of the clips."""
-        return self.folder / "overlays"
-
-    def overlay(self, trial: str) -> Path:
-        """Return the clip of one trial with the edges drawn."""
-        return result_file(self.overlays, trial, ".mp4")
-
-    @property
-    def provenance(self) -> Path:
-        """Versions, settings and hashes of all inputs."""
-        return self.folder / "provenance.json"
-
-    @property
-    def report(self) -> Path:
-        """The report."""
-        return self.folder / "report.html"
-
-    def track(self, trial: str) -> Path:
-        """Return the file of the positions of one leading edge."""
-        return result_file(self.folder / "tracks", trial, ".csv")
-
-    def kinematics(self, trial: str) -> Path:
-        """Return the file of the motion of one leading edge."""
-        return result_file(self.folder / "kinematics", trial, ".csv")
-
-    def analysed(self, trial: str) -> Path:
-        """Return the file with a trial's contribution to the tables of the experiment."""
-        return result_file(self.folder / "analysed", trial, ".json")
-
-    def strip_figure(self, trial: str, suffix: str) -> Path:
-        """Return the strip figure of one recording with its tracked edge."""
-        return result_file(self.folder / "figures", f"strip_{trial}", suffix)
-
-    def figure(self, name: str, suffix: str) -> Path:
-        """Return a figure of the whole experiment."""
-        return result_file(self.folder / "figures", name, suffix)
-
-    @property
-    def figure_list(self) -> Path:
-        """List of the figures of the whole experiment that were drawn."""
-        return self.folder / "figures" / "campaign.json"
-
-    def trial_figure(self, trial: str, suffix: str) -> Path:
-        """Return the figure of one trial."""
-        return result_file(self.folder / "figures", f"trial_{trial}", suffix)
 
 
 def read_result(path: Path) -> pd.DataFrame:
@@ -350,3 +203,85 @@ def read_diagnosis(results: Results) -> Diagnosis | None:
         return Diagnosis.from_json(content, ladder if ladder is not None and len(ladder) else None)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise unreadable_file_error(results.diagnosis, error) from None
+
+
+# ------------------------------------------------------------------------------
+# The experiment that a results folder was made from, and its measured trials.
+
+
+def read_source_experiment(folder: Path, experiment: Path | None = None) -> Experiment:
+    """Read the experiment that a results folder was made from, as stated by its `provenance.json`."""
+    from vinetrack.experiment.folder import read_experiment
+
+    results = Results(folder)
+    if not folder.is_dir():
+        raise ResultsError(f"{folder} is not a folder: give the results folder of a run, such as results/NAME")
+    if not results.provenance.exists():
+        raise ResultsError(
+            f"{folder} is not a results folder, because it has no {results.provenance.name}: run vinetrack run or "
+            "snakemake first"
+        )
+    path = experiment or Path(str(read_json(results.provenance)["experiment"]))
+    if not path.is_dir():
+        raise ResultsError(
+            f"{folder} was made from {path}, which does not exist any more: give its new path with --experiment PATH"
+        )
+    return read_experiment(path)
+
+
+def measured_trials(
+    experiment: Experiment, results: Results
+) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
+    """Read the tracks and kinematics of all trials that did not fail from a results folder. Returns pairs, kinematics
+    (by name of trial).
+    """
+    pairs, kinematics = [], {}
+    failed: set[str] = set()
+    if results.trials.exists():
+        gathered = read_result(results.trials)
+        failed = set(gathered.loc[gathered["status"] == "failed", "trial"])
+    for trial in experiment.trials:
+        table = read_result(results.track(trial.name))
+        if len(table) and trial.name not in failed:
+            pairs.append((trial, read_stored_track(trial, table)))
+            kinematics[trial.name] = _kinematics(read_result(results.kinematics(trial.name)), trial.travel_ratio)
+    return pairs, kinematics
+
+
+def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
+    """Make a track of `tracks/<trial>.csv`, with the measured pressure. The results do not contain the pressure: it is
+    read from the user's track or pressure trace.
+    """
+    from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
+
+    systematic_m = table["lead_position_systematic_m"].to_numpy(dtype=float)
+    track = Track(
+        time_s=table["time_s"].to_numpy(dtype=float),
+        lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
+        lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
+        flag=table["flag"].to_numpy(dtype=str),
+        edge_px=table["edge_px"].to_numpy(dtype=float),
+        lead_position_systematic_m=systematic_m if np.isfinite(systematic_m).any() else None,
+    )
+    try:
+        if trial.pressure_trace is not None:
+            return attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+        source_track = load_track(trial) if trial.track is not None else None
+    except TrackError as error:
+        raise ResultsError(f"trial {trial.name}: {error}; then run snakemake again") from None
+    if source_track is None or source_track.pressure_Pa is None:
+        return track
+    return replace(track, pressure_Pa=np.interp(track.time_s, source_track.time_s, source_track.pressure_Pa))
+
+
+def _kinematics(table: pd.DataFrame, travel_ratio: float) -> Kinematics:
+    """Make kinematics of `kinematics/<trial>.csv`, which does not store smoothing windows and noise."""
+    names = ("time_s", "lead_position_m", "lead_velocity_m_s", "lead_velocity_sigma_m_s", "lead_acceleration_m_s2")
+    columns = {name: table[name].to_numpy(dtype=float) for name in names}
+    return Kinematics(
+        **columns,
+        window_points=np.zeros(len(table), dtype=int),
+        noise_m=np.nan,
+        noise_correlation=np.nan,
+        travel_ratio=travel_ratio,
+    )

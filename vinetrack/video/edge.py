@@ -84,14 +84,6 @@ def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
     return _cut_at_growth_end(strip, _better_path(strip))
 
 
-def front_path_by_change(strip: Strip) -> tuple[Floats, tuple[int, int]]:
-    """Find the initial path of the front by change alone, and the columns that it leaves permanently changed. Start and
-    end of growth are more exact than by appearance, for which several frames are averaged. Returns as
-    `initial_front_path`.
-    """
-    return _cut_at_growth_end(strip, _trim_to_changed_runs(*ky.path_by_change(strip)))
-
-
 def _cut_at_growth_end(strip: Strip, front_path: _FrontPath) -> _FrontPath:
     """End the passed columns where the film ends: a payload may fly on beyond it."""
     path, (begin, end) = front_path

@@ -6,6 +6,7 @@ Works on positions alone, in pixels by frame, from any tracker.
 from __future__ import annotations
 
 import bisect
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -239,16 +240,43 @@ FILM_PARTS = (0.7, 0.35, 0.175)
 FLIGHT_SPEED_RATIO = 1.35  # Ratio of the speeds after and before, below which the motion is still growth (chosen)
 
 
-def is_grown(edge_px: Floats, quality: PointQuality, length_px: float) -> bool:
-    """Whether the edge stops where the whole vine has grown; False where its length or its rest is unknown. Shapes:
-    edge_px (n_frames,).
+@dataclass(frozen=True)
+class Ending:
+    """How an edge ends: its way from standstill to standstill, and until the last frame where it still moves there, px
+    (NaN otherwise); `remarks` on where it stopped, and the `place` of all this among the notes.
     """
-    if quality.last_moving < 0 or not np.isfinite(length_px):
-        return False
+
+    grown_px: float = math.nan
+    truncated_px: float = math.nan
+    remarks: tuple[str, ...] = ()
+    name: str = ""
+    place: int = 0
+
+    def notes(self, length_px: float) -> list[str]:
+        """What a track is told about its end; nothing where the whole vine has grown."""
+        if abs(self.grown_px / length_px - 1) < GROWN_TOLERANCE:
+            return []
+        share = f", after {self.truncated_px / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
+        moves = f"{self.name}: the recording ends while the leading edge moves{share}"
+        return [*self.remarks, *([moves] if np.isfinite(self.truncated_px) else [])]
+
+
+def ending_of(
+    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_], whole: bool,
+    place: int,
+) -> Ending:  # fmt: skip
+    """How an edge that moved ends; only a `whole` recording can be truncated. Shapes: luma (n_frames, height, width);
+    edge_px, number (n_frames,).
+    """
     start, end = edge_px[: quality.first_moving], edge_px[quality.last_moving + 1 :]
-    if not (np.isfinite(start).any() and np.isfinite(end).any()):
-        return False
-    return bool(abs((np.nanmedian(end) - np.nanmedian(start)) / length_px - 1) < GROWN_TOLERANCE)
+    both = np.isfinite(start).any() and np.isfinite(end).any()
+    grown_px, truncated_px = float(np.nanmedian(end) - np.nanmedian(start)) if both else math.nan, math.nan
+    followed = np.flatnonzero(np.isfinite(edge_px))
+    if whole and quality.last_moving >= followed[-1] and quality.left_picture is None:
+        truncated_px = float(edge_px[followed[-1]]) - float(
+            np.median(edge_px[followed][: max(quality.first_moving, 1)])
+        )
+    return Ending(grown_px, truncated_px, tuple(growth_end_notes(luma, quality, edge_px, name, number)), name, place)
 
 
 def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
@@ -279,16 +307,6 @@ def growth_end_notes(
     if later - least > CHANGING_PART * (before - least):
         return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
     return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
-
-
-def truncation_notes(edge_px: Floats, quality: PointQuality, length_px: float, name: str) -> list[str]:
-    """Say that the recording ends while the edge is moving. Shapes: edge_px (n_frames,)."""
-    followed = np.flatnonzero(np.isfinite(edge_px))
-    if quality.last_moving < followed[-1] or quality.left_picture is not None:
-        return []
-    travel_px = edge_px[followed[-1]] - float(np.median(edge_px[followed][: max(quality.first_moving, 1)]))
-    share = f", after {travel_px / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
-    return [f"{name}: the recording ends while the leading edge moves{share}"]
 
 
 def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:

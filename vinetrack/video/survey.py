@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,11 +36,10 @@ from vinetrack.video.curved_axis import (
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.track import FEWEST_FRAMES, Tracking, track_frames, tube_strip
+from vinetrack.video.track import FEWEST_FRAMES, Tracking, in_metres, track_pixels, tube_strip
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.video.frames import RawFrames
 
 
 # ------------------------------------------------------------------------------
@@ -68,34 +67,51 @@ class Measurement:
         return float(np.max(position_m) - position_m[0]) if position_m.size else math.nan
 
 
-def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) -> Measurement:
-    """Decode, calibrate and track the recording of one trial."""
+Keep = Callable[[tuple[object, ...], Callable[[], Tracking]], Tracking]
+
+
+def measure_recording(
+    trial: Trial, settings: ExperimentSettings, folder: Path, keep: Keep | None = None
+) -> Measurement:
+    """Decode, calibrate and track the recording of one trial; see `measure`."""
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
     capture_rate(trial, recording)
-    return measure(trial, settings, recording, calibration_of(trial, settings, folder, recording))
+    return measure(trial, settings, recording, calibration_of(trial, settings, folder, recording), keep)
 
 
 def measure(
-    trial: Trial, settings: ExperimentSettings, recording: Recording, calibration: PlaneCalibration | None
+    trial: Trial,
+    settings: ExperimentSettings,
+    recording: Recording,
+    calibration: PlaneCalibration | None,
+    keep: Keep | None = None,
 ) -> Measurement:
-    """Track the recording of one trial by a calibration, or by the trial's own scale: the one look into a recording."""
+    """Track the recording of one trial by a calibration, or by the trial's own scale: the one look into a recording.
+    `keep` returns the tracking in pixels that it keeps for these inputs, or makes it by the function it is given.
+    """
     capture_fps = capture_rate(trial, recording)
     if calibration is None and not math.isfinite(trial.m_per_px):
         raise RecordingError(
             f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
         )
-    frames = read_event(recording, trial.frames_used)
     m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
     axis = given_axis(trial, settings, m_per_px)
-    along_path = None if calibration is None else calibration.along_path
-    tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, along_path=along_path)
-    rel_sigma = math.nan
+    diameter_px = math.nan if axis is None else trial.diameter_m / m_per_px  # an axis that is found has its width
+    exposure_s = capture_exposure(trial, recording)
+    inputs = recording.path, trial.frames_used, trial.travel_ratio, capture_fps, exposure_s, axis, diameter_px
+
+    def track() -> Tracking:
+        return track_pixels(read_event(recording, trial.frames_used), trial, capture_fps, axis, diameter_px)
+
+    tracking = track() if keep is None else keep(inputs, track)
+    rel_sigma, position_m = math.nan, None
     if calibration is not None:
         bent = isinstance(tracking.axis, CurvedAxis) and math.isfinite(tracking.tube_width_sigma_px)
         along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
-        m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
+        m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
+    tracking = in_metres(tracking, trial, m_per_px, position_m)
     notes = [*tracking.track.notes]
     # Notes on a scale that was merely given belong to the experiment, not to each of its trials.
     if calibration is not None and math.isfinite(calibration.reprojection_px):
@@ -245,17 +261,12 @@ def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
         f"moves {number(tracking.fast_px_per_frame, 2)} px a frame"
     )
     severity = "error" if difference_px > 2 * EXPOSURE_TOLERANCE_PX else "warning"
-    remedy = "check exposure_us, its unit and capture_fps"
-    return [
-        Problem(
-            message=message,
-            severity=severity,
-            column="exposure_us",
-            value=f"{stated_us:g}",
-            remedy=remedy,
-            of_a_measurement=True,
-        )
-    ]
+    given: dict[str, Any] = {
+        "column": "exposure_us",
+        "value": f"{stated_us:g}",
+        "remedy": "check exposure_us, its unit and capture_fps",
+    }
+    return [Problem(message=message, severity=severity, of_a_measurement=True, **given)]
 
 
 def _near_one(ratio: float) -> bool:
@@ -272,13 +283,9 @@ def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str
     """The problem of a stated size, an error beyond ERROR_FACTOR."""
     severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
     return Problem(
-        message=f"differs: {seen}",
-        severity=severity,
-        column=column,
-        value=f"{stated_mm:g}",
-        remedy=remedy,
+        message=f"differs: {seen}", severity=severity, column=column, value=f"{stated_mm:g}", remedy=remedy,
         of_a_measurement=True,
-    )
+    )  # fmt: skip
 
 
 def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
@@ -328,21 +335,8 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
     `down` is the growth angle from straight down as the sheet states it: no picture shows it.
     """
     rows = [_cells(fact, trial) for fact, trial in zip(facts, trials, strict=True)]
-    head = (
-        "recording",
-        "frames",
-        "rate",
-        "plays",
-        "lasts",
-        "scale",
-        "picture",
-        "axis",
-        "down",
-        "tube",
-        "sheet",
-        "growth",
-        "sheet",
-    )
+    head = ("recording", "frames", "rate", "plays", "lasts", "scale", "picture", "axis", "down",
+            "tube", "sheet", "growth", "sheet")  # fmt: skip
     units = ("", "", "1/s", "1/s", "s", "mm/px", "mm", "px", "°", "mm", "mm", "mm", "mm")
     return table(rows, head, units, align="<>>>>>><>>>>>")
 
@@ -389,7 +383,8 @@ class Surveyor:
     trials whose recordings were tracked.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, keep: Keep | None = None) -> None:
+        self.keep = keep
         self.facts: dict[Trial, RecordingFacts] = {}
         self.looked_into: list[Trial] = []
 
@@ -414,17 +409,12 @@ class Surveyor:
             facts, of_trial = _stated_facts(trial, experiment.settings, opened[trial], scale), []
             if trial in self.looked_into:
                 with contextlib.suppress(RecordingError):
-                    measurement = measure(trial, experiment.settings, opened[trial], scale)
+                    measurement = measure(trial, experiment.settings, opened[trial], scale, self.keep)
                     facts = tracked_facts(trial, measurement)
                     of_trial = [*size_problems(trial, facts), *exposure_problems(trial, measurement.tracking)]
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
             self.facts[trial] = facts
         return problems + of_scale
-
-
-def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
-    """List the problems of the recordings of these trials; see `Surveyor`."""
-    return Surveyor()(experiment, trials)
 
 
 def _one_per_condition(trials: list[Trial]) -> list[Trial]:
@@ -487,7 +477,8 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
 def _frames_present(recording: Recording) -> int | None:
     """Number of frames in the file, if it can be known without decoding; None otherwise."""
     if recording.raw is not None:
-        return _raw_frames_present(recording.path.stat().st_size, recording.raw)
+        size, raw = recording.path.stat().st_size, recording.raw
+        return sum(offset + raw.frame_bytes <= size for offset in raw.offsets)
     if recording.kind != "container":
         return recording.declared_frames
     import av
@@ -505,11 +496,6 @@ def _frames_present(recording: Recording) -> int | None:
     except (av.error.FFmpegError, AttributeError):
         # The walk met damage, which decoding will report.
         return None
-
-
-def _raw_frames_present(size: int, raw: RawFrames) -> int:
-    """Number of whole frames in a raw file of `size` bytes."""
-    return sum(offset + raw.frame_bytes <= size for offset in raw.offsets)
 
 
 Calibrations = dict[tuple[int, int], "PlaneCalibration"]

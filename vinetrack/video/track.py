@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -38,20 +38,18 @@ from vinetrack.video.point_quality import (
     LARGEST_BODY_FACTOR,
     LARGEST_FACTOR,
     LOST_SIGMA_PX,
+    Ending,
     PointQuality,
     assess_points,
     body_end_note,
     calibrated_sigma,
-    growth_end_notes,
-    is_grown,
-    truncation_notes,
+    ending_of,
 )
 from vinetrack.video.small_pictures import SmallPictures, read_event
 from vinetrack.video.strip import Strip, recut, snap_to_grid
 
 if TYPE_CHECKING:
     from vinetrack.video.body import BodyEnd
-    from vinetrack.video.calibration import AxisScale
     from vinetrack.video.edge import EdgeFit
 
 
@@ -276,6 +274,7 @@ class Tracking:
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan
     strip_frames: Indices | None = None
+    ending: Ending = field(default_factory=Ending)
 
     @property
     def strip_rows(self) -> Indices:
@@ -307,9 +306,18 @@ def track_frames(
     *,
     m_per_px: float | None = None,
     position_m: Callable[[Floats], Floats] | None = None,
-    along_path: Callable[[Axis], AxisScale] | None = None,
 ) -> Tracking:
     """Track frames that are already in memory; see `track_recording`."""
+    scale = trial.m_per_px if m_per_px is None else m_per_px
+    return in_metres(track_pixels(frames, trial, capture_fps, axis, trial.diameter_m / scale), trial, scale, position_m)
+
+
+def track_pixels(
+    frames: Frames, trial: Trial, capture_fps: float, axis: Axis | None, diameter_px: float = math.nan
+) -> Tracking:
+    """Track frames in pixels: the part of a tracking that neither the scale nor the sizes in the sheet change, but for
+    the width of a given axis. Errors are in px, positions in metres NaN; `in_metres` gives them.
+    """
     name = frames.recording.path.name
     exposure_s = capture_exposure(trial, frames.recording)
     selection = _select_frames(frames, trial)
@@ -317,7 +325,7 @@ def track_frames(
     luma = frames.luma if len(rows) == len(frames) else frames.luma[rows]
     axis_given = axis is not None
     try:
-        axis, front_share_of = locate_axis(luma, axis, trial, m_per_px)
+        axis, front_share_of = locate_axis(luma, axis, trial, diameter_px)
         strip, followed = follow(luma, trial, axis, exposure_s * capture_fps, front_share_of)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
@@ -329,21 +337,15 @@ def track_frames(
     if quality.last_moving < 0:
         raise RecordingError(f"{name}: {_why_motionless(total_px, quality)}")
     errors_px = _random_error(random_px, followed, quality), _slow_error(strip, followed)
-    scale = trial.m_per_px if m_per_px is None else m_per_px
-    if along_path is not None:
-        along = along_path(strip.axis)
-        scale, position_m = along.m_per_px, along.position_m
-    length_px = trial.length_m / scale
-    notes = _notes(frames, selection, luma, trial, strip, followed, quality, length_px, axis_given)
+    notes, ending = _notes(frames, selection, luma, trial, strip, followed, quality, axis_given)
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
-    track = in_metres(corrected_by_hand(track, trial.corrections), strip.axis, scale, position_m)
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
     pictures = tuple((int(number[i]), luma[i].copy()) for i in shown)
     shake_px = np.zeros(frames.n_recorded)
     shake_px[number] = shake_along(strip, followed.edge_px) if strip.stabilised else 0.0
     return Tracking(
         track, strip.axis, _kymograph(strip), pictures, followed.blur_px, followed.exposure_frames, shake_px,
-        *followed.width_px, *followed.seen_exposure, strip_frames=number,
+        *followed.width_px, *followed.seen_exposure, strip_frames=number, ending=ending,
     )  # fmt: skip
 
 
@@ -425,17 +427,16 @@ def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
 
 def _notes(
     frames: Frames, selection: _Selection, luma: NDArray[Any], trial: Trial, strip: Strip, followed: Positions,
-    quality: PointQuality, length_px: float, axis_given: bool,
-) -> list[str]:  # fmt: skip
-    """Sentences about the track: its points, its end, its axis, and the frames left out."""
+    quality: PointQuality, axis_given: bool,
+) -> tuple[list[str], Ending]:  # fmt: skip
+    """Sentences about the track: its points, its end, its axis, and the frames left out; and how it ends."""
     name, number = frames.recording.path.name, selection.number
-    notes = [*frames.notes, *quality.notes]
+    notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
         notes.append(f"{name}: {body_end_note(followed.end, number)}")
-    elif not is_grown(followed.edge_px, quality, length_px):
-        notes += growth_end_notes(luma, quality, followed.edge_px, name, number)
-        if trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1:
-            notes += truncation_notes(followed.edge_px, quality, length_px, name)
+    else:
+        whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
+        ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
     if isinstance(strip.axis, CurvedAxis) and not axis_given:
         notes.append(f"{name}: {curve_note(strip.axis)}")
     if not followed.is_edge:
@@ -443,22 +444,22 @@ def _notes(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
             "to about a pixel"
         )
-    return [*notes, *selection.notes]
+    return [*notes, *selection.notes], ending
 
 
-def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, FrontShare]:
+def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, diameter_px: float) -> tuple[Axis, FrontShare]:
     """Find the growth axis, or give a known one a width and centre it on the motion. Returns the axis, px, and a
     function from an axis of its kind, straight or curved, to its `axis.front_share`: below: `axis.LEAST_FRONT_SHARE`
     where the vine bends or sweeps away. Shapes: luma (n_frames, height, width).
     """
     given = axis is not None
     if isinstance(axis, CurvedAxis):
-        return _given_curve(luma, axis, trial, m_per_px)
+        return _given_curve(luma, axis, diameter_px)
     small = SmallPictures(luma)
     if axis is None and trial.travel_ratio == 2:
         axis = find_growth_axis(small, luma)
     axis = axis if axis is not None else find_axis(small, grows=False)
-    axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
+    axis = replace(axis, width_px=2 * _half_width(axis, diameter_px))
     if given and not axis.bends:
         # A margin for an axis a few degrees off; it is centred on the motion, here or by `tube_strip`.
         axis = replace(axis, width_px=axis.width_px + GIVEN_AXIS_MARGIN * axis.length_px)
@@ -467,26 +468,21 @@ def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     return axis, front_share_function(small, luma)
 
 
-def _given_curve(
-    luma: NDArray[Any], axis: CurvedAxis, trial: Trial, m_per_px: float | None
-) -> tuple[CurvedAxis, FrontShare]:
+def _given_curve(luma: NDArray[Any], axis: CurvedAxis, diameter_px: float) -> tuple[CurvedAxis, FrontShare]:
     """A given curve with a width, no wider than its curvature allows; see `locate_axis`."""
-    half = _half_width(axis, trial, m_per_px)
-    width_known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
+    half = _half_width(axis, diameter_px)
+    width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
     check_curve(axis, half if width_known else math.nan, luma.shape[1:])
     wide = min(2 * half + GIVEN_AXIS_MARGIN * axis.length_px, 2 * axis.largest_half_px)
     axis = replace(axis, width_px=max(wide, 2 * half) if width_known else wide)
     return axis, partial(front_share_on_curve, luma)
 
 
-def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
+def _half_width(axis: Axis, diameter_px: float) -> float:
     """Half the width of the tube, px: the axis's, else the sheet's diameter by the scale, else a tenth of the axis."""
     if np.isfinite(axis.width_px):
         return axis.width_px / 2
-    scale = trial.m_per_px if m_per_px is None else m_per_px
-    if np.isfinite(trial.diameter_m) and np.isfinite(scale):
-        return trial.diameter_m / scale / 2
-    return 0.1 * axis.length_px
+    return diameter_px / 2 if np.isfinite(diameter_px) else 0.1 * axis.length_px
 
 
 def _assemble(
@@ -516,29 +512,33 @@ def _assemble(
     )  # fmt: skip
 
 
-def in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[Floats], Floats] | None) -> Track:
-    """Convert a track from pixels along its axis to metres. Shapes: position_m (n, 2)."""
-    if position_m is None:
-        return _scaled(track, track.edge_px * m_per_px, m_per_px)
-    finite = np.isfinite(track.edge_px)
-    position = np.full(len(track.edge_px), np.nan)
-    local_scale = np.full(len(track.edge_px), np.nan)
-    if finite.any():
-        along = track.edge_px[finite]
-        position[finite] = position_m(axis.points(along))
-        local_scale[finite] = position_m(axis.points(along + 0.5)) - position_m(axis.points(along - 0.5))
-    return _scaled(track, position, np.abs(local_scale))
-
-
-def _scaled(track: Track, position_m: Floats, m_per_px: Floats | float) -> Track:
-    """The track with these positions and with its errors in metres."""
+def in_metres(
+    tracking: Tracking, trial: Trial, m_per_px: float, position_m: Callable[[Floats], Floats] | None = None
+) -> Tracking:
+    """A tracking in pixels with hand corrections, positions and errors in metres, and notes on its end where that is
+    not the end of the vine. Shapes: position_m (n, 2).
+    """
+    ending, length_px = tracking.ending, trial.length_m / m_per_px
+    notes = [*tracking.track.notes]
+    notes[ending.place : ending.place] = ending.notes(length_px)
+    track = corrected_by_hand(replace(tracking.track, notes=tuple(notes)), trial.corrections)
+    position = track.edge_px * m_per_px
+    local_m_per_px: Floats | float = m_per_px
+    if position_m is not None:
+        finite, along = np.isfinite(track.edge_px), track.edge_px[np.isfinite(track.edge_px)]
+        position, local_m_per_px = np.full((2, len(track.edge_px)), np.nan)
+        if finite.any():
+            points = tracking.axis.points
+            position[finite] = position_m(points(along))
+            local_m_per_px[finite] = np.abs(position_m(points(along + 0.5)) - position_m(points(along - 0.5)))
     slow_px = track.lead_position_systematic_m
-    return replace(
+    track = replace(
         track,
-        lead_position_m=position_m,
-        lead_position_sigma_m=track.lead_position_sigma_m * m_per_px,
-        lead_position_systematic_m=None if slow_px is None else slow_px * m_per_px,
+        lead_position_m=position,
+        lead_position_sigma_m=track.lead_position_sigma_m * local_m_per_px,
+        lead_position_systematic_m=None if slow_px is None else slow_px * local_m_per_px,
     )
+    return replace(tracking, track=track)
 
 
 def _kymograph(strip: Strip) -> NDArray[np.float32]:

@@ -1,0 +1,452 @@
+"""The stages of the trials: from recording or track to kinematics and figures of each, and the tables of all of them.
+
+Worker processes take one trial after another. The track of a recording in pixels and the pictures of a trial are kept
+(`kept.py`). A trial that fails writes its reason and never stops the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import multiprocessing
+import os
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from vinetrack.core.problems import INTERNAL_ERROR
+from vinetrack.core.records import Kinematics, Track, Trial, Window
+from vinetrack.core.tables import is_disk_full, write_csv, write_json
+from vinetrack.figures.registry import describe_trial
+from vinetrack.pipeline.kept import Kept
+from vinetrack.results.folder_layout import (
+    COUNT_COLUMNS,
+    KINEMATICS_COLUMNS,
+    POINT_COLUMNS,
+    STEADY_COLUMNS,
+    TEXT_COLUMNS,
+    TRACK_COLUMNS,
+    TRIALS_COLUMNS,
+    TRUTH_COLUMNS,
+    Results,
+    empty_table,
+    read_json,
+    read_result,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from vinetrack.core.problems import Problem
+    from vinetrack.dynamics.model import Model
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import DampingSettings, FigureSettings, RunSettings
+    from vinetrack.video.survey import Measurement
+
+log = logging.getLogger(__name__)
+
+# ------------------------------------------------------------------------------
+# Applying a function to many trials in several processes.
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
+    """Yield `function(item)` of every item as soon as it is ready, in any order. `function` and items are sent to other
+    processes and must be picklable.
+    """
+    if n_workers < 2 or len(items) < 2:
+        yield from map(function, items)
+        return
+    # Forked on Linux, where workers are ready at once and share what is imported, and spawned elsewhere.
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(min(n_workers, len(items)), mp_context=context, initializer=_end_with_parent) as pool:
+        futures = [pool.submit(function, item) for item in items]
+        try:
+            yield from (future.result() for future in as_completed(futures))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent process ends, even if the parent is killed. A worker waits for its next argument
+    on a pipe that the other workers hold open as well: after a killed run all of them would wait forever and keep their
+    memory.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, name="end with the parent", daemon=True).start()
+
+
+# ------------------------------------------------------------------------------
+# One trial: its track, kinematics, contribution to the tables, and pictures.
+
+TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
+
+
+def analyse_trials(
+    experiment: Experiment,
+    folder: Path,
+    settings: RunSettings,
+    n_workers: int = 1,
+    only: Collection[str] | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, str]:
+    """Analyse all trials that are used, or only some; write the files of each in `tracks/`, `kinematics/`, `analysed/`
+    and `figures/`. Trials with a faulty row of the sheet get empty files. Returns reasons of failed trials by name;
+    `say` is told how many are finished.
+    """
+    names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
+    model_of(experiment)
+    if n_workers > 1:
+        _import_for_workers(experiment)
+    work = partial(_analyse, experiment=experiment, results=Results(folder), settings=settings)
+    failed = {}
+    for count, (name, reason, fault) in enumerate(map_unordered(work, names, n_workers), 1):
+        log.info("%s: %s", name, reason or "analysed")
+        if fault:
+            log.error("trial %s:\n%s", name, fault)
+        if reason:
+            failed[name] = reason
+        say(f"{count} of {len(names)} trials")
+    Kept(folder).forget()
+    return {name: failed[name] for name in names if name in failed}
+
+
+def _import_for_workers(experiment: Experiment) -> None:
+    """Import what every worker needs once, before they are forked."""
+    import vinetrack.figures.motion_figures
+    import vinetrack.kinematics.summary
+
+    if any(trial.video is not None for trial in experiment.trials):
+        import vinetrack.figures.overlay
+        import vinetrack.video.survey  # noqa: F401
+
+
+def _analyse(name: str, experiment: Experiment, results: Results, settings: RunSettings) -> tuple[str, str, str]:
+    """Analyse one trial in a worker process. Returns its name, why it failed (blank if it did not), and the traceback
+    of an unexpected exception (blank if there was none).
+    """
+    from vinetrack.kinematics.summary import TrialError, summarise_trial
+    from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
+    from vinetrack.video.frames import RecordingError
+
+    reason, fault, kept = experiment.failed.get(name, ""), "", Kept(results.folder)
+    if reason:
+        _write(results, name, _bare_row(name, "failed", reason))
+        _draw_trial(name, None, results, settings.figures, kept)
+        return name, reason, fault
+    trial, measurement, summary = experiment.trial(name), None, None
+    columns: dict[str, float] = {}
+    view: dict[str, Any] = {}
+    try:
+        if trial.video is None:
+            track = load_track(trial)
+        else:
+            measurement = _measure(trial, experiment, kept)
+            contradictions = _contradictions(trial, measurement)
+            track = measurement.tracking.track
+            track = replace(track, notes=(*track.notes, *(problem.reason for problem in contradictions)))
+            if trial.pressure_trace is not None:
+                track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+            columns = {
+                "mm_per_px": 1e3 * measurement.m_per_px,
+                "scale_rel_sigma": measurement.scale_rel_sigma,
+                "tube_width_mm": 1e3 * measurement.m_per_px * measurement.tracking.tube_width_px,
+            }
+            view = _calibration_and_axis(measurement, getattr(experiment.settings.calibration, "image", None))
+            view["contradictions"] = [{"column": one.column, "reason": one.reason} for one in contradictions]
+        summary = summarise_trial(trial, track, settings, model_of(experiment))
+    except (RecordingError, TrackError, TrialError) as error:
+        from_file = trial.track if isinstance(error, TrackError) and trial.video is None else None
+        reason = f"{from_file.name} {error}" if from_file else str(error)
+    except Exception as error:
+        if is_disk_full(error):
+            raise  # a full disk is not a fault of this trial
+        reason, fault = TRIAL_NOT_ANALYSED, traceback.format_exc()
+    if summary is None:
+        _write(results, name, failed_row(trial, reason), **view)
+    else:
+        row = dict(summary.row) | columns
+        point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
+        windows = [_window_row(name, window) for window in summary.windows.values()]
+        tables = _track_table(summary.track), _kinematics_table(summary.kinematics)
+        _write(results, name, row, *tables, windows=windows, point=point, **view)
+    _draw_trial(name, trial, results, settings.figures, kept)
+    if trial.video is not None:
+        _draw_strip(trial, results, measurement, reason, settings.figures, kept)
+    return name, reason, fault
+
+
+def _measure(trial: Trial, experiment: Experiment, kept: Kept) -> Measurement:
+    from vinetrack.video.frames import RecordingError, inspect_recording
+    from vinetrack.video.images import capture_rate
+    from vinetrack.video.survey import measure
+
+    assert trial.video is not None
+    recording = inspect_recording(trial.video)
+    capture_rate(trial, recording)
+    calibration, settings = None, experiment.settings.calibration
+    if not np.isfinite(trial.m_per_px) and settings is not None:
+        calibration = _calibration(settings, experiment.folder, recording.width, recording.height)
+        if isinstance(calibration, RecordingError):
+            raise calibration
+    return measure(trial, experiment.settings, recording, calibration, kept.track)
+
+
+@lru_cache(maxsize=8)
+def _calibration(settings: Any, folder: Path, width_px: int, height_px: int) -> Any:
+    """The calibration for a size of picture, or the error; each process looks at a board once."""
+    from vinetrack.video.calibration import CalibrationError, calibrate
+    from vinetrack.video.frames import RecordingError
+
+    try:
+        return calibrate(settings, folder, width_px, height_px)
+    except CalibrationError as error:
+        return RecordingError(f"calibration: {error}")
+
+
+def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:
+    """Return the measured sizes and exposures that contradict the sheet, as warnings."""
+    from vinetrack.video.frames import RecordingError
+    from vinetrack.video.survey import exposure_problems, size_problems, tracked_facts
+
+    problems = size_problems(trial, tracked_facts(trial, measurement))
+    problems += exposure_problems(trial, measurement.tracking)
+    errors = [problem.reason for problem in problems if problem.severity == "error"]
+    if errors:
+        raise RecordingError("; ".join(errors))
+    return problems
+
+
+def _calibration_and_axis(measurement: Measurement, image: str | None) -> dict[str, Any]:
+    """Return the calibration of a recording, and the axis along which its `edge_px` is measured, as JSON entries."""
+    from vinetrack.video.curved_axis import axis_entry
+
+    calibration = measurement.calibration
+    entry: dict[str, Any] = {
+        "kind": "sheet" if calibration is None else calibration.kind,
+        "image": image if calibration is not None else None,
+        "mm_per_px": 1e3 * measurement.m_per_px,
+        "scale_rel_sigma": measurement.scale_rel_sigma,
+        "reprojection_px": None if calibration is None else calibration.reprojection_px,
+        "n_corners": 0 if calibration is None else calibration.n_corners,
+        "n_pictures": 0 if calibration is None else calibration.n_pictures,
+        "notes": [] if calibration is None else calibration.notes,
+    }
+    axis, shake_px = measurement.tracking.axis, measurement.tracking.shake_px
+    line = axis_entry(axis) | {"width_px": axis.width_px}
+    line |= {"shake_px": shake_px.round(2)} if np.any(shake_px) else {}
+    return {"calibration": entry, "axis": line}
+
+
+@lru_cache(maxsize=1)
+def _model(names: tuple[str, ...], paths: tuple[Path, ...]) -> Model:
+    from vinetrack.dynamics.model import make_model
+    from vinetrack.effects import load_effect
+
+    return make_model(names, {effect.name: effect for effect in map(load_effect, paths)})
+
+
+def model_of(experiment: Experiment) -> Model:
+    """Return the model in use; each process makes its own, since a user's effects cannot be pickled."""
+    return _model(experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects))
+
+
+def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
+    """Return the row of `trials.csv` of a trial that failed."""
+    return _bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
+
+
+def _bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
+    """Return a row of `trials.csv` for a trial without results."""
+    blank: dict[str, Any] = dict.fromkeys(TRIALS_COLUMNS, np.nan)
+    return blank | {"trial": trial, "vine": "", "condition": "", "status": status, "reason": reason, "steady_rule": ""}
+
+
+def _write(
+    results: Results,
+    trial: str,
+    row: dict[str, Any],
+    track: pd.DataFrame | None = None,
+    kinematics: pd.DataFrame | None = None,
+    *,
+    windows: Sequence[dict[str, Any]] = (),
+    point: dict[str, Any] | None = None,
+    **view: Any,
+) -> None:
+    """Write the files of a trial; without results, tables with headers only and its row."""
+    write_csv(results.track(trial), empty_table(TRACK_COLUMNS) if track is None else track)
+    write_csv(results.kinematics(trial), empty_table(KINEMATICS_COLUMNS) if kinematics is None else kinematics)
+    write_json(results.analysed(trial), {"row": row, "windows": windows, "point": point, **view})
+
+
+def _track_table(track: Track) -> pd.DataFrame:
+    """Return a track as the table `tracks/<trial>.csv`: one row per frame, `frame` counted from 0."""
+    import pandas as pd
+
+    columns = (
+        np.arange(len(track.time_s)),
+        track.time_s,
+        track.edge_px,
+        track.lead_position_m,
+        track.lead_position_sigma_m,
+        track.flag,
+        track.edge_px if track.tracked_px is None else track.tracked_px,
+        np.nan if track.lead_position_systematic_m is None else track.lead_position_systematic_m,
+    )
+    return pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
+
+
+def _kinematics_table(kinematics: Kinematics) -> pd.DataFrame:
+    """Return kinematics as the table `kinematics/<trial>.csv`."""
+    import pandas as pd
+
+    return pd.DataFrame({column: getattr(kinematics, column) for column in KINEMATICS_COLUMNS})
+
+
+def _window_row(trial: str, window: Window) -> dict[str, Any]:
+    low, high = window.drift_95
+    row = {column: getattr(window, column, None) for column in STEADY_COLUMNS}
+    return row | {"trial": trial, "points": window.n_points, "drift_95_low": low, "drift_95_high": high}
+
+
+def _draw_trial(name: str, trial: Trial | None, results: Results, settings: FigureSettings, kept: Kept) -> None:
+    """Draw position, speed and steady windows of a trial, unless nothing in them changed."""
+    windows = _frame(read_json(results.analysed(name))["windows"], STEADY_COLUMNS)
+
+    def draw() -> Figure:
+        from vinetrack.figures.style import blank
+
+        title = describe_trial(trial) if trial is not None else name
+        return draw_trial(results, trial, name, windows) or blank(f"{title}: no positions to draw.")
+
+    shown = [results.track(name), results.kinematics(name)]
+    content = hashlib.sha256(b"".join(path.read_bytes() for path in shown)).hexdigest()
+    about = describe_trial(trial) if trial is not None else "", trial.travel_ratio if trial is not None else 0
+    inputs = "trial", name, *about, content, windows.to_csv()
+    kept.figure(inputs, partial(results.trial_figure, name), settings, draw)
+
+
+def draw_trial(results: Results, trial: Trial | None, name: str, windows: pd.DataFrame | None = None) -> Figure | None:
+    """Draw position, speed and steady windows of one trial; None if there are no positions."""
+    from vinetrack.figures.motion_figures import draw_trial_motion
+
+    title, ratio = (describe_trial(trial), trial.travel_ratio) if trial is not None else (name, 2.0)
+    if windows is None:
+        windows = read_result(results.steady).loc[lambda table: table["trial"] == name]
+    tables = read_result(results.track(name)), read_result(results.kinematics(name))
+    return draw_trial_motion(title, *tables, windows, ratio)
+
+
+def _draw_strip(
+    trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: FigureSettings, kept: Kept
+) -> None:
+    """Draw the strip of a recording with its tracked edge, unless nothing in it changed."""
+
+    def draw() -> Figure:
+        from vinetrack.figures.overlay import draw_strip
+        from vinetrack.figures.style import blank
+
+        if measurement is None:
+            return blank(f"{trial.name}: {reason}")
+        return draw_strip(trial.name, measurement.tracking, measurement.m_per_px)
+
+    inputs: tuple[object, ...] = ("strip", trial.name, reason)
+    if measurement is not None:
+        inputs = ("strip", trial.name, kept.tracked, measurement.m_per_px, trial.corrections)
+    kept.figure(inputs, partial(results.strip_figure, trial.name), settings, draw)
+
+
+# ------------------------------------------------------------------------------
+# All trials: the tables of the experiment, and the damping law with its scaling with the size of the vine.
+
+
+def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
+    """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`."""
+    from vinetrack.kinematics.damping import mark_left_out
+    from vinetrack.kinematics.summary import condition_table
+
+    results = Results(folder)
+    analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
+    analysed |= _askew_as_failed(experiment, analysed)
+    rows = {name: content["row"] for name, content in analysed.items()}
+    rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
+    table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
+    write_csv(
+        results.steady, _frame([row for content in analysed.values() for row in content["windows"]], STEADY_COLUMNS)
+    )
+    points = _frame([c["point"] for c in analysed.values() if c["point"]], POINT_COLUMNS)
+    write_csv(results.points, mark_left_out(points))
+    evaluated_at = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
+    write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
+    write_csv(results.trials, table)
+    for row in table.itertuples():
+        log.info("%s: %s %s", row.trial, row.status, row.reason)
+    return table
+
+
+def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return, as failed trials, those whose axis is askew to that of most other trials with the same growth angle."""
+    from vinetrack.video.axis import askew_trials, slope_deg
+
+    failed: dict[str, dict[str, Any]] = {}
+    if experiment.settings.axis is not None:
+        return failed
+    tracked = [
+        (name, content.get("axis")) for name, content in analysed.items() if content["row"]["status"] != "failed"
+    ]
+    slopes_deg = {
+        name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis) for name, axis in tracked if axis
+    }
+    for names, agreed in askew_trials(slopes_deg, experiment.trials):
+        for name in names:
+            reason = (
+                f"its growth axis was found askew to that of {agreed} other recordings: another moving object, such as "
+                "a door, was taken for the tube; state its axis in the column `axis`, even if the camera was turned"
+            )
+            failed[name] = {"row": failed_row(experiment.trial(name), reason), "windows": [], "point": None}
+    return failed
+
+
+def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame:
+    """Return rows, or none, as a table with typed columns; a number that JSON stores as null becomes NaN."""
+    import pandas as pd
+
+    frame = pd.DataFrame(rows, columns=list(columns))
+    counts = [column for column in columns if column in COUNT_COLUMNS]
+    truths = [column for column in columns if column in TRUTH_COLUMNS]
+    numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS | COUNT_COLUMNS]
+    kinds = dict.fromkeys(numbers, "float") | dict.fromkeys(counts, "Int64") | dict.fromkeys(truths, "bool")
+    return frame.astype(kinds)
+
+
+def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
+    """Fit the damping law to `damping_points.csv`; write `damping.json` and `scaling.json`. Returns `damping.json` as
+    written.
+    """
+    from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends
+
+    results = Results(folder)
+    damping = fit_laws(read_result(results.points), resamples=settings.resamples, seed=settings.seed)
+    write_json(results.scaling, fit_scaling(damping) | fit_trends(read_result(results.conditions)))
+    write_json(results.damping, damping)
+    for method, fit in damping.items():
+        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
+    return damping
