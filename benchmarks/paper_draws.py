@@ -18,7 +18,7 @@ import numpy as np
 
 from vinetrack.core import published
 from vinetrack.core.records import Floats, Trial
-from vinetrack.paper.arithmetic import LASTS_S, NONE, WITHIN, follow, position_rms_m, position_trials
+from vinetrack.paper.motions import LASTS_S, NONE, WITHIN, follow, position_rms_m, position_trials
 
 TRIALS, B_SCATTER, PRESSURE_SCATTER = 4, 0.03, 0.01
 PSI_PA, OTHER_YIELD_PA = 6894.76, 3200.0

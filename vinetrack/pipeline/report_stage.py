@@ -64,41 +64,38 @@ def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings
 
 def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     """Write `paper.csv` and the tables of the figures; return `paper.csv` as written."""
-    from vinetrack.paper.arithmetic import MARKS, MEASURED, SIMULATED, as_table, computed_rows
-    from vinetrack.paper.protocol import protocol_rows
-    from vinetrack.paper.result_rows import result_rows, theory_rows
+    from vinetrack.paper import rows as paper
 
     kind = experiment.settings.published
     if kind is None:
         raise ResultsError("experiment.yaml has no key `published`: set it to `simulated` or `measured`")
     results = Results(folder)
-    mark = SIMULATED if kind == "simulated" else MEASURED
+    mark = paper.SIMULATED if kind == "simulated" else paper.MEASURED
     tables = _tables(experiment, results)
     results_given = _experiment_results(mark, results, tables)
     rows = [
-        *protocol_rows(experiment.trials, read_result(results.steady), mark),
-        *result_rows(results_given),
-        *computed_rows(),
-        *theory_rows(experiment.trials),
+        *paper.protocol_rows(experiment.trials, read_result(results.steady), mark),
+        *paper.result_rows(results_given),
+        *paper.computed_rows(),
+        *paper.theory_rows(experiment.trials),
     ]
-    table = as_table(rows)
+    table = paper.as_table(rows)
     for name, table_of_figure in tables.items():
         write_csv(folder / f"{name}.csv", table_of_figure)
     write_csv(folder / "paper.csv", table)
-    for mark in MARKS:
+    for mark in paper.MARKS:
         log.info("%s: %d rows", mark, int((table["mark"] == mark).sum()))
     return table
 
 
 def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]:
     """Return the tables of all figures, by file name."""
-    from vinetrack.paper import protocol as comparison
-    from vinetrack.paper.arithmetic import departure_table, motion_table, pressure_table
+    from vinetrack.paper import motions
 
     trials = experiment.trials
-    positions, speeds = comparison.position_conditions(trials), comparison.speed_conditions(trials)
+    positions, speeds = motions.position_conditions(trials), motions.speed_conditions(trials)
     starts = {
-        name: comparison.Rest(fitted_trial.release_s, fitted_trial.origin_m)
+        name: motions.Rest(fitted_trial.release_s, fitted_trial.origin_m)
         for name, fitted_trial in read_fit(results).trials.items()
     }
     rests = {name: start for name, start in starts.items() if math.isfinite(start.release_s + start.origin_m)}
@@ -110,13 +107,13 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
     }
     payloads_g = sorted({round(1e3 * replicates[0].payload_kg, 6) for replicates in speeds.values()})
     return {
-        "paper_departures": departure_table(payloads_g),
-        "paper_motions": motion_table(),
-        "paper_means": comparison.mean_motions(positions, kinematics, rests),
-        "paper_positions": comparison.position_errors(positions, kinematics, rests),
-        "paper_pressures": pressure_table(),
-        "paper_speeds": comparison.final_speeds(speeds, kinematics, rests),
-        "paper_speed_curves": comparison.speed_curves(speeds),
+        "paper_departures": motions.departure_table(payloads_g),
+        "paper_motions": motions.motion_table(),
+        "paper_means": motions.mean_motions(positions, kinematics, rests),
+        "paper_positions": motions.position_errors(positions, kinematics, rests),
+        "paper_pressures": motions.pressure_table(),
+        "paper_speeds": motions.final_speeds(speeds, kinematics, rests),
+        "paper_speed_curves": motions.speed_curves(speeds),
     }
 
 
@@ -131,7 +128,7 @@ def draw_paper(folder: Path, settings: FigureSettings) -> None:
 
 
 def _experiment_results(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> Any:
-    from vinetrack.paper.result_rows import ExperimentResults
+    from vinetrack.paper.rows import ExperimentResults
 
     return ExperimentResults(
         mark=mark,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> ReportSection:
     """Return the section."""
-    from vinetrack.paper.arithmetic import MARKS
+    from vinetrack.paper.rows import MARKS
 
     present = [f"“{mark}”: {words}" for mark, words in MARKS.items() if (table["mark"] == mark).any()]
     return ReportSection(
@@ -38,7 +38,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
 
 def tally(table: pd.DataFrame) -> str:
     """Return the number of rows of each kind, as a sentence."""
-    from vinetrack.paper.arithmetic import MARKS
+    from vinetrack.paper.rows import MARKS
 
     counts = table["mark"].value_counts()
     parts = [f"{counts[mark]} {mark}" for mark in MARKS if counts.get(mark, 0)]

@@ -1,0 +1,425 @@
+"""Motions by Eq. (2) with the printed numbers, departures from its assumptions, and the trials of Figs. 4 and 5.
+
+The departures are a chamber that is not refilled, from slow (isothermal) to fast (adiabatic), a tail that cannot carry
+compression, and both. They bound the effect of such a departure, with the printed B, n and P_y, and do not explain what
+was measured: neither the rate at which the regulator refills nor the lengths of the vines are printed, and a payload
+that has fallen to the tip rests there without pushing it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from vinetrack import effects
+from vinetrack.core import published
+from vinetrack.core.records import Floats, Trial, plain_track
+from vinetrack.core.units import AIR_DENSITY_KG_M3, AMBIENT_PRESSURE_PA
+from vinetrack.dynamics.model import Model, base_model
+from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
+from vinetrack.kinematics.damping import fit_laws
+from vinetrack.kinematics.force import paper_force_N
+from vinetrack.kinematics.steady import paper_window
+from vinetrack.kinematics.summary import lead_velocity_at, mean_with_error
+from vinetrack.planning.predictive_inputs import damping_prior
+
+
+def area_m2(diameter_mm: float) -> float:
+    """Cross-section πD²/4."""
+    return math.pi * (diameter_mm / 1e3) ** 2 / 4
+
+
+def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> float:
+    """Return the volume of a whole vine over that of its chamber."""
+    return area_m2(diameter_mm) * length_mm / 1e3 / chamber_m3
+
+
+def gauge_left(gauge_Pa: float, change: float, gamma: float = 1.0) -> float:
+    """Return the fraction of the gauge pressure left after the volume has grown by the fraction `change`. P_abs V^γ is
+    constant, with absolute pressure.
+    """
+    absolute_Pa = gauge_Pa + AMBIENT_PRESSURE_PA
+    return (absolute_Pa * (1 + change) ** -gamma - AMBIENT_PRESSURE_PA) / gauge_Pa
+
+
+# Fraction of the length up to which positions are compared (chosen)
+WITHIN = 0.95
+
+LASTS_S = 60.0  # Duration of the simulated motions, s; the slowest, at 7 kPa, takes 7 s by Eq. (2) (chosen)
+
+
+@dataclass(frozen=True)
+class Departure:
+    """A departure from Eq. (2): `gamma` of a chamber that is not refilled (None: refilled), and a slack tail."""
+
+    name: str
+    gamma: float | None = None
+    slack: bool = False
+
+    def model(self, B: float) -> Model:
+        """Return Eq. (2) with the printed n and this departure."""
+        model = base_model()
+        if self.gamma is not None:
+            model = (model + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": self.gamma})
+        return model.with_values({"eversion_damping.B": B, "eversion_damping.n": published.EXPONENT})
+
+    def trial(self, trial: Trial) -> Trial:
+        """Return the trial, whose tail may go slack if the departure says so."""
+        return replace(trial, tail_slack="free" if self.slack else "taut")
+
+
+NONE = Departure("eq2")
+DEPARTURES = (
+    Departure("depletion_slow", gamma=1.0),  # Chamber not refilled, isothermal
+    Departure("depletion_fast", gamma=1.4),  # Chamber not refilled, adiabatic
+    Departure("slack", slack=True),  # Tail that cannot push
+    Departure("depletion_slow_slack", gamma=1.0, slack=True),
+    Departure("depletion_fast_slack", gamma=1.4, slack=True),
+)
+
+DEPARTURE_COLUMNS = (
+    *("figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s", "slack_from_s"),
+)
+MOTION_COLUMNS = ("pressure_kPa", "departure", "time_s", "lead_position_m")
+
+
+def paper_trial(
+    diameter_mm: float, thickness_um: float, length_mm: float, pressure_kPa: float, payload_g: float = 0.0
+) -> Trial:
+    """Return a trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa."""
+    return Trial(
+        name=f"{diameter_mm:g} mm × {thickness_um:g} µm at {pressure_kPa:g} kPa",
+        capture_fps=published.CAPTURE_FPS,
+        diameter_m=diameter_mm / 1e3,
+        thickness_m=thickness_um / 1e6,
+        length_m=length_mm / 1e3,
+        pressure_Pa=1e3 * pressure_kPa,
+        yield_pressure_Pa=1e3 * published.YIELD_PRESSURE_KPA,
+        payload_kg=payload_g / 1e3,
+        chamber_m3=published.CHAMBER_L / 1e3,
+    )
+
+
+def position_trials() -> list[Trial]:
+    """Return the trials of the paper's Fig. 4: the 24 mm × 200 µm vine, as long as the longest, with its payload."""
+    size = (published.DIAMETER_MM[4], published.THICKNESS_UM[4], published.LONGEST_VINE_MM)
+    return [paper_trial(*size, pressure_kPa, published.PAYLOAD_G) for pressure_kPa in published.POSITION_RMS_CM]
+
+
+def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
+    """Compute the differences of each departure from Eq. (2), columns `DEPARTURE_COLUMNS`."""
+    rows: list[tuple[object, ...]] = []
+    for trial in position_trials():
+        plain = follow(trial, NONE, published.DAMPING_B[4])
+        for departure in DEPARTURES:
+            moved = follow(trial, departure, published.DAMPING_B[4])
+            rms_m = position_rms_m(plain, moved, trial)
+            rows.append(("Fig. 4", trial.pressure_Pa / 1e3, departure.name, rms_m, math.nan, moved.slack_from_s))
+    for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
+        for departure in DEPARTURES:
+            off = [_speed_change_m_s(pressure_kPa, payload_g, departure) for payload_g in payloads_g]
+            rms_m_s = math.sqrt(float(np.mean(np.square(off)))) if off else math.nan
+            rows.append(("Fig. 5", float(pressure_kPa), departure.name, math.nan, rms_m_s, math.nan))
+    return pd.DataFrame(rows, columns=list(DEPARTURE_COLUMNS))
+
+
+def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
+    """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`."""
+    time_s = np.arange(0, LASTS_S, 1 / published.CAPTURE_FPS)
+    return simulate(departure.model(B), departure.trial(trial), time_s)
+
+
+def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
+    """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %."""
+    stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))
+    return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
+
+
+def _speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departure) -> float:
+    """Change of the leading edge's speed at the paper's 12 cm against Eq. (2), in Fig. 5; its B is not printed and
+    taken as proportional to the wall.
+    """
+    wall_um = published.FINAL_SPEED_THICKNESS_UM
+    B = published.DAMPING_B[4] * wall_um / published.THICKNESS_UM[4]
+    trial = paper_trial(published.DIAMETER_MM[4], wall_um, published.LONGEST_VINE_MM, pressure_kPa, payload_g)
+    at_m = published.FINAL_SPEED_AT_MM / 1e3
+    speeds = []
+    for assumed in (departure, NONE):
+        moved = follow(trial, assumed, B)
+        speeds.append(lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, at_m))
+    return speeds[0] - speeds[1] if math.isfinite(speeds[0]) else -speeds[1]
+
+
+def motion_table(instants: int = 200) -> pd.DataFrame:
+    """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`."""
+    parts = []
+    for trial in position_trials():
+        for departure in (NONE, *DEPARTURES):
+            moved = follow(trial, departure, published.DAMPING_B[4])
+            end_s = moved.end_time_s if math.isfinite(moved.end_time_s) else LASTS_S
+            time_s = np.linspace(0, end_s, instants)
+            position_m = np.interp(time_s, moved.time_s, moved.lead_position_m)
+            columns = (trial.pressure_Pa / 1e3, departure.name, time_s, position_m)
+            parts.append(pd.DataFrame(dict(zip(MOTION_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True)
+
+
+def pressure_table(instants: int = 60) -> pd.DataFrame:
+    """Compute the remaining gauge pressure along the growth of Fig. 4's vine."""
+    rows = []
+    for trial in position_trials():
+        for departure in DEPARTURES[:2]:
+            for y in np.linspace(0, trial.length_m, instants):
+                change = area_m2(1e3 * trial.diameter_m) * float(y) / trial.chamber_m3
+                left = gauge_left(trial.pressure_Pa, change, departure.gamma or 1.0)
+                rows.append((trial.pressure_Pa / 1e3, departure.name, float(y), left))
+    return pd.DataFrame(rows, columns=["pressure_kPa", "departure", "lead_position_m", "gauge_left"])
+
+
+# ------------------------------------------------------------------------------
+# The fast vine, the example of air drag, and the published rule, by Eq. (2).
+
+SLOWEST_S = 10.0  # Duration of the simulated motions, s (chosen)
+
+
+def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
+    """Compute the speed of the fast vine's leading edge by Eq. (2) with B from the scaling prior."""
+    fast = published.FAST_VINE
+    trial = paper_trial(fast["diameter_mm"], fast["thickness_um"], fast["length_mm"], fast["pressure_kPa"])
+    model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
+    motion = simulate(model, trial, np.linspace(0, 0.05, 50_001))
+    return [lead_velocity_at(motion.lead_position_m, motion.lead_velocity_m_s, f * trial.length_m) for f in fractions]
+
+
+def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, float]]:
+    """Compute the ratio of drag to drive in the paper's example of air drag, by mechanics and as printed. By mechanics
+    the air meets the head at ẏ and the pulley halves the force: ¼ρ A C_D ẏ² over ½PA; printed is ½ρ A C_D ẋ². Speeds
+    are those of Eq. (2) without drag, with B from the scaling prior.
+    """
+    case = published.DRAG_EXAMPLE
+    trial = paper_trial(case["diameter_mm"], case["thickness_um"], case["length_mm"], case["pressure_kPa"])
+    model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
+    motion = simulate(model, trial, np.linspace(0, 0.05, 50_001))
+    for fraction in fractions:
+        lead = lead_velocity_at(motion.lead_position_m, motion.lead_velocity_m_s, fraction * trial.length_m)
+        share = 0.5 * AIR_DENSITY_KG_M3 * published.DRAG_COEFFICIENT * lead**2 / trial.pressure_Pa
+        yield fraction, share, 8 * share
+
+
+def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[float, dict[int, float]]:
+    """Apply the published rule to noise-free motions of these trials, simulated with the printed B and n.
+    Returns n, B.
+    """
+    departure = Departure("", gamma=gamma)
+    time_s = np.arange(0, SLOWEST_S, 1 / published.CAPTURE_FPS)
+    rows = []
+    for scale, B in published.DAMPING_B.items():
+        of_scale = [
+            replace(trial, chamber_m3=published.CHAMBER_L / 1e3, yield_pressure_Pa=1e3 * published.YIELD_PRESSURE_KPA)
+            for trial in trials
+            if published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m) == scale
+        ]
+        runs = simulate_many(departure.model(B), of_scale, [time_s] * len(of_scale))
+        rows += [_point(scale, trial, moved) for trial, moved in zip(of_scale, runs, strict=True)]
+    law = fit_laws(pd.DataFrame(rows), resamples=100)["paper"]
+    return float(law["n"]), {int(vine): float(vine_law["B"]) for vine, vine_law in law["vines"].items()}
+
+
+def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
+    """A row of the damping fit that only the published rule uses."""
+    unknown = dict.fromkeys(("x_ss_m_s", "x_ss_sigma_m_s", "force_N", "force_sigma_N"), math.nan)
+    return {
+        "trial": trial.name,
+        "vine": str(scale),
+        "diameter_mm": 1e3 * trial.diameter_m,
+        "thickness_um": 1e6 * trial.thickness_m,
+        **unknown,
+        "yield_force_sigma_N": 0.0,
+        "x_ss_paper_m_s": _published_window(moved, trial.travel_ratio),
+        "force_paper_N": paper_force_N(trial),
+        "eligible": True,
+        "used": False,
+    }
+
+
+def _published_window(moved: Trajectory, travel_ratio: float) -> float:
+    """Steady tail speed by the published rule in a motion without noise, m/s."""
+    stop = int(np.searchsorted(moved.time_s, moved.end_time_s)) if math.isfinite(moved.end_time_s) else None
+    time_s, position_m = moved.time_s[:stop], moved.lead_position_m[:stop]
+    track = plain_track(time_s, position_m)
+    window = paper_window(
+        track, travel_ratio=travel_ratio, cv_limit=published.STEADY_CV, min_points=published.STEADY_FEWEST_POINTS
+    )
+    return window.x_ss_m_s if window.accepted else math.nan
+
+
+# ------------------------------------------------------------------------------
+# Comparison of the trials of the paper's Figs. 4 and 5 with Eq. (2) and the printed numbers, by the paper's method.
+
+POSITION_COLUMNS = ("condition", "pressure_kPa", "n_trials", "rms_mean_m", "rms_single_m")
+SPEED_COLUMNS = (
+    "condition",
+    "vine",
+    "pressure_kPa",
+    "payload_g",
+    "n_final",
+    "final_at_mm",
+    "final_lead_velocity_m_s",
+    "final_lead_velocity_sigma_m_s",
+    "eq2_lead_velocity_m_s",
+)
+MEAN_COLUMNS = ("pressure_kPa", "time_s", "lead_position_m", "lead_position_sigma_m", "n_trials")
+
+
+class Rest(NamedTuple):
+    """Release time of a trial, on the clock of its track, and resting position of its edge."""
+
+    release_s: float
+    origin_m: float
+
+
+def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
+    """Find the trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload. Returns trials
+    of one condition each, by pressure in kPa.
+    """
+    conditions: dict[float, list[Trial]] = {}
+    for pressure_kPa in published.POSITION_RMS_CM:
+        alike = [trial for trial in trials if _is(trial, published.THICKNESS_UM[4], pressure_kPa, published.PAYLOAD_G)]
+        if alike:
+            conditions[float(pressure_kPa)] = [trial for trial in alike if trial.condition == alike[0].condition]
+    return conditions
+
+
+def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
+    """Find the trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload. Returns
+    trials by condition.
+    """
+    conditions: dict[str, list[Trial]] = {}
+    for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
+        for trial in trials:
+            if _is(trial, published.FINAL_SPEED_THICKNESS_UM, pressure_kPa) and trial.payload_kg > 0:
+                conditions.setdefault(trial.condition, []).append(trial)
+    return conditions
+
+
+def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float | None = None) -> bool:
+    pairs = [
+        (1e3 * trial.diameter_m, published.DIAMETER_MM[4]),
+        (1e6 * trial.thickness_m, thickness_um),
+        (trial.pressure_Pa / 1e3, float(pressure_kPa)),
+    ]
+    if payload_g is not None:
+        pairs.append((1e3 * trial.payload_kg, payload_g))
+    return all(math.isclose(ours, printed, rel_tol=0.02) for ours, printed in pairs)
+
+
+def mean_motions(
+    conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
+) -> pd.DataFrame:
+    """Average the trials of each pressure since release, columns `MEAN_COLUMNS`, until the first has grown to 95 %. The
+    release comes from a fit in which each trial has its own pressure and B. With one B for all, the release of a trial
+    would absorb its deviation of speed.
+    """
+    parts = []
+    for pressure_kPa, trials in conditions.items():
+        time_s, laid_m = _since_release(trials, kinematics, rests)
+        if not len(laid_m):
+            continue
+        sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
+        columns = (pressure_kPa, time_s, laid_m.mean(axis=0), sigma_m, len(laid_m))
+        parts.append(pd.DataFrame(dict(zip(MEAN_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(MEAN_COLUMNS), dtype=float)
+
+
+def _since_release(
+    trials: Sequence[Trial], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
+) -> tuple[Floats, Floats]:
+    """Common times since release, shape (n,), and positions from rest, shape (n_trials, n), of those that are known."""
+    motions = []
+    for trial in trials:
+        if trial.name in kinematics and trial.name in rests:
+            start, table = rests[trial.name], kinematics[trial.name]
+            grown_m = table["lead_position_m"].to_numpy(float) - start.origin_m
+            time_s, known = table["time_s"].to_numpy(float) - start.release_s, np.isfinite(grown_m)
+            beyond = np.flatnonzero(known & (grown_m >= WITHIN * trial.length_m))
+            stop = int(beyond[0]) + 1 if beyond.size else grown_m.size
+            motions.append((time_s[:stop][known[:stop]], grown_m[:stop][known[:stop]]))
+    if not motions:
+        return np.empty(0), np.empty((0, 0))
+    end_s = min(float(time_s[-1]) for time_s, _ in motions)
+    common_s = np.arange(0, end_s, 1 / published.CAPTURE_FPS)
+    return common_s, np.array([np.interp(common_s, *motion) for motion in motions])
+
+
+def position_errors(
+    conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
+) -> pd.DataFrame:
+    """Compare positions with Eq. (2) and the printed B and n, of the mean and of single trials (`POSITION_COLUMNS`).
+    From release until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
+    """
+    rows = []
+    for pressure_kPa, trials in conditions.items():
+        time_s, laid_m = _since_release(trials, kinematics, rests)
+        if not len(laid_m):
+            continue
+        plain = follow(trials[0], NONE, published.DAMPING_B[4])
+        stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trials[0].length_m))
+        counts = time_s <= plain.time_s[min(stop, plain.time_s.size - 1)]
+        off_m = (laid_m - np.interp(time_s, plain.time_s, plain.lead_position_m))[:, counts]
+        mean_m, single_m = (math.sqrt(float(np.mean(np.square(part_m)))) for part_m in (off_m.mean(axis=0), off_m))
+        rows.append((trials[0].condition, pressure_kPa, len(laid_m), mean_m, single_m))
+    return pd.DataFrame(rows, columns=list(POSITION_COLUMNS))
+
+
+def final_speeds(
+    conditions: Mapping[str, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
+) -> pd.DataFrame:
+    """Average the speed of the leading edge at the paper's 12 cm, and compute it by Eq. (2), columns
+    `SPEED_COLUMNS`.
+    """
+    rows = []
+    at_m = published.FINAL_SPEED_AT_MM / 1e3
+    for condition, trials in conditions.items():
+        speeds = [
+            lead_velocity_at(
+                kinematics[trial.name]["lead_position_m"].to_numpy(float) - rests[trial.name].origin_m,
+                kinematics[trial.name]["lead_velocity_m_s"].to_numpy(float),
+                at_m,
+            )
+            for trial in trials
+            if trial.name in kinematics and trial.name in rests
+        ]
+        mean, sigma, count = mean_with_error(np.array(speeds, dtype=float))
+        if count:
+            first = trials[0]
+            sizes = (condition, first.vine, first.pressure_Pa / 1e3, 1e3 * first.payload_kg)
+            rows.append((*sizes, count, 1e3 * at_m, mean, sigma, eq2_speed_m_s(first)))
+    return pd.DataFrame(rows, columns=list(SPEED_COLUMNS))
+
+
+def eq2_speed_m_s(trial: Trial) -> float:
+    """Return the speed of the leading edge at 12 cm by Eq. (2), B proportional to the wall; 0 where not reached."""
+    B = published.DAMPING_B[4] * 1e6 * trial.thickness_m / published.THICKNESS_UM[4]
+    moved = follow(trial, NONE, B)
+    speed = lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, published.FINAL_SPEED_AT_MM / 1e3)
+    return speed if math.isfinite(speed) else 0.0
+
+
+def speed_curves(conditions: Mapping[str, list[Trial]], instants: int = 15) -> pd.DataFrame:
+    """Compute Eq. (2) over the range of payloads of each pressure, in the columns of `final_speeds`."""
+    rows = []
+    by_pressure: dict[float, list[Trial]] = {}
+    for trials in conditions.values():
+        by_pressure.setdefault(trials[0].pressure_Pa, []).append(trials[0])
+    for pressure_Pa, trials in by_pressure.items():
+        payloads_kg = [trial.payload_kg for trial in trials]
+        for payload_kg in np.linspace(min(payloads_kg), max(payloads_kg), instants):
+            speed = eq2_speed_m_s(replace(trials[0], payload_kg=float(payload_kg)))
+            rows.append((trials[0].vine, pressure_Pa / 1e3, 1e3 * payload_kg, speed, math.nan))
+    names = ["vine", "pressure_kPa", "payload_g", "final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s"]
+    return pd.DataFrame(rows, columns=names)

@@ -1,0 +1,471 @@
+"""The paper's numbers beside ours, `paper.csv`: where each is printed, and how ours is found.
+
+What is said about a row stands in `rows.csv` beside this file, one line a row: text with the names of facts in braces,
+filled in by `row_of`. Here stands how ours is computed: from the experiment's protocol and results, by arithmetic from
+other printed numbers, and by Eq. (2) with the printed B and n.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import t as student
+
+from vinetrack.core import published
+from vinetrack.core.published import SOURCE
+from vinetrack.core.records import Trial
+from vinetrack.core.units import GRAVITY_M_S2, convert, or_nan
+from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.kinematics.damping import regress
+from vinetrack.paper.motions import (
+    DEPARTURES,
+    area_m2,
+    drag_shares,
+    fast_vine_speeds,
+    gauge_left,
+    rule_on_noise_free,
+    volume_change,
+)
+from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
+
+COMPUTED = "computed"
+SIMULATED = "simulated from printed parameters"
+MEASURED = "measured"
+NOT_CHECKABLE = "not checkable"
+
+UNANSWERED = "the trials of this experiment do not tell"
+
+MARKS = {
+    COMPUTED: f"follows by arithmetic, or by Eq. (2), from other numbers of {SOURCE}; ours is the corrected value "
+    "where the two differ",
+    SIMULATED: "found in virtual trials that were grown from the printed B and n: agreement checks the analysis, not "
+    "the paper",
+    MEASURED: "found in trials that were filmed",
+    NOT_CHECKABLE: "rests on something that is not printed: a setting, a scatter, or a B that had to be guessed",
+}
+
+PAPER_COLUMNS = (
+    *("row", "where", "quantity", "setting", "unit", "published", "as_printed"),
+    *("ours", "ours_low_95", "ours_high_95", "mark", "how", "beside"),
+)
+
+PREFERRED = "both_axes"  # The fit of the damping law that supplies our numbers
+
+FAST_AT = (0.90, 0.95, 0.98, 0.99)  # Fractions of the length at which the speed of the fast vine is evaluated (chosen)
+
+DRAG_AT = (0.50, 0.95, 0.99)  # Fractions of the length at which drag is evaluated (chosen)
+
+GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
+
+nan = math.nan
+UNKNOWN = (nan, nan)  # An interval that is not known
+
+Row = dict[str, Any]
+
+
+# ------------------------------------------------------------------------------
+# One row, and the table.
+
+
+@lru_cache
+def _texts() -> dict[str, dict[str, str]]:
+    with Path(__file__).with_name("rows.csv").open(encoding="utf-8", newline="") as file:
+        return {line["row"]: line for line in csv.DictReader(file)}
+
+
+def row_of(
+    name: str,
+    ours: float = nan,
+    interval: Sequence[float] = UNKNOWN,
+    *,
+    published_as: float = nan,
+    mark: str = "",
+    **facts: Any,
+) -> Row:
+    """Return the row `name` of `rows.csv`, filled in with `facts`. `interval` is the 95 % interval of ours;
+    `published_as` is NaN where the paper prints no number; `mark` tells whether the trials were simulated or filmed.
+    """
+    text = _texts()[name]
+    facts |= {"paper": published, "published": published_as}
+    kind, how = text["mark"], text["how"]
+    if kind.startswith("trials"):
+        kind = NOT_CHECKABLE if kind == "trials if measured" and mark == SIMULATED else mark
+        how = (mark == MEASURED and text["how_if_measured"]) or how
+    try:
+        beside = text["beside"].format(**facts)
+    except KeyError:  # The trials did not give what it tells
+        beside = ""
+    filled = {key: text[key].format(**facts) for key in ("row", "where", "quantity", "setting", "unit", "as_printed")}
+    unanswered = kind in (SIMULATED, MEASURED) and not math.isfinite(ours)
+    return {
+        **filled,
+        "published": published_as,
+        "as_printed": filled["as_printed"] or (f"{published_as:g}" if math.isfinite(published_as) else ""),
+        "ours": ours,
+        "ours_low_95": interval[0],
+        "ours_high_95": interval[1],
+        "mark": kind,
+        "how": UNANSWERED if unanswered else how.format(**facts),
+        "beside": beside,
+    }
+
+
+def as_table(rows: Iterable[Row]) -> pd.DataFrame:
+    """Return the rows as a table with the columns `PAPER_COLUMNS` of `paper.csv`."""
+    table = pd.DataFrame(rows, columns=list(PAPER_COLUMNS))
+    twice = table.loc[table["row"].duplicated(), "row"].tolist()
+    if twice:
+        raise ValueError(f"rows stand twice: {', '.join(twice)}")
+    return table
+
+
+# ------------------------------------------------------------------------------
+# The protocol: the vines of Table I, their fabrication, how trials were run, and steady windows.
+
+
+def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> Iterator[Row]:
+    """Compare the protocol of an experiment with that of the paper."""
+    bare = [trial for trial in trials if trial.payload_kg == 0 and trial.travel_ratio == 2]
+    by_scale = {
+        R: [t for t in bare if published.scale_of(1e3 * t.diameter_m, 1e6 * t.thickness_m) == R]
+        for R in published.DAMPING_B
+    }
+    for R, vines in by_scale.items():
+        thickness_um = _mean([1e6 * trial.thickness_m for trial in vines])
+        diameter_mm = _mean([1e3 * trial.diameter_m for trial in vines])
+        yield row_of("thickness_R{R}", thickness_um, published_as=published.THICKNESS_UM[R], mark=mark, R=R)
+        yield row_of("diameter_R{R}", diameter_mm, published_as=published.DIAMETER_MM[R], mark=mark, R=R)
+        yield row_of("press_R{R}", published_as=published.PRESS_TEMPERATURE_DEGC[R], R=R)
+        yield row_of("laser_R{R}", published_as=published.LASER_POWER_PERCENT[R], R=R)
+    for R, vines in by_scale.items():
+        replicates = pd.Series([round(trial.pressure_Pa, 3) for trial in vines], dtype=float).value_counts()
+        yield row_of("pressures_R{R}", float(len(replicates)) if vines else nan, mark=mark, R=R)
+        yield row_of("trials_R{R}", float(replicates.median()), mark=mark, R=R)
+    rates = [trial.capture_fps for trial in trials if math.isfinite(trial.capture_fps)]
+    yield row_of("capture_fps", _median(rates), published_as=published.CAPTURE_FPS, mark=mark)
+    names = {trial.name for vines in by_scale.values() for trial in vines}
+    yield from _window_rows(steady[steady["trial"].isin(names)], mark)
+
+
+def _window_rows(windows: pd.DataFrame, mark: str) -> Iterator[Row]:
+    """What the published rule for a steady window accepts in trials without payload, and the gated rule."""
+    literal, gated = windows[windows["rule"] == "paper"], windows[windows["rule"] == "gated"]
+    accepted = literal[literal["accepted"]]
+    fewest, largest = accepted["points"].min(), 100 * accepted["cv"].max()
+    drift = {"drift_percent": 100 * accepted["drift"].abs().max()} if len(accepted) else {}
+    share = {"gated_percent": 100 * gated["accepted"].mean()} if len(gated) else {}
+    limit = 100 * published.STEADY_CV
+    yield row_of("window_fewest_points", float(fewest), mark=mark, n=len(accepted))
+    yield row_of("window_largest_cv", float(largest), published_as=limit, mark=mark, **drift)
+    yield row_of("window_share_accepted", 100 * _mean(literal["accepted"].tolist()), mark=mark, **share)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if len(values) else nan
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if len(values) else nan
+
+
+# ------------------------------------------------------------------------------
+# The results of an experiment: damping law, positions, speeds, dependence on size.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentResults:
+    """Results of an experiment: tables and files of its results folder, by their names there. `mark` is `SIMULATED` or
+    `MEASURED`.
+    """
+
+    mark: str
+    damping: Mapping[str, Any]
+    scaling: Mapping[str, Any]
+    conditions: pd.DataFrame
+    fit: FitSummary
+    positions: pd.DataFrame
+    speeds: pd.DataFrame
+    departures: pd.DataFrame
+
+
+def result_rows(results: ExperimentResults) -> Iterator[Row]:
+    """Yield every row that an experiment can answer; where it does not, ours is blank."""
+    yield from _law_rows(results)
+    yield from _motion_rows(results)
+    yield from _scale_rows(results.mark, results.scaling)
+    yield from _wall_rows(results)
+    yield from _efficiency_rows(results.mark, results.scaling)
+    yield _fast_row(results)
+
+
+def _bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
+    """An interval of a JSON file, NaN for null."""
+    low, high = pair or UNKNOWN
+    return or_nan(low), or_nan(high)
+
+
+def _fitted(line: Mapping[str, Any], key: str = "slope") -> dict[str, Any]:
+    """Ours, its interval and its p-value, of a fitted line; blank if there is none."""
+    p = {"p": line["p"]} if line else {}
+    return {"ours": or_nan(line.get(key)), "interval": _bounds(line.get(f"{key}_95")), **p}
+
+
+def _law_rows(results: ExperimentResults) -> Iterator[Row]:
+    laws = {method: results.damping.get(method) or {} for method in ("log_log", PREFERRED, "paper")}
+    for row, law in zip(("n_log_log", "n_both_axes", "n_literal"), laws.values(), strict=True):
+        interval = _bounds(law.get("n_95_total"))
+        yield row_of(row, or_nan(law.get("n")), interval, published_as=published.EXPONENT, mark=results.mark)
+    for R, printed in published.DAMPING_B.items():
+        log_log, ours, literal = (_vine_of(law, R) for law in laws.values())
+        B, interval, n = or_nan(ours.get("B")), _bounds(ours.get("B_95_total")), ours.get("n_trials", 0)
+        by_rule = {"literal": literal["B"]} if math.isfinite(or_nan(literal.get("B"))) else {}
+        yield row_of("B_R{R}", B, interval, published_as=printed, mark=results.mark, R=R, n=n, **by_rule)
+        R2 = or_nan(log_log.get("R2"))
+        yield row_of("R2_R{R}", R2, published_as=published.DAMPING_R2[R], mark=results.mark, R=R)
+
+
+def _vine_of(law: Mapping[str, Any], R: int) -> Mapping[str, Any]:
+    """What a law says of the vine of scale R."""
+    vines: Iterable[Mapping[str, Any]] = (law.get("vines") or {}).values()
+    return next((vine for vine in vines if published.scale_of(vine["diameter_mm"], vine["thickness_um"]) == R), {})
+
+
+def _motion_rows(results: ExperimentResults) -> Iterator[Row]:
+    mark = results.mark
+    for kPa, printed in published.POSITION_RMS_CM.items():
+        lines = _at_pressure(results.positions, kPa)
+        first: Any = lines.iloc[0] if len(lines) else {"n_trials": 0, "rms_mean_m": nan}
+        facts = {
+            "n": first["n_trials"],
+            "alone": f"; {100 * first['rms_single_m']:.2f} cm over single trials" if len(lines) else "",
+            "departures": departures_in_words(results.departures, "Fig. 4", kPa),
+        }
+        rms_cm = 100 * float(first["rms_mean_m"])
+        yield row_of("position_rms_{kPa:g}kPa", rms_cm, published_as=printed, mark=mark, kPa=kPa, **facts)
+    pressures = [
+        [value / 1e3 for value in (fitted.value, fitted.low, fitted.high)]
+        for fitted in results.fit.numbers
+        if fitted.key == "yield_pressure.P_y" and fitted.vine.startswith("24mm-200um")
+    ]
+    kPa, *interval = pressures[-1] if pressures else (nan, nan, nan)
+    yield row_of("yield_pressure", kPa, interval, published_as=published.YIELD_PRESSURE_KPA, mark=mark)
+    for kPa, printed in published.FINAL_SPEED_RMS_M_S.items():
+        lines = _at_pressure(results.speeds, kPa)
+        off = (lines["final_lead_velocity_m_s"] - lines["eq2_lead_velocity_m_s"]).to_numpy(float)
+        facts = {
+            "payloads": ", ".join(f"{payload:g}" for payload in lines["payload_g"]) or "none",
+            "departures": departures_in_words(results.departures, "Fig. 5", kPa),
+        }
+        yield row_of("final_speed_rms_{kPa:g}kPa", math.sqrt(_mean(off**2)), published_as=printed, kPa=kPa, **facts)
+
+
+def _at_pressure(table: pd.DataFrame, pressure_kPa: float) -> pd.DataFrame:
+    return table[np.isclose(table["pressure_kPa"].to_numpy(float), pressure_kPa)]
+
+
+def departures_in_words(table: pd.DataFrame, figure: str, pressure_kPa: float) -> str:
+    """Describe the effect of departures from Eq. (2) in a sentence: positions in cm, speeds in m/s."""
+    lines = table[(table["figure"] == figure) & (abs(table["pressure_kPa"] - pressure_kPa) < 1e-6)]
+    column, factor, unit = (
+        ("rms_position_m", 100.0, "cm") if figure == "Fig. 4" else ("rms_final_lead_velocity_m_s", 1.0, "m/s")
+    )
+    size = {row.departure: factor * float(getattr(row, column)) for row in lines.itertuples()}
+    if not size:
+        return ""
+    slow, fast, slack, both_slow, both_fast = (size[departure.name] for departure in DEPARTURES)
+    return (
+        f"not in it: a chamber that nothing refills would cause {slow:.2f} to {fast:.2f} {unit}, a tail that "
+        f"cannot push {slack:.2f}, both {both_slow:.2f} to {both_fast:.2f}"
+    )
+
+
+def _scale_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
+    isometric = next((family for family in scaling.get("isometric") or () if len(family["vines"]) >= 4), {})
+    yield row_of("our_B_power_of_scale", **_fitted(isometric.get("power") or {}), mark=mark)
+    yield row_of("our_B_line_R2", or_nan((isometric.get("line") or {}).get("R2")), mark=mark)
+
+    families: Sequence[Mapping[str, Any]] = scaling.get("steady_speed") or ()
+    family = next((one for one in families if _close(one["pressure_kPa"], published.STEADY_SPEED_KPA)), {})
+    n, line = len(family.get("sizes", ())), family.get("line") or {}
+    replicates = float(published.REPLICATES)
+    counts = [int(count) for count in family.get("n_steady", ())]
+    yield row_of("steady_speed_trials", _median(counts), published_as=replicates, mark=mark, n=n)
+    facts = {"p": line["p"], "monotonic": "yes" if family.get("monotonic") else "no"} if line else {}
+    R2 = or_nan(line.get("R2"))
+    yield row_of("steady_speed_R2", R2, published_as=published.STEADY_SPEED_R2, mark=mark, n=n, **facts)
+    yield row_of("steady_speed_power", **_fitted(family.get("power") or {}), mark=mark, n=n)
+    relative = (family.get("over_diameter") or {}).get("power") or {}
+    yield row_of("steady_speed_over_diameter_power", **_fitted(relative), mark=mark, n=n)
+
+
+def _close(ours: float, printed: float) -> bool:
+    return math.isclose(ours, printed, rel_tol=0.02)
+
+
+def _wall_rows(results: ExperimentResults) -> Iterator[Row]:
+    vines = (results.damping.get(PREFERRED) or {}).get("vines") or {}
+    family: Mapping[str, Any] = {}
+    for candidate in results.scaling.get("thickness") or ():
+        diameters_mm = [vines.get(vine, {}).get("diameter_mm", nan) for vine in candidate["vines"]]
+        if any(abs(mm / published.THICKNESS_SERIES_DIAMETER_MM - 1) < 0.01 for mm in diameters_mm):
+            family = candidate
+    walls = ", ".join(f"{size:g}" for size in family.get("sizes", ()))
+    yield row_of("B_power_of_wall", **_fitted(family.get("power") or {}), mark=results.mark, walls=walls)
+    yield row_of("B_wall_line_R2", or_nan((family.get("line") or {}).get("R2")), mark=results.mark, walls=walls)
+
+
+def _efficiency_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
+    families = [
+        family
+        for family in scaling.get("efficiency") or ()
+        if _close(family["pressure_kPa"], published.EFFICIENCY_KPA) and _close(family["payload_g"], published.PAYLOAD_G)
+    ]
+    trends: Mapping[str, Any] = families[0]["trend"] if families else {}
+    names = {
+        "efficiency": "½ m(x) ẋ² / (P₀ A y)",
+        "efficiency_payload": "payload alone",
+        "efficiency_with_weight": "with the work of the weight in the denominator",
+    }
+    for key, words in names.items():
+        trend = trends.get(key) or {}
+        for row, size in (("{key}_power_of_wall", "thickness_um"), ("{key}_power_of_diameter", "diameter_mm")):
+            power = _fitted(trend.get(size) or {}, "power")
+            yield row_of(row, **power, mark=mark, key=key, words=words, n=trend.get("n", 0))
+
+
+def _fast_row(results: ExperimentResults) -> Row:
+    table = results.conditions
+    same = np.array(table["payload_g"] == 0)
+    for column in ("diameter_mm", "thickness_um", "pressure_kPa"):
+        same &= np.isclose(table[column].to_numpy(float), published.FAST_VINE[column], rtol=0.02)
+    speed, place = nan, ""
+    if same.any():
+        first = table[same].iloc[0]
+        speed = float(first["final_lead_velocity_m_s"])
+        place = f", at {first['final_at_mm']:.0f} mm, N = {int(first['n_final'])}"
+    printed = published.FAST_VINE_MEASURED_M_S
+    return row_of("fast_vine_measured", speed, published_as=printed, mark=results.mark, place=place)
+
+
+# ------------------------------------------------------------------------------
+# What follows from the paper's own numbers by arithmetic.
+
+
+def p_value(R2: float, n: int) -> float:
+    """Return the two-sided p-value of the slope of a straight line from its R² and the number of points."""
+    dof = n - 2
+    return 2 * float(student.sf(math.sqrt(R2 * dof / (1 - R2)), dof))
+
+
+def printed_steady_speed_m_s(scale: int, gauge_Pa: float, yield_Pa: float) -> float:
+    """Return the steady tail speed by Eq. (3) with the printed B and n."""
+    force_N = (gauge_Pa - yield_Pa) * area_m2(published.DIAMETER_MM[scale])
+    return (force_N / published.DAMPING_B[scale]) ** (1 / published.EXPONENT)
+
+
+def weight_over_gas(diameter_mm: float) -> float:
+    """Return the work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y."""
+    gas_Pa_m2 = 1e3 * published.EFFICIENCY_KPA * area_m2(diameter_mm)
+    return published.PAYLOAD_G / 1e3 * GRAVITY_M_S2 * 2 / gas_Pa_m2
+
+
+def computed_rows() -> Iterator[Row]:
+    """Yield every row of the table that needs no experiment and no simulation."""
+    walls_um, diameters_mm = published.THICKNESS_UM, published.DIAMETER_MM
+    for R in published.DAMPING_B:
+        relative = walls_um[R] / diameters_mm[R] / (walls_um[1] / diameters_mm[1])
+        yield row_of("isometry_R{R}", relative, published_as=1.0, R=R)
+    yield from _reservoir_rows()
+    R2, n = published.STEADY_SPEED_R2, len(published.DAMPING_B)
+    yield row_of("steady_speed_p_value", p_value(R2, n), published_as=published.STEADY_SPEED_P_VALUE, n=n)
+    scales, B = (np.array(list(values), dtype=float) for values in (published.DAMPING_B, published.DAMPING_B.values()))
+    power, line = regress(np.log(scales), np.log(B)), regress(scales, B)
+    yield row_of("B_power_of_scale", power["slope"], power["slope_95"])
+    yield row_of("B_line_R2", line["R2"])
+    yield row_of("B_line_intercept", line["intercept"], line["intercept_95"])
+    gauge_Pa, yield_Pa = 1e3 * published.STEADY_SPEED_KPA, 1e3 * published.YIELD_PRESSURE_KPA
+    for R in published.DAMPING_B:
+        bare, with_yield = (printed_steady_speed_m_s(R, gauge_Pa, least_Pa) for least_Pa in (0.0, yield_Pa))
+        yield row_of("steady_speed_of_printed_B_R{R}", bare, R=R, with_yield=with_yield)
+    for diameter_mm in published.EFFICIENCY_DIAMETERS_MM:
+        yield row_of("weight_share_{mm:g}mm", 100 * weight_over_gas(diameter_mm), mm=diameter_mm)
+    yield from _injector_rows()
+    for R, printed in published.DAMPING_B.items():
+        guess = damping_prior(diameters_mm[R] / 1e3, walls_um[R] / 1e6)
+        yield row_of("guessed_B_R{R}", guess, published_as=printed, R=R)
+    fast = published.FAST_VINE
+    stress_Pa = hoop_stress_Pa(1e3 * fast["pressure_kPa"], fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
+    yield row_of("fast_vine_hoop_stress", stress_Pa / 1e6, burst_MPa=BURST_STRESS_PA / 1e6)
+    yield _rounding_row()
+
+
+def _reservoir_rows() -> Iterator[Row]:
+    change = volume_change(published.CHAMBER_L / 1e3, max(published.DIAMETER_MM.values()), published.LONGEST_VINE_MM)
+    printed, allowed = 100 * published.CHAMBER_CHANGE, 100 * published.CHAMBER_ALLOWED
+    yield row_of("chamber_volume_change", 100 * change, published_as=printed)
+    for kPa in sorted(published.POSITION_RMS_CM, reverse=True):
+        for speed, gamma in GAMMAS.items():
+            drop = 100 * (1 - gauge_left(1e3 * kPa, change, gamma))
+            facts = {"kPa": kPa, "speed": speed, "process": "isothermal" if gamma == 1 else "adiabatic"}
+            yield row_of("gauge_drop_{kPa:g}kPa_{speed}", drop, published_as=printed, allowed=allowed, **facts)
+
+
+def _injector_rows() -> Iterator[Row]:
+    vine, (length_mm, diameter_mm) = published.INJECTOR, published.INJECTOR_CHAMBER_MM
+    printed = 100 * published.INJECTOR_CHANGE
+    chamber_m3 = area_m2(diameter_mm) * length_mm / 1e3
+    change = volume_change(chamber_m3, vine["diameter_mm"], vine["length_mm"])
+    slow, fast = (100 * (1 - gauge_left(1e3 * vine["pressure_kPa"], change, gamma)) for gamma in GAMMAS.values())
+    yield row_of("injector_volume_change", 100 * change, published_as=printed)
+    yield row_of("injector_gauge_drop", slow, published_as=printed, fast=fast)
+
+
+def _rounding_row() -> Row:
+    # The printed pressures look like rounded pounds per square inch: 14 kPa is 2 psi, 13.79 kPa.
+    pressures_kPa, psi_kPa = (7, 14, 28, 34, 41, 48, 62), convert(1.0, "psi", "kPa")
+    exact = [round(kPa / psi_kPa) * psi_kPa for kPa in pressures_kPa]
+    errors = [abs(kPa / true - 1) for kPa, true in zip(pressures_kPa, exact, strict=True)]
+    worst = int(np.argmax(errors))
+    return row_of("pressure_rounding", 100 * errors[worst], kPa=pressures_kPa[worst], exact=exact[worst])
+
+
+# ------------------------------------------------------------------------------
+# What follows by Eq. (2) with the paper's own numbers: the fast vine, air drag, and the published rule.
+
+
+def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
+    """Compute the rows on the fast vine, on air drag, and on the published rule for noise-free motions."""
+    fast = published.FAST_VINE
+    B = damping_prior(fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
+    printed = published.FAST_VINE_PREDICTED_M_S
+    for fraction, speed in zip(FAST_AT, fast_vine_speeds(FAST_AT), strict=True):
+        yield row_of("fast_vine_predicted_{percent:.0f}", speed, published_as=printed, percent=100 * fraction, B=B)
+    for fraction, share, by_print in drag_shares(DRAG_AT):
+        facts = {"percent": 100 * fraction, "by_print": 100 * by_print}
+        printed = 100 * published.DRAG_SHARE
+        yield row_of("drag_share_{percent:.0f}", 100 * share, published_as=printed, **facts)
+    yield from _rule_rows(trials)
+
+
+def _rule_rows(trials: Sequence[Trial]) -> Iterator[Row]:
+    """Bias of the published rule in noise-free motions, with a full and with a depleting chamber."""
+    chosen: dict[str, Trial] = {}
+    for trial in trials:
+        scale = published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m)
+        if scale is not None and trial.payload_kg == 0 and trial.travel_ratio == 2:
+            chosen.setdefault(trial.condition, trial)
+    if len(chosen) < len(published.DAMPING_B):
+        return
+    cases = {"rule_bias_n": None, "rule_n_depletion_slow": 1.0, "rule_n_depletion_fast": 1.4}
+    for row, gamma in cases.items():
+        n, B = rule_on_noise_free(gamma, list(chosen.values()))
+        facts = {"B": ", ".join(f"{B[R]:.2f}" for R in sorted(B)), "scales": ", ".join(map(str, sorted(B)))}
+        yield row_of(row, n, published_as=published.EXPONENT, n=len(chosen), **facts)
