@@ -16,7 +16,7 @@ import termios
 
 import pytest
 
-from vinetrack.core.terminal import colour_wanted, progress, styled, table, waiting
+from vinetrack.core.terminal import colour_wanted, progress, severity_first, table, waiting
 
 SLOW = """
 import time
@@ -62,8 +62,8 @@ def test_numbers_stand_to_the_right_and_words_to_the_left() -> None:
 def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
-    assert styled("bad", "red", "bold", stream=Screen()) == "\x1b[31;1mbad\x1b[0m"
-    assert styled("bad", "red", stream=io.StringIO()) == "bad"
+    assert severity_first("error: a", Screen()) == "\x1b[31;1merror\x1b[0m: a"
+    assert severity_first("error: a", io.StringIO()) == "error: a"
     monkeypatch.setenv("NO_COLOR", "1")
     assert not colour_wanted(Screen())
     monkeypatch.setenv("NO_COLOR", "")
@@ -76,7 +76,7 @@ def test_a_bar_says_how_much_is_left() -> None:
     said = seen_on_a_terminal(SLOW)
     assert "trials:" in said
     assert "/12" in said
-    assert "<00:0" in said
+    assert " left" in said
 
 
 def test_nothing_is_shown_where_nobody_looks(capfd: pytest.CaptureFixture[str]) -> None:

@@ -33,7 +33,6 @@ from vinetrack.cli.diagnose_commands import progress_line
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.planning_commands import register as register_planning
 from vinetrack.cli.start_commands import register as register_start
-from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.pipeline.stages import STAGES, Job, Stage
 
 if TYPE_CHECKING:
@@ -71,6 +70,8 @@ def _exit_despite_threads(status: str | int | None) -> None:
     such a thread within compiled code, which sometimes aborts the process (status -6). Files are written atomically, so
     nothing is lost by not waiting.
     """
+    from vinetrack.pages.local_page import THREAD_PREFIX
+
     if isinstance(status, str) or not any(thread.name.startswith(THREAD_PREFIX) for thread in threading.enumerate()):
         return
     logging.shutdown()

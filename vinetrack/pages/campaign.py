@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
-from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
@@ -34,6 +33,7 @@ from vinetrack.inference.fit_result import Fit, Number, TrialFit
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, group_names
 from vinetrack.inference.sensitivity import initial_trial_effects
+from vinetrack.pages.local_page import THREAD_PREFIX
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result
 
 if TYPE_CHECKING:

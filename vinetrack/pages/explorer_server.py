@@ -17,14 +17,14 @@ from bokeh.document import Document
 from bokeh.server.server import Server
 from tornado.web import ErrorHandler
 
-from vinetrack.core.local_page import (
+from vinetrack.pages.campaign import BackgroundFit
+from vinetrack.pages.local_page import (
     LOOPBACK,
     allowed_hosts,
     secret_path,
     serve_on_free_port,
     stop_on_signals,
 )
-from vinetrack.pages.campaign import BackgroundFit, read_campaign
 
 if TYPE_CHECKING:
     from vinetrack.pages.campaign import Campaign

@@ -17,9 +17,9 @@ from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Prediction
+from vinetrack.pages.local_page import THREAD_PREFIX
 from vinetrack.pages.plots import (
     MEASURED_EDGE,
     MODEL_EDGE,

@@ -15,14 +15,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from vinetrack.core.local_page import (
-    LOOPBACK,
-    THREAD_PREFIX,
-    allowed_hosts,
-    secret_path,
-    serve_on_free_port,
-    stop_on_signals,
-)
 from vinetrack.core.problems import ExperimentError, Problem, UserError
 from vinetrack.core.records import Correction
 from vinetrack.core.tables import list_recordings
@@ -31,20 +23,30 @@ from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import SETTINGS, check_experiment, corrections_text
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
-from vinetrack.pages.clip_names import list_pictures, list_tables, units_of
 from vinetrack.pages.clip_views import ClipStore, jpeg, track_row, warm_up
 from vinetrack.pages.draft_files import (
     Draft,
     SheetDraft,
     draft_folder,
     files_stamp,
+    list_pictures,
+    list_tables,
     open_draft,
     place_block,
     read_draft,
     same_cells,
     shared_values,
+    units_of,
     with_shared,
     write_draft,
+)
+from vinetrack.pages.local_page import (
+    LOOPBACK,
+    THREAD_PREFIX,
+    allowed_hosts,
+    secret_path,
+    serve_on_free_port,
+    stop_on_signals,
 )
 from vinetrack.video.frames import RecordingError
 
