@@ -590,14 +590,8 @@ class FitJob(Generic[Progress, Outcome]):
     ) -> None:
         self._work, self._on_progress, self._on_success, self._on_failure = work, on_progress, on_success, on_failure
         self._cancelled = threading.Event()
-        self.started = time.monotonic()
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}fit")
         self._thread.start()
-
-    @property
-    def running(self) -> bool:
-        """Whether it is running and was not cancelled."""
-        return self._thread.is_alive() and not self._cancelled.is_set()
 
     def cancel(self) -> None:
         """End it at its next step; no callback is called any more."""
@@ -697,11 +691,12 @@ _INITIAL_FRACTION = 0.04  # Fraction of the progress bar filled at the start; ch
 class FitProgress:
     """Progress of a fit, as a fraction and as text; `message` is shown when no fit runs. The number of steps is
     unknown. Progress is measured on the logarithm of the predicted decrease of −2 ln L by the next step, from its
-    largest value down to `CONVERGED_DECREASE`, where a fit stops.
+    largest value down to `CONVERGED_DECREASE`, where a fit stops; and by the clock where `typical_s` is given.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, typical_s: float = 0.0) -> None:
         self.message = ""
+        self._typical_s = typical_s
         self._started = 0.0
         self._largest = 0.0
         self._fraction = _INITIAL_FRACTION
@@ -724,6 +719,9 @@ class FitProgress:
 
     def state(self, now: float, task: str, other: Step | None = None) -> tuple[float, str]:
         """Return the fraction done and the text of the status line. Returns fraction, text."""
+        passed_s = now - self._started
+        if self._typical_s:
+            return max(self._fraction, passed_s / (passed_s + self._typical_s / 2)), f"{task} · {passed_s:.0f} s"
         step = other or self._step
         where = f" · step {step.iteration}" if step is not None else ""
         promise = ""
@@ -733,15 +731,7 @@ class FitProgress:
                 if step.predicted_decrease < 1e4
                 else " · still far off"
             )
-        return self._fraction, f"{task}{where}{promise} · {now - self._started:.1f} s"
-
-    def end(self, message: str) -> None:
-        """Show why a fit ended."""
-        self.message = message
-
-    def set_message(self, message: str) -> None:
-        """Show a message without ending the fit."""
-        self.message = message
+        return self._fraction, f"{task}{where}{promise} · {passed_s:.1f} s"
 
 
 def commands(campaign: Campaign, choice: ModelChoice, *, fitted: bool, save: bool = False) -> list[str]:

@@ -19,6 +19,7 @@ from vinetrack.experiment.folder import SETTINGS, read_corrections
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, read_row
+from vinetrack.pages.local_page import jpeg
 from vinetrack.tracks.importers import TrackError, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import CurvedAxis, axis_through
@@ -27,7 +28,6 @@ from vinetrack.video.survey import Measurement, measure_recording, proposed_axis
 from vinetrack.video.target_corners import find_board
 from vinetrack.video.track import Tracking, track_recording
 
-JPEG_QUALITY = 90  # JPEG quality, 0 to 100; chosen: at 90 a mark on a ruler shows no blocks under the magnifier
 CACHED_CLIPS = 2  # Recordings whose frames are cached; chosen: the current and the previous one
 THUMBNAIL_PX = 220  # Width of the pictures in the list; chosen: as wide as its column
 BLANK_GREY = 128  # Grey level of the strip where no frame was decoded (chosen)
@@ -111,19 +111,6 @@ def _decoded(path: Path) -> DecodedClip:
     top = float(np.quantile(frames.luma[0], 0.999)) if frames.luma.dtype != np.uint8 else 255.0
     pictures = tuple(jpeg(luma, white=top) for luma in frames.luma)
     return DecodedClip(pictures, width, height, axis, no_axis, frames.notes)
-
-
-def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None = None) -> bytes:
-    """Return a grey picture as JPEG. Shapes: picture (height, width)."""
-    import cv2
-
-    if picture.dtype != np.uint8:
-        scale = 255 / max(float(picture.max()) if white is None else white, 1.0)
-        picture = (np.nan_to_num(picture.astype(np.float32)) * scale).clip(0, 255).astype(np.uint8)
-    height, width = picture.shape
-    if widest is not None and width > widest:
-        picture = cv2.resize(picture, (widest, max(1, round(height * widest / width))), interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
 def axis_json(axis: Axis) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from bokeh.models import (
-    Button,
     Checkbox,
     CheckboxButtonGroup,
     Column,
@@ -18,9 +17,9 @@ from bokeh.models import (
     CustomJS,
     Div,
     PrintfTickFormatter,
-    Row,
     Slider,
     Toggle,
+    UIElement,
 )
 
 from vinetrack.core.problems import ExperimentError, UserError, format_problems
@@ -31,6 +30,7 @@ from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
     FitJob,
+    FitProgress,
     Fitted,
     ModelChoice,
     SizeControl,
@@ -42,7 +42,16 @@ from vinetrack.pages.campaign import (
     sizes_of,
     slider_range,
 )
-from vinetrack.pages.plots import command_block, escaped, html_div, progress_bar, stylesheet
+from vinetrack.pages.plots import (
+    button,
+    command_block,
+    escaped,
+    html_div,
+    progress_bar,
+    side_by_side,
+    stacked,
+    stylesheet,
+)
 from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect
 
 if TYPE_CHECKING:
@@ -81,9 +90,7 @@ class EffectRow:
         self.fitted_texts = [html_div(visible=False, name=f"found_{size.name}") for size in self.sizes]
         about = f"<small>{escaped(unusable or effect.formula)}</small>"
         pairs = [part for pair in zip(self.sliders, self.fitted_texts, strict=True) for part in pair]
-        self.root = Column(
-            children=[self.tick, html_div(about), *pairs], sizing_mode="stretch_width", margin=(0, 0, 4, 0)
-        )
+        self.root = stacked(self.tick, html_div(about), *pairs, margin=(0, 0, 4, 0))
 
     def value(self, k: int) -> float:
         """Return the value of a slider in SI units."""
@@ -93,7 +100,7 @@ class EffectRow:
 def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
     unit, factor = size.shown
     low, high = factor * size.low, factor * size.high
-    slider = Slider(
+    return Slider(
         start=low,
         end=high,
         value=factor * choice.numbers.get(size.name, size.parameter.default),
@@ -106,7 +113,6 @@ def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
         stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; }")],
         margin=(2, 0, 6, 0),
     )
-    return slider
 
 
 def _title(size: SizeControl) -> str:
@@ -116,6 +122,13 @@ def _title(size: SizeControl) -> str:
 
 def _step(low: float, high: float) -> float:
     return (high - low) / STEPS or 1.0
+
+
+def _opens(inside: UIElement, title: str, css: str, **keywords: Any) -> Toggle:
+    """A toggle that shows and hides what is inside."""
+    head = Toggle(label=title, active=inside.visible, stylesheets=[stylesheet(css)], margin=0, **keywords)
+    head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
+    return head
 
 
 class EffectPanel:
@@ -133,12 +146,10 @@ class EffectPanel:
         self._updating = False
         self.rows = {name: EffectRow(campaign, effect, choice) for name, effect in campaign.effects.items()}
         for name, row in self.rows.items():
-            row.tick.on_change("active", self._on_tick(name))
+            row.tick.on_change("active", partial(self._on_tick, name))
             for k, slider in enumerate(row.sliders):
-                slider.on_change("value", self._on_size(name, k))
-        self.root = Column(
-            children=self._groups(choice, suspects), sizing_mode="stretch_width", name="effects", margin=0
-        )
+                slider.on_change("value", partial(self._on_size, name, k))
+        self.root = stacked(*self._groups(choice, suspects), name="effects")
 
     def _groups(self, choice: ModelChoice, suspects: Sequence[str]) -> list[Column]:
         in_use = [name for name in self.rows if name in choice]
@@ -154,29 +165,17 @@ class EffectPanel:
         return [self._group(title, names, shown) for title, names, shown in groups if names]
 
     def _group(self, title: str, names: Sequence[str], shown: bool) -> Column:
-        inside = Column(
-            children=[self.rows[name].root for name in names], sizing_mode="stretch_width", visible=shown, margin=0
-        )
-        head = Toggle(
-            label=title, active=shown, sizing_mode="stretch_width", stylesheets=[stylesheet(HEADING)], margin=0
-        )
-        head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
-        return Column(children=[head, inside], sizing_mode="stretch_width", margin=0)
+        inside = stacked(*(self.rows[name].root for name in names), visible=shown)
+        return stacked(_opens(inside, title, HEADING, sizing_mode="stretch_width"), inside)
 
-    def _on_tick(self, name: str) -> Callable[[str, bool, bool], None]:
-        def on_change(_attr: str, _old: bool, new: bool) -> None:
-            if not self._updating:
-                self._ticked(name, new)
+    def _on_tick(self, name: str, _attr: str, _old: bool, new: bool) -> None:
+        if not self._updating:
+            self._ticked(name, new)
 
-        return on_change
-
-    def _on_size(self, name: str, k: int) -> Callable[[str, float, float], None]:
-        def on_change(_attr: str, _old: float, _new: float) -> None:
-            if not self._updating:
-                row = self.rows[name]
-                self._moved(name, row.sizes[k].name, row.value(k))
-
-        return on_change
+    def _on_size(self, name: str, k: int, _attr: str, _old: float, _new: float) -> None:
+        if not self._updating:
+            row = self.rows[name]
+            self._moved(name, row.sizes[k].name, row.value(k))
 
     def show(self, choice: ModelChoice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
         """Set tick boxes and, optionally, sliders to a choice; show the fitted value at each slider."""
@@ -235,46 +234,29 @@ class TrialSelector:
 
     def __init__(self, campaign: Campaign, on_change: Callable[[], None]) -> None:
         self.campaign, self._on_change = campaign, on_change
-        everything = list(range(len(campaign.conditions)))
-        self._conditions = CheckboxButtonGroup(
-            labels=[campaign.labels[name] for name in campaign.conditions],
+        self._conditions = self._chips([campaign.labels[name] for name in campaign.conditions], "conditions")
+        self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", SMALL, visible=False)
+        tools = side_by_side(
+            button("all", "choose_all", self._all, css=SMALL),
+            button("none", "choose_none", self._none, css=SMALL),
+            _opens(self._trials, "single trials …", SMALL, name="single_trials"),
+            css=":host { gap: 4px; }",
+        )
+        self.root = stacked(self._conditions, tools, self._trials, name="choose")
+
+    def _chips(self, labels: list[str], name: str, css: str = "", **keywords: Any) -> CheckboxButtonGroup:
+        """Buttons that are all chosen at first."""
+        everything, margin = list(range(len(labels))), (4, 0, 0, 0) if css else (0, 0, 4, 0)
+        chips = CheckboxButtonGroup(
+            labels=labels,
             active=everything,
-            name="conditions",
-            stylesheets=[stylesheet(CHIPS)],
-            margin=(0, 0, 4, 0),
+            name=name,
+            stylesheets=[stylesheet(CHIPS + css)],
+            margin=margin,
+            **keywords,
         )
-        self._trials = CheckboxButtonGroup(
-            labels=[aligned.name for aligned in campaign.trials],
-            active=list(range(len(campaign.trials))),
-            name="trials",
-            visible=False,
-            stylesheets=[stylesheet(CHIPS + SMALL)],
-            margin=(4, 0, 0, 0),
-        )
-        self._conditions.on_change("active", lambda _attr, _old, _new: self._on_change())
-        self._trials.on_change("active", lambda _attr, _old, _new: self._on_change())
-        self.root = Column(
-            children=[self._conditions, self._tools(), self._trials],
-            sizing_mode="stretch_width",
-            name="choose",
-            margin=0,
-        )
-
-    def _tools(self) -> Row:
-        single = Toggle(
-            label="single trials …", active=False, stylesheets=[stylesheet(SMALL)], margin=0, name="single_trials"
-        )
-        single.js_on_change("active", CustomJS(args={"t": self._trials}, code="t.visible = cb_obj.active"))
-        return Row(
-            children=[self._button("all", self._all), self._button("none", self._none), single],
-            margin=0,
-            stylesheets=[stylesheet(":host { gap: 4px; }")],
-        )
-
-    def _button(self, label: str, does: Callable[[], None]) -> Any:
-        button = Button(label=label, stylesheets=[stylesheet(SMALL)], margin=0, name=f"choose_{label}")
-        button.on_click(does)
-        return button
+        chips.on_change("active", lambda _attr, _old, _new: self._on_change())
+        return chips
 
     def _all(self) -> None:
         self._trials.active = list(range(len(self.campaign.trials)))
@@ -306,15 +288,9 @@ class SavePanel:
 
     def __init__(self, page: Page) -> None:
         self._page = page
-        self.save = Button(label="Save the model to experiment.yaml", name="save", stylesheets=[stylesheet()], margin=0)
-        self.save.on_click(self._save)
         self.message = html_div(name="saved")
-        self.root = Column(
-            children=[Row(children=[self.save], margin=0), self.message],
-            sizing_mode="stretch_width",
-            name="keep",
-            margin=0,
-        )
+        save = button("Save the model to experiment.yaml", "save", self._save)
+        self.root = stacked(side_by_side(save), self.message, name="keep")
 
     def _save(self) -> None:
         page = self._page
@@ -355,8 +331,7 @@ INTRODUCTION = (
     " as an effect file of your own, beside the experiment. It takes minutes."
 )
 RELOAD = "location.reload()"
-# Fraction of the progress bar at the start, and the time in which it is two thirds full (chosen)
-INITIAL_FRACTION, TYPICAL_DURATION_S = 0.04, 150.0
+TYPICAL_DURATION_S = 150.0  # Time in which the progress bar of a search is two thirds full (chosen)
 
 
 @dataclass(frozen=True)
@@ -381,32 +356,15 @@ class ProposalPanel:
     def __init__(self, page: Page, reopen: Reopen | None) -> None:
         self._page, self._reopen = page, reopen
         self._job: FitJob[str, ReadProposal] | None = None
-        self._task, self._started = "", 0.0
+        self._task, self._progress = "", FitProgress(TYPICAL_DURATION_S)
         self._outcome: ReadProposal | None = None
-        self.button = Button(label=PROPOSE, name="propose", width=150, stylesheets=[stylesheet()], margin=0)
-        self.button.on_click(self._propose_or_stop)
-        self.open = Button(
-            label="Open the page with it",
-            name="open_proposed",
-            width=170,
-            stylesheets=[stylesheet()],
-            margin=0,
-            visible=False,
-        )
-        self.open.on_click(self._open)
+        self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
+        self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)
         self.text = html_div(name="proposal")
         self._reload = ColumnDataSource({"times": [0]}, name="reload")
         self._reload.js_on_change("data", CustomJS(code=RELOAD))
-        self.root = Column(
-            children=[
-                self.text,
-                Row(children=[self.button, self.open], margin=0, stylesheets=[stylesheet(":host { gap: 6px; }")]),
-            ],
-            sizing_mode="stretch_width",
-            name="propose_panel",
-            margin=0,
-            tags=[self._reload],
-        )
+        buttons = side_by_side(self.button, self.open)
+        self.root = stacked(self.text, buttons, name="propose_panel", tags=[self._reload])
         self.show()
 
     def show(self) -> None:
@@ -414,9 +372,7 @@ class ProposalPanel:
         summary = self._page.summary
         self.root.visible = self._job is not None or self._outcome is not None or bool(summary and summary.unexplained)
         if self._job is not None:
-            passed_s = time.monotonic() - self._started
-            share = max(INITIAL_FRACTION, passed_s / (passed_s + TYPICAL_DURATION_S / 2))
-            self._say(progress_bar(share, f"{self._task} · {passed_s:.0f} s"))
+            self._say(progress_bar(*self._progress.state(time.monotonic(), self._task)))
         elif self._outcome is None and not self.text.text:
             command = command_block([f"vinetrack propose {self._page.campaign.folder.as_posix()}"])
             self._say(f"<p>{INTRODUCTION} The same from the command line:</p>{command}")
@@ -435,7 +391,8 @@ class ProposalPanel:
             self._job.cancel()
             self._ended("<p>The search was stopped; nothing was written.</p>")
             return
-        self._task, self._started, self.button.label = "reading the results", time.monotonic(), "Stop"
+        self._task, self.button.label = "reading the results", "Stop"
+        self._progress.begin(time.monotonic())
         soon = self._page.document.add_next_tick_callback
         self._job = FitJob(
             partial(propose_and_read, self._page.campaign),

@@ -12,21 +12,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import Button, Column, ColumnDataSource, LinearColorMapper, Range1d, Row, Select, Slider
+from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d, Select, Slider
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Prediction
-from vinetrack.pages.local_page import THREAD_PREFIX
+from vinetrack.pages.local_page import THREAD_PREFIX, jpeg
 from vinetrack.pages.plots import (
     MEASURED_EDGE,
     MODEL_EDGE,
     REFERENCE_EDGE,
+    button,
     escaped,
     html_div,
     progress_bar,
+    side_by_side,
+    stacked,
     stylesheet,
 )
 from vinetrack.pipeline.overlays_stage import shake_along
@@ -45,8 +48,6 @@ if TYPE_CHECKING:
 # second of a high-speed camera takes a few tens of megabytes.
 
 MAX_WIDTH_PX = 960  # Chosen: as wide as the page shows a recording
-
-JPEG_QUALITY = 88  # JPEG quality, 0 to 100
 
 PROGRESS_EVERY_FRAMES = 10  # Frames between two reports of progress; chosen: several reports a second
 
@@ -163,7 +164,11 @@ class DecodedRecording:
             for luma in iterate_frames(recording):
                 if self._cancelled:
                     return self
-                self._add(luma, recording.bit_depth)
+                height, width = luma.shape
+                shown_px = min(width, MAX_WIDTH_PX)
+                self.shape, self.scale = (max(1, round(height * shown_px / width)), shown_px), shown_px / width
+                self._frames.append(jpeg(luma, MAX_WIDTH_PX, 2.0**recording.bit_depth - 1))
+                self.count += 1
                 if on_progress is not None and self.count % PROGRESS_EVERY_FRAMES == 1:
                     on_progress(self)
         except (RecordingError, OSError) as error:
@@ -181,20 +186,6 @@ class DecodedRecording:
         """Stop decoding."""
         self._cancelled = True
 
-    def _add(self, luma: NDArray[Any], bit_depth: int) -> None:
-        import cv2
-
-        height, width = luma.shape
-        if luma.dtype != np.uint8:
-            luma = (luma >> max(bit_depth - 8, 0)).astype(np.uint8)
-        if width > MAX_WIDTH_PX:
-            size = (MAX_WIDTH_PX, round(height * MAX_WIDTH_PX / width))
-            luma = cv2.resize(luma, size, interpolation=cv2.INTER_AREA)
-        _, data = cv2.imencode(".jpg", luma, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        self._frames.append(data.tobytes())
-        self.shape, self.scale = (luma.shape[0], luma.shape[1]), luma.shape[1] / width
-        self.count += 1
-
 
 PLAY_MS = 70  # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
 NARROW = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
@@ -211,16 +202,9 @@ class FilmPanel:
         self._view: RecordingView | None = None
         self._playing: Any = None
         names = [aligned.name for aligned in campaign.trials]
-        self.trial_select = Select(
-            options=names,
-            value=names[0],
-            width=220,
-            title="trial",
-            name="film_trial",
-            stylesheets=[stylesheet()],
-            margin=0,
-        )
-        self.play = Button(label="▶ play", width=84, name="film_play", stylesheets=[stylesheet()], margin=0)
+        common = {"stylesheets": [stylesheet()], "margin": 0}
+        self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial", **common)
+        self.play = button("▶ play", "film_play", self._toggle_play, width=84)
         self.frame = Slider(
             start=0,
             end=1,
@@ -238,16 +222,8 @@ class FilmPanel:
         self.figure = self._draw()
         self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
         self.frame.on_change("value", lambda _attr, _old, new: self._show_frame(int(new)))
-        self.play.on_click(self._toggle_play)
-        controls = Row(
-            children=[self.trial_select, self.play, self.frame],
-            sizing_mode="stretch_width",
-            stylesheets=[stylesheet(NARROW)],
-            margin=0,
-        )
-        self.root = Column(
-            children=[controls, self.figure, self.caption], sizing_mode="stretch_width", name="film", margin=0
-        )
+        controls = side_by_side(self.trial_select, self.play, self.frame, css=NARROW, sizing_mode="stretch_width")
+        self.root = stacked(controls, self.figure, self.caption, name="film")
 
     def _draw(self) -> Any:
         fig = figure(

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from bokeh.document import Document
-from bokeh.models import Button, Column, CustomJS, Row
+from bokeh.models import CustomJS
 
 from vinetrack.figures.style import follows_screen
 from vinetrack.inference.fit_data import FitError
@@ -27,13 +27,15 @@ from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, SavePan
 from vinetrack.pages.film_panel import FilmPanel
 from vinetrack.pages.plots import (
     Plots,
+    button,
     escaped,
     html_div,
     page_style,
     page_template,
     progress_bar,
     screen_script,
-    stylesheet,
+    side_by_side,
+    stacked,
     theme,
     vine_colours,
 )
@@ -107,22 +109,16 @@ class Page:
         self.film = FilmPanel(campaign, self.document, self._instant)
         self.save_panel = SavePanel(self)
         self.proposal = ProposalPanel(self, reopen)
-        self.refit = Button(label="Refit", button_type="primary", width=110, name="refit", stylesheets=[stylesheet()])
-        self.back = Button(label="As fitted", width=96, name="as_fitted", stylesheets=[stylesheet()])
-        self.hold = Button(label="Hold to compare", width=132, name="hold", stylesheets=[stylesheet()])
-        self.refit.on_click(self._refit_or_stop)
-        self.hold.on_click(self._hold)
-        self.back.on_click(self._as_fitted)
+        self.refit = button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
+        back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
+        self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
         self.command_text = html_div(name="commands")
-        wrapped = stylesheet(":host { gap: 6px; flex-wrap: wrap; }")
-        buttons = Row(children=[self.refit, self.back, self.hold], margin=0, stylesheets=[wrapped])
+        buttons = side_by_side(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
         hint = html_div(
             "<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps this "
             "model for comparison.</small>"
         )
-        actions = Column(
-            children=[buttons, hint, self.command_text], sizing_mode="stretch_width", name="actions", margin=0
-        )
+        actions = stacked(buttons, hint, self.command_text, name="actions")
         roots = [self.headline, self.status, self.selector.root, self.plots.motion, self.plots.residual]
         roots += [self.plots.errors, self.panel.root, actions, self.numbers, self.tied, self.next]
         for root in (*roots, self.film.root, self.save_panel.root, self.proposal.root):
@@ -297,7 +293,7 @@ class Page:
         if self._job is not None:
             self._job.cancel()
         self._job, self._refit_requested = None, False
-        self._progress.end(reason)
+        self._progress.message = reason
         self.refit.label = "Refit"
         self._update_status()
         self._update_text_soon()
@@ -325,10 +321,10 @@ class Page:
         try:
             self.shown = predict_choice(self.campaign, choice, None if self.shown is None else self.shown.floors_m)
         except FitError as error:
-            self._progress.set_message(str(error))
+            self._progress.message = str(error)
             self._update_status()
             return
-        self._progress.set_message("")
+        self._progress.message = ""
         self._draw()
 
     def _draw(self) -> None:

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 from bokeh.models import (
+    Button,
     CategoricalColorMapper,
+    Column,
     ColumnDataSource,
     CustomJS,
     CustomJSTickFormatter,
@@ -19,8 +21,10 @@ from bokeh.models import (
     HoverTool,
     InlineStyleSheet,
     Range1d,
+    Row,
     Span,
     TapTool,
+    UIElement,
 )
 from bokeh.plotting import figure
 from bokeh.themes import Theme
@@ -94,6 +98,25 @@ def stylesheet(more: str = "") -> InlineStyleSheet:
 def html_div(text: str = "", name: str | None = None, **keywords: Any) -> Div:
     """Return a piece of HTML as a widget."""
     return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[stylesheet()], margin=0, **keywords)
+
+
+def button(
+    label: str, name: str, does: Callable[[], None], *, css: str = "", margin: int = 0, **options: Any
+) -> Button:
+    """Return a button that calls `does` when it is clicked."""
+    made = Button(label=label, name=name, stylesheets=[stylesheet(css)], margin=margin, **options)
+    made.on_click(does)
+    return made
+
+
+def stacked(*parts: UIElement, margin: Any = 0, **keywords: Any) -> Column:
+    """Return parts below each other, as wide as their card."""
+    return Column(children=list(parts), sizing_mode="stretch_width", margin=margin, **keywords)
+
+
+def side_by_side(*parts: UIElement, css: str = ":host { gap: 6px; }", **keywords: Any) -> Row:
+    """Return parts beside each other."""
+    return Row(children=list(parts), margin=0, stylesheets=[stylesheet(css)], **keywords)
 
 
 def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:

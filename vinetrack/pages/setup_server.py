@@ -23,7 +23,7 @@ from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import SETTINGS, check_experiment, corrections_text
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
-from vinetrack.pages.clip_views import ClipStore, jpeg, track_row, warm_up
+from vinetrack.pages.clip_views import ClipStore, track_row, warm_up
 from vinetrack.pages.draft_files import (
     Draft,
     SheetDraft,
@@ -44,6 +44,7 @@ from vinetrack.pages.local_page import (
     LOOPBACK,
     THREAD_PREFIX,
     allowed_hosts,
+    jpeg,
     secret_path,
     serve_on_free_port,
     stop_on_signals,
