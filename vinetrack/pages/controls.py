@@ -246,15 +246,9 @@ class TrialSelector:
 
     def _chips(self, labels: list[str], name: str, css: str = "", **keywords: Any) -> CheckboxButtonGroup:
         """Buttons that are all chosen at first."""
-        everything, margin = list(range(len(labels))), (4, 0, 0, 0) if css else (0, 0, 4, 0)
-        chips = CheckboxButtonGroup(
-            labels=labels,
-            active=everything,
-            name=name,
-            stylesheets=[stylesheet(CHIPS + css)],
-            margin=margin,
-            **keywords,
-        )
+        margin = (4, 0, 0, 0) if css else (0, 0, 4, 0)
+        look: dict[str, Any] = {"stylesheets": [stylesheet(CHIPS + css)], "margin": margin, **keywords}
+        chips = CheckboxButtonGroup(labels=labels, active=list(range(len(labels))), name=name, **look)
         chips.on_change("active", lambda _attr, _old, _new: self._on_change())
         return chips
 

@@ -202,7 +202,7 @@ class FilmPanel:
         self._view: RecordingView | None = None
         self._playing: Any = None
         names = [aligned.name for aligned in campaign.trials]
-        common = {"stylesheets": [stylesheet()], "margin": 0}
+        common: dict[str, Any] = {"stylesheets": [stylesheet()], "margin": 0}
         self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial", **common)
         self.play = button("▶ play", "film_play", self._toggle_play, width=84)
         self.frame = Slider(

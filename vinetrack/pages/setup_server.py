@@ -119,14 +119,10 @@ def _place(correction: Correction) -> dict[str, Any]:
     return {"edge_px": correction.edge_px if math.isfinite(correction.edge_px) else None}
 
 
-def _page_state_frame(point: Mapping[str, Any]) -> int:
-    return int(point["frame"])
-
-
 def _correction(point: Mapping[str, Any]) -> Correction:
     """A correction from the JSON of the page."""
     edge_px = math.nan if point["edge_px"] is None else float(point["edge_px"])
-    return Correction(_page_state_frame(point), str(point["action"]), edge_px)
+    return Correction(int(point["frame"]), str(point["action"]), edge_px)
 
 
 def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
@@ -144,7 +140,9 @@ def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
             text = with_value(text, key, value, SETTINGS)
     given = content.get("corrections", {}).items()
     corrections = {
-        str(trial): tuple(map(_correction, sorted(points, key=_page_state_frame))) for trial, points in given if points
+        str(trial): tuple(sorted(map(_correction, points), key=lambda made: made.frame))
+        for trial, points in given
+        if points
     }
     return Draft(sheet, text, str(content["stamp"]), corrections)
 

@@ -160,8 +160,8 @@ def _window_rows(windows: pd.DataFrame, mark: str) -> Iterator[Row]:
     literal, gated = windows[windows["rule"] == "paper"], windows[windows["rule"] == "gated"]
     accepted = literal[literal["accepted"]]
     fewest, largest = accepted["points"].min(), 100 * accepted["cv"].max()
-    drift = {"drift_percent": 100 * accepted["drift"].abs().max()} if len(accepted) else {}
-    share = {"gated_percent": 100 * gated["accepted"].mean()} if len(gated) else {}
+    drift: Row = {"drift_percent": 100 * accepted["drift"].abs().max()} if len(accepted) else {}
+    share: Row = {"gated_percent": 100 * gated["accepted"].mean()} if len(gated) else {}
     limit = 100 * published.STEADY_CV
     yield row_of("window_fewest_points", float(fewest), mark=mark, n=len(accepted))
     yield row_of("window_largest_cv", float(largest), published_as=limit, mark=mark, **drift)
@@ -226,7 +226,7 @@ def _law_rows(results: ExperimentResults) -> Iterator[Row]:
     for R, printed in published.DAMPING_B.items():
         log_log, ours, literal = (_vine_of(law, R) for law in laws.values())
         B, interval, n = or_nan(ours.get("B")), _bounds(ours.get("B_95_total")), ours.get("n_trials", 0)
-        by_rule = {"literal": literal["B"]} if math.isfinite(or_nan(literal.get("B"))) else {}
+        by_rule: Row = {"literal": literal["B"]} if math.isfinite(or_nan(literal.get("B"))) else {}
         yield row_of("B_R{R}", B, interval, published_as=printed, mark=results.mark, R=R, n=n, **by_rule)
         R2 = or_nan(log_log.get("R2"))
         yield row_of("R2_R{R}", R2, published_as=published.DAMPING_R2[R], mark=results.mark, R=R)
@@ -243,7 +243,7 @@ def _motion_rows(results: ExperimentResults) -> Iterator[Row]:
     for kPa, printed in published.POSITION_RMS_CM.items():
         lines = _at_pressure(results.positions, kPa)
         first: Any = lines.iloc[0] if len(lines) else {"n_trials": 0, "rms_mean_m": nan}
-        facts = {
+        facts: Row = {
             "n": first["n_trials"],
             "alone": f"; {100 * first['rms_single_m']:.2f} cm over single trials" if len(lines) else "",
             "departures": departures_in_words(results.departures, "Fig. 4", kPa),
@@ -298,7 +298,7 @@ def _scale_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
     replicates = float(published.REPLICATES)
     counts = [int(count) for count in family.get("n_steady", ())]
     yield row_of("steady_speed_trials", _median(counts), published_as=replicates, mark=mark, n=n)
-    facts = {"p": line["p"], "monotonic": "yes" if family.get("monotonic") else "no"} if line else {}
+    facts: Row = {"p": line["p"], "monotonic": "yes" if family.get("monotonic") else "no"} if line else {}
     R2 = or_nan(line.get("R2"))
     yield row_of("steady_speed_R2", R2, published_as=published.STEADY_SPEED_R2, mark=mark, n=n, **facts)
     yield row_of("steady_speed_power", **_fitted(family.get("power") or {}), mark=mark, n=n)
@@ -414,7 +414,7 @@ def _reservoir_rows() -> Iterator[Row]:
     for kPa in sorted(published.POSITION_RMS_CM, reverse=True):
         for speed, gamma in GAMMAS.items():
             drop = 100 * (1 - gauge_left(1e3 * kPa, change, gamma))
-            facts = {"kPa": kPa, "speed": speed, "process": "isothermal" if gamma == 1 else "adiabatic"}
+            facts: Row = {"kPa": kPa, "speed": speed, "process": "isothermal" if gamma == 1 else "adiabatic"}
             yield row_of("gauge_drop_{kPa:g}kPa_{speed}", drop, published_as=printed, allowed=allowed, **facts)
 
 
@@ -449,7 +449,7 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
     for fraction, speed in zip(FAST_AT, fast_vine_speeds(FAST_AT), strict=True):
         yield row_of("fast_vine_predicted_{percent:.0f}", speed, published_as=printed, percent=100 * fraction, B=B)
     for fraction, share, by_print in drag_shares(DRAG_AT):
-        facts = {"percent": 100 * fraction, "by_print": 100 * by_print}
+        facts: Row = {"percent": 100 * fraction, "by_print": 100 * by_print}
         printed = 100 * published.DRAG_SHARE
         yield row_of("drag_share_{percent:.0f}", 100 * share, published_as=printed, **facts)
     yield from _rule_rows(trials)
@@ -467,5 +467,5 @@ def _rule_rows(trials: Sequence[Trial]) -> Iterator[Row]:
     cases = {"rule_bias_n": None, "rule_n_depletion_slow": 1.0, "rule_n_depletion_fast": 1.4}
     for row, gamma in cases.items():
         n, B = rule_on_noise_free(gamma, list(chosen.values()))
-        facts = {"B": ", ".join(f"{B[R]:.2f}" for R in sorted(B)), "scales": ", ".join(map(str, sorted(B)))}
+        facts: Row = {"B": ", ".join(f"{B[R]:.2f}" for R in sorted(B)), "scales": ", ".join(map(str, sorted(B)))}
         yield row_of(row, n, published_as=published.EXPONENT, n=len(chosen), **facts)
