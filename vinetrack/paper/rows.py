@@ -66,7 +66,6 @@ DRAG_AT = (0.50, 0.95, 0.99)  # Fractions of the length at which drag is evaluat
 GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
 
 nan = math.nan
-UNKNOWN = (nan, nan)  # An interval that is not known
 
 Row = dict[str, Any]
 
@@ -84,7 +83,7 @@ def _texts() -> dict[str, dict[str, str]]:
 def row_of(
     name: str,
     ours: float = nan,
-    interval: Sequence[float] = UNKNOWN,
+    interval: Sequence[float] = (nan, nan),
     *,
     published_as: float = nan,
     mark: str = "",
@@ -208,7 +207,7 @@ def result_rows(results: ExperimentResults) -> Iterator[Row]:
 
 def _bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
     """An interval of a JSON file, NaN for null."""
-    low, high = pair or UNKNOWN
+    low, high = pair or (nan, nan)
     return or_nan(low), or_nan(high)
 
 
