@@ -254,8 +254,8 @@ def _motion_rows(results: ExperimentResults) -> Iterator[Row]:
         for fitted in results.fit.numbers
         if fitted.key == "yield_pressure.P_y" and fitted.vine.startswith("24mm-200um")
     ]
-    kPa, *interval = pressures[-1] if pressures else (nan, nan, nan)
-    yield row_of("yield_pressure", kPa, interval, published_as=published.YIELD_PRESSURE_KPA, mark=mark)
+    yield_kPa, *interval = pressures[-1] if pressures else (nan, nan, nan)
+    yield row_of("yield_pressure", yield_kPa, interval, published_as=published.YIELD_PRESSURE_KPA, mark=mark)
     for kPa, printed in published.FINAL_SPEED_RMS_M_S.items():
         lines = _at_pressure(results.speeds, kPa)
         off = (lines["final_lead_velocity_m_s"] - lines["eq2_lead_velocity_m_s"]).to_numpy(float)
@@ -263,7 +263,9 @@ def _motion_rows(results: ExperimentResults) -> Iterator[Row]:
             "payloads": ", ".join(f"{payload:g}" for payload in lines["payload_g"]) or "none",
             "departures": departures_in_words(results.departures, "Fig. 5", kPa),
         }
-        yield row_of("final_speed_rms_{kPa:g}kPa", math.sqrt(_mean(off**2)), published_as=printed, kPa=kPa, **facts)
+        yield row_of(
+            "final_speed_rms_{kPa:g}kPa", math.sqrt(_mean((off**2).tolist())), published_as=printed, kPa=kPa, **facts
+        )
 
 
 def _at_pressure(table: pd.DataFrame, pressure_kPa: float) -> pd.DataFrame:
@@ -287,7 +289,9 @@ def departures_in_words(table: pd.DataFrame, figure: str, pressure_kPa: float) -
 
 
 def _scale_rows(mark: str, scaling: Mapping[str, Any]) -> Iterator[Row]:
-    isometric = next((family for family in scaling.get("isometric") or () if len(family["vines"]) >= 4), {})
+    isometric: Mapping[str, Any] = next(
+        (family for family in scaling.get("isometric") or () if len(family["vines"]) >= 4), {}
+    )
     yield row_of("our_B_power_of_scale", **_fitted(isometric.get("power") or {}), mark=mark)
     yield row_of("our_B_line_R2", or_nan((isometric.get("line") or {}).get("R2")), mark=mark)
 
