@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from tqdm import tqdm
+from rich.progress import track
 
 from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.experiment.settings import RunSettings
@@ -111,7 +111,7 @@ def main() -> None:
         for nature in given.natures:
             known = set(done.loc[done["nature"] == nature, "seed"]) if len(done) else set()
             todo = [seed for seed in seeds if seed not in known]
-            for found in tqdm(pool.map(partial(measure, nature=nature), todo), total=len(todo), desc=nature):
+            for found in track(pool.map(partial(measure, nature=nature), todo), total=len(todo), description=nature):
                 tables.append(pd.DataFrame(found).assign(nature=nature))
                 if given.rows:
                     pd.concat(tables).to_csv(given.rows, index=False)

@@ -25,7 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from tqdm import tqdm
+from rich.progress import track
 
 import vinetrack as vt
 from vinetrack.core.published import CHAMBER_L
@@ -217,7 +217,7 @@ def main() -> None:
     given = parser.parse_args()
     seeds = range(given.first_seed, given.first_seed + given.campaigns)
     one = measure_few if given.few else measure_drops if given.drops else measure
-    table = pd.DataFrame([one(seed) for seed in tqdm(seeds)])
+    table = pd.DataFrame([one(seed) for seed in track(seeds)])
     if given.csv:
         table.to_csv(given.csv, index=False)
     if given.few or given.drops:

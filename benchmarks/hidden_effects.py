@@ -36,7 +36,7 @@ import pandas as pd
 from hidden import FIRST_SCORING_SEED, kinds, tables
 from hidden.questions import METHODS, Row
 from hidden.verify import differences
-from tqdm import tqdm
+from rich.progress import track
 
 Task = tuple[str, str, int]
 COLUMNS = (
@@ -77,7 +77,7 @@ def gather(tasks: list[Task], path: Path | None, processes: int) -> list[Row]:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=context) as pool:
         futures = [pool.submit(ask, task) for task in todo]
-        for future in tqdm(as_completed(futures), total=len(futures), disable=None):
+        for future in track(as_completed(futures), total=len(futures)):
             row = future.result()
             rows.append(row)
             if path is not None:

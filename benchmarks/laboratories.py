@@ -29,7 +29,7 @@ from hidden.laboratory_folder import write_experiment, write_truth
 from hidden.laboratory_kinds import TRIALS
 from hidden.laboratory_rows import ROWS, campaign
 from hidden.verdicts import Answer, judge
-from tqdm import tqdm
+from rich.progress import track
 
 Task = tuple[str, int, tuple[int, int], Path | None]
 Line = dict[str, object]
@@ -125,7 +125,7 @@ def gather(tasks: list[Task], path: Path | None, jobs: int) -> list[Line]:
         path.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(ask, task) for task in todo]
-        for future in tqdm(as_completed(futures), total=len(futures), disable=None):
+        for future in track(as_completed(futures), total=len(futures)):
             lines.append(future.result())
             if path is not None:
                 with path.open("a", newline="", encoding="utf-8") as stream:

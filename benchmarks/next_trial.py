@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
+from rich.progress import track
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
@@ -154,7 +154,7 @@ def main() -> None:
     rows = []
     for tie in [one for one in TIES if arguments.only in (None, one.effect)]:
         seeds = range(arguments.first_seed, arguments.first_seed + arguments.campaigns)
-        every = [measure(tie, seed) for seed in tqdm(seeds, desc=tie.effect, leave=False)]
+        every = [measure(tie, seed) for seed in track(seeds, description=tie.effect)]
         rows.append(_row(tie, [one for one in every if one is not None], len(every)))
     head = ("true", "taken for", "predicted σ", "simulated", "realised", "range", "kept", "CPU s")
     print("\n".join(table(rows, head)))

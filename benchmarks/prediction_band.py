@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from hidden import make
-from tqdm import tqdm
+from rich.progress import track
 from tube.folder import write_folder
 from tube.recordings import read_recordings
 
@@ -107,7 +107,7 @@ def main() -> None:
         print(table.round(2).to_string(index=False))
     else:
         seeds = range(given.first_seed, given.first_seed + given.campaigns)
-        jobs = tqdm([(kind, seed) for kind in given.kinds for seed in seeds])
+        jobs = track([(kind, seed) for kind in given.kinds for seed in seeds])
         table = pd.DataFrame([one for kind, seed in jobs for one in measure(kind, seed, given.trials, given.left_out)])
     found = table.groupby(["kind", "model"]).agg(
         trials=("held", "size"), held=("held", "mean"), within=("within", "mean"),

@@ -21,7 +21,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from tqdm import tqdm
+from rich.progress import track
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=3100)
     given = parser.parse_args()
     seeds = range(given.first_seed, given.first_seed + given.campaigns)
-    table = pd.DataFrame([row for seed in tqdm(seeds) for row in measure(seed)])
+    table = pd.DataFrame([row for seed in track(seeds) for row in measure(seed)])
     print(f"\n{given.campaigns} campaigns of 24 trials, seeds {seeds[0]}–{seeds[-1]}; final speeds, relative\n")
     lines = []
     for name, part in table.groupby("trial", sort=False):

@@ -37,9 +37,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 import numpy as np
+from rich.progress import track
 from scipy import stats
 from scoreboard_units import GROUPS, REAL, Row, processor_s, yardstick_s
-from tqdm import tqdm
 
 FIRST_SEED = {"work": 40_000, "final": 41_000}
 STORED = Path(__file__).with_name("scoreboard_work.json")
@@ -207,7 +207,7 @@ def gathered(tasks: list[Task], visible: Mapping[str, tuple[float, float]], proc
             pool.submit(asked, ("tracking", "hard door", 1), None).result()
     with ProcessPoolExecutor(processes, mp_context=context) as pool:
         futures = {pool.submit(asked, task, visible.get(key_of(task))): task for task in tasks}
-        for future in tqdm(as_completed(futures), total=len(futures), disable=None):
+        for future in track(as_completed(futures), total=len(futures)):
             try:
                 yield future.result()
             except BrokenProcessPool:

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import pandas as pd
 from hidden import make, tables
-from tqdm import tqdm
+from rich.progress import track
 
 THRESHOLDS = (
     *(
@@ -122,7 +122,7 @@ def gather(tasks: list[Task], path: Path | None) -> pd.DataFrame:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context, max_tasks_per_child=1) as pool:
         futures = [pool.submit(ask, task) for task in todo]
-        for future in tqdm(as_completed(futures), total=len(futures), disable=None):
+        for future in track(as_completed(futures), total=len(futures)):
             rows.append(future.result())
             if path is not None:
                 with path.open("a", newline="", encoding="utf-8") as stream:

@@ -15,38 +15,42 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.summary import CONDITION_COLUMNS
-from vinetrack.paper.arithmetic import (
-    COMPUTED,
+from vinetrack.paper.motions import (
     DEPARTURE_COLUMNS,
     DEPARTURES,
     NONE,
-    NOT_CHECKABLE,
-    PAPER_COLUMNS,
-    SIMULATED,
-    as_table,
-    computed_rows,
-    departure_table,
-    follow,
-    p_value,
-    paper_trial,
-    position_trials,
-    pressure_table,
-    volume_change,
-    weight_over_gas,
-)
-from vinetrack.paper.protocol import (
     POSITION_COLUMNS,
     SPEED_COLUMNS,
     Rest,
+    departure_table,
+    drag_shares,
     eq2_speed_m_s,
     final_speeds,
+    follow,
     mean_motions,
+    paper_trial,
     position_conditions,
     position_errors,
-    protocol_rows,
+    position_trials,
+    pressure_table,
+    rule_on_noise_free,
     speed_conditions,
+    volume_change,
 )
-from vinetrack.paper.result_rows import ExperimentResults, drag_shares, result_rows, rule_on_noise_free, theory_rows
+from vinetrack.paper.rows import (
+    COMPUTED,
+    NOT_CHECKABLE,
+    PAPER_COLUMNS,
+    SIMULATED,
+    ExperimentResults,
+    as_table,
+    computed_rows,
+    p_value,
+    protocol_rows,
+    result_rows,
+    theory_rows,
+    weight_over_gas,
+)
 
 # What follows from the paper's own numbers, each worked out by hand.
 

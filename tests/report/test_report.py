@@ -19,7 +19,8 @@ from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.diagnosis.result import Candidate, Diagnosis
 from vinetrack.figures.registry import diagnosis_figures
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.paper.arithmetic import DEPARTURE_COLUMNS, DEPARTURES, SIMULATED, PaperRow, as_table
+from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
+from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build as report_trials
 from vinetrack.report.build import (
     SHARED_ERROR,
@@ -408,10 +409,8 @@ nan = math.nan
 
 
 def rows() -> pd.DataFrame:
-    row = PaperRow(
-        row="position_rms_7kPa", where="Fig. 4", how="", quantity="rms", mark=SIMULATED, published=1.9, ours=0.32
-    )
-    return as_table([row])
+    row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
+    return as_table([row | {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}])
 
 
 def departures() -> pd.DataFrame:

@@ -16,7 +16,6 @@ LIBRARIES = (
     "scipy",
     "pandas",
     "numba",
-    "odrpack",
     "opencv-python-headless",
     "av",
     "scikit-image",
