@@ -11,14 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vinetrack.pages.clip_names import columns_from_names, list_pictures, list_tables
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import list_recordings, read_table
 from vinetrack.core.yaml_document import parse_yaml
 from vinetrack.pages.draft_files import (
     SHARED_ROW,
+    columns_from_names,
     first_settings,
+    list_pictures,
+    list_tables,
     open_draft,
     place_block,
     read_block,
