@@ -177,7 +177,6 @@ def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted
     recorded = RecordedCallbacks()
     job = recorded.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
     job.wait(60)
-    assert not job.running
     assert recorded.steps
     assert recorded.results[0].fit.model.names == first.fit.model.names
 
@@ -194,7 +193,6 @@ def test_a_cancelled_job_calls_no_callback() -> None:
     job = recorded.job(endless)
     started.wait(10)
     job.cancel()
-    assert not job.running
     job.wait(10)
     count = len(recorded.steps)
     time.sleep(0.05)

@@ -17,7 +17,7 @@ from bokeh.document import Document
 from bokeh.server.server import Server
 from tornado.web import ErrorHandler
 
-from vinetrack.pages.campaign import BackgroundFit
+from vinetrack.pages.campaign import BackgroundFit, read_campaign
 from vinetrack.pages.local_page import (
     LOOPBACK,
     allowed_hosts,
