@@ -95,11 +95,11 @@ class Progress(Generic[Item]):
         columns: list[ProgressColumn] = [rich.SpinnerColumn(), text("{task.description} … {task.elapsed:.0f} s")]
         if total is not None:
             amount = [rich.BarColumn(), rich.MofNCompleteColumn(), text(unit)]
-            left = [rich.TimeRemainingColumn(compact=True), text("left  {task.fields[words]}")]
+            left = [rich.TimeRemainingColumn(compact=True), text("left")]
             columns = [text("{task.description}:"), *amount, *left]
         self._items = items
         self._bar = rich.Progress(*columns, console=Console(stderr=True), transient=True)
-        self._task = self._bar.add_task(description, total=total, words="")
+        self._task = self._bar.add_task(description, total=total)
         self._timer = threading.Timer(PROGRESS_DELAY_S, self._bar.start)
         self._timer.daemon = True
         if sys.stderr.isatty():
@@ -112,10 +112,6 @@ class Progress(Generic[Item]):
     def reach(self, done: int, total: int) -> None:
         """Set the number of completed steps, and of how many."""
         self._bar.update(self._task, completed=done, total=total)
-
-    def say(self, words: str) -> None:
-        """Show the current activity after the bar."""
-        self._bar.update(self._task, words=words)
 
     def __iter__(self) -> Iterator[Item]:
         with self:
