@@ -56,7 +56,7 @@ BUDGETS = {
     "kinematics": (2274, 6, 42),
     "laboratory": (2049, 6, 32),
     "narrative": (1774, 4, 31),
-    "pages": (4389, 12, 68),
+    "pages": (4392, 12, 70),
     "paper": (1369, 4, 21),
     "pipeline": (4489, 13, 43),
     "planning": (2893, 6, 78),
