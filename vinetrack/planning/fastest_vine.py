@@ -19,17 +19,15 @@ from scipy.optimize import brentq
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.audit import pressure_along
 from vinetrack.dynamics.model import Model, host_for
-from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
 from vinetrack.experiment.schema import with_names
 from vinetrack.planning.prediction import (
-    LONGEST_S,
-    POINTS,
     VinePrediction,
+    drawn_final_speeds,
     final_m_s,
+    final_speeds,
+    grown,
     predict_vine,
-    run,
-    told_by_payload,
 )
 from vinetrack.planning.predictive_inputs import (
     BURST_STRESS_PA,
@@ -60,11 +58,13 @@ class Room:
     burst_stress_Pa: float = BURST_STRESS_PA
 
     def pressure_of(self, diameter_m: float, thickness_m: float) -> float:
-        """Return the highest pressure that supply and wall allow, Pa. P = min(P_supply, f · 2tσ/D), with f the allowed
-        fraction of the burst stress σ.
-        """
+        """Return the highest pressure that supply and wall allow, Pa."""
+        return min(self.pressure_Pa, self.bearable_Pa(diameter_m, thickness_m))
+
+    def bearable_Pa(self, diameter_m: float, thickness_m: float) -> float:
+        """Return the highest pressure that the wall allows, f · 2tσ/D, Pa."""
         burst_Pa = burst_pressure_Pa(diameter_m, thickness_m) * self.burst_stress_Pa / BURST_STRESS_PA
-        return min(self.pressure_Pa, self.burst_share * burst_Pa)
+        return self.burst_share * burst_Pa
 
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
         """Return the trial with a vine of this size at the highest pressure allowed."""
@@ -129,7 +129,9 @@ def _best(
     for round_number in range(ROUNDS):
         axes = [np.unique(np.geomspace(*span, count)) for span, count in zip(spans, GRID, strict=True)]
         vine_inputs = [predictive_inputs(room.trial(D, film_m, L), stated, fit) for D in axes[0] for L in axes[1]]
-        speeds = final_speeds(vine_inputs, at_fraction).reshape(axes[0].size, axes[1].size)
+        rows = np.array([inputs.model.parameters_of(inputs.trial) for inputs in vine_inputs])
+        trials = [inputs.trial for inputs in vine_inputs]
+        speeds = final_speeds(vine_inputs[0].model, trials, at_fraction, rows).reshape(axes[0].size, axes[1].size)
         i, j = np.unravel_index(int(np.argmax(speeds)), speeds.shape)
         inputs = vine_inputs[int(i) * axes[1].size + int(j)]
         if round_number == 0:
@@ -144,35 +146,10 @@ def _neighbours(axis: Floats, k: int, limits: tuple[float, float]) -> tuple[floa
     return max(limits[0], float(axis[max(k - 1, 0)])), min(limits[1], float(axis[min(k + 1, axis.size - 1)]))
 
 
-def final_speeds(vine_inputs: Sequence[PredictiveInputs], at_fraction: float) -> Floats:
-    """Return the final speed of every vine at its medians, m/s: a payload's at the end, else the leading edge's.
-    Returns 0 for a vine that does not grow to its end. Shape (n,).
-    """
-    trials = [inputs.trial for inputs in vine_inputs]
-    model = vine_inputs[0].model
-    rows = np.array([inputs.model.parameters_of(inputs.trial) for inputs in vine_inputs])
-    ends = simulate_many(model, trials, [np.array([0.0, LONGEST_S])] * len(trials), parameters=rows)
-    stop_s = np.array([end.end_time_s if end.status == "ended" else LONGEST_S for end in ends])
-    times = [stop * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for stop in stop_s]
-    moved = simulate_many(model, trials, times, parameters=rows)
-    speeds = np.zeros(len(trials))
-    for k, (trial, end, trajectory) in enumerate(zip(trials, ends, moved, strict=True)):
-        if end.status != "ended":
-            continue
-        if told_by_payload(trial):
-            speeds[k] = trial.travel_ratio * trajectory.lead_velocity_m_s[-1]
-        else:
-            speeds[k] = np.interp(
-                at_fraction * trial.length_m, trajectory.lead_position_m, trajectory.lead_velocity_m_s
-            )
-    return speeds
-
-
 def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
     """The constraints that keep a vine from being faster: of its pressure, and bounds of its size."""
-    burst = room.burst_share * burst_pressure_Pa(trial.diameter_m, trial.thickness_m)
-    burst *= room.burst_stress_Pa / BURST_STRESS_PA
-    limits = ["supply" if room.pressure_Pa <= burst else "burst"]
+    bearable_Pa = room.bearable_Pa(trial.diameter_m, trial.thickness_m)
+    limits = ["supply" if room.pressure_Pa <= bearable_Pa else "burst"]
     for name, value, (low, high) in (
         ("diameter", trial.diameter_m, room.diameter_m),
         ("length", trial.length_m, room.length_m),
@@ -186,13 +163,7 @@ def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
 
 def _odds(vine_inputs: Sequence[PredictiveInputs], samples: int, seed: int, at_fraction: float) -> list[float]:
     """Fraction of draws in which each is the fastest; inputs that vines share have the same draws in all."""
-    speeds = []
-    for inputs in vine_inputs:
-        trial = inputs.trial
-        runs = run(inputs, np.array([at_fraction * trial.length_m]), samples, seed, with_tension=False)
-        speeds.append(
-            runs.end_lead_velocity_m_s * trial.travel_ratio if told_by_payload(trial) else runs.lead_velocity_m_s[:, 0]
-        )
+    speeds = [drawn_final_speeds(inputs, at_fraction, samples, seed) for inputs in vine_inputs]
     winners = np.argmax(np.array(speeds), axis=0)
     return [float(np.mean(winners == k)) for k in range(len(vine_inputs))]
 
@@ -227,13 +198,6 @@ def chamber_for(pressure_Pa: float, swept: float, loss: float, gamma: float, amb
     return swept * q / (1 - q)
 
 
-def chamber_by_gauge(swept: float, loss: float) -> float:
-    """Return the volume, m³, by Boyle's law with gauge instead of absolute pressure, V₁/V₂ = 1 − ε, which
-    is too small.
-    """
-    return swept * (1 - loss) / loss
-
-
 @dataclass(frozen=True)
 class Chamber:
     """One chamber and the loss of pressure in it: `losses` by gas law, as a fraction of the gauge pressure."""
@@ -262,18 +226,16 @@ def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
         )
         for law, gamma in GAMMAS.items()
     ]
-    return (*asked, *needed, chamber("by gauge pressure (wrong)", chamber_by_gauge(volume, loss)))
+    # Boyle's law with gauge instead of absolute pressure, V₁/V₂ = 1 − ε, gives too small a chamber.
+    return (*asked, *needed, chamber("by gauge pressure (wrong)", volume * (1 - loss) / loss))
 
 
 def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gamma: float) -> float:
     """Return the largest fraction of the gauge pressure lost at the medians with a supply of time constant `tau_s`."""
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
     model = _with(inputs.model, "supply_refill", tau=tau_s, gamma=gamma)
-    (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host_for(inputs.model))
-    until = end.end_time_s if end.status in ("ended", "stalled") else LONGEST_S
-    times = until * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS)
-    (moved,) = simulate_many(model, [trial], [times], host=host_for(inputs.model))
-    pressure = pressure_along(model, trial, times, moved.lead_position_m, moved.lead_velocity_m_s)
+    (moved,), _ = grown(model, [trial], host=host_for(inputs.model))
+    pressure = pressure_along(model, trial, moved.time_s, moved.lead_position_m, moved.lead_velocity_m_s)
     return 1 - float(np.min(pressure)) / trial.pressure_Pa
 
 

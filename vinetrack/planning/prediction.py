@@ -8,7 +8,7 @@ are those of the position at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
-from vinetrack.effects import Effect, EffectError, catalogue
+from vinetrack.effects import EffectError, catalogue
 from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.planning.predictive_inputs import (
     BAND,
@@ -34,9 +34,6 @@ LONGEST_S = 600.0  # Duration of a simulation, s (chosen)
 POINTS = 400  # Times at which each draw is evaluated (derived)
 
 MOST_TENSIONS = 300  # Draws whose forces are evaluated, a third of a millisecond each (chosen)
-
-# Tension below which the tail is slack, as a fraction of the drive (chosen)
-ZERO_TENSION = 1e-9
 
 # Compression of the tail from which the model is said to be in doubt, as a fraction of the drive ½PA (chosen)
 COMPRESSION_FRACTION = 0.01
@@ -71,7 +68,7 @@ def run(
 ) -> Runs:
     """Draw predictive inputs and simulate every draw. Shapes: places_m (n_places,)."""
     trials, rows = inputs.laid_out(inputs.draw(samples, seed, only))
-    moved, until_s = follow(inputs, trials, rows)
+    moved, until_s = grown(inputs.model, trials, rows)
     time_s, velocity_m_s = np.full((samples, places_m.size), math.inf), np.zeros((samples, places_m.size))
     for i, trajectory in enumerate(moved):
         reached = places_m <= trajectory.lead_position_m[-1]
@@ -97,17 +94,46 @@ def run(
     )
 
 
-def follow(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> tuple[list[Trajectory], Floats]:
-    """Simulate every draw at `POINTS` times of its growth. Returns trajectories, end_s (inf where a draw does not reach
-    its end). Shapes: rows (n_draws, n_parameters) → (n_draws,).
+def grown(
+    model: Model, trials: Sequence[Trial], rows: Floats | None = None, host: Model | None = None
+) -> tuple[list[Trajectory], Floats]:
+    """Simulate every trial at `POINTS` times of its growth. Returns trajectories, end_s (inf where a vine does not
+    reach its end). Shapes: rows (n_trials, n_parameters) → (n_trials,).
     """
     until_longest = [np.array([0.0, LONGEST_S])] * len(trials)
-    ends = simulate_many(inputs.model, trials, until_longest, parameters=rows)
+    ends = simulate_many(model, trials, until_longest, parameters=rows, host=host)
     stop_s = np.array([last.end_time_s if last.status in ("ended", "stalled") else LONGEST_S for last in ends])
     # Just before the end: without payload the speed diverges there, and is 0 after it.
     times = [max(end, 1e-9) * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for end in stop_s]
-    moved = simulate_many(inputs.model, trials, times, parameters=rows)
+    moved = simulate_many(model, trials, times, parameters=rows, host=host)
     return moved, np.where([last.status == "ended" for last in ends], stop_s, math.inf)
+
+
+def final_speeds(
+    model: Model, trials: Sequence[Trial], at_fraction: float, rows: Floats | None = None, host: Model | None = None
+) -> Floats:
+    """Return the final speed of every trial, m/s: a payload's at the end, else the leading edge's at `at_fraction`; 0
+    for a vine that does not grow to its end. Shape (n_trials,).
+    """
+    speeds = np.zeros(len(trials))
+    moved, end_s = grown(model, trials, rows, host)
+    for k, (trial, trajectory) in enumerate(zip(trials, moved, strict=True)):
+        position_m, velocity_m_s = trajectory.lead_position_m, trajectory.lead_velocity_m_s
+        if told_by_payload(trial):
+            speeds[k] = trial.travel_ratio * velocity_m_s[-1]
+        else:
+            speeds[k] = np.interp(at_fraction * trial.length_m, position_m, velocity_m_s)
+    return np.where(np.isfinite(end_s), speeds, 0.0)
+
+
+def drawn_final_speeds(
+    inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int, only: Iterable[str] | None = None
+) -> Floats:
+    """Return the final speed in every draw, m/s, see `final_speeds`. Shape (n_draws,)."""
+    place_m = np.array([at_fraction * inputs.trial.length_m])
+    runs = run(inputs, place_m, samples, seed, only=only, with_tension=False)
+    loaded = told_by_payload(inputs.trial)
+    return inputs.trial.travel_ratio * runs.end_lead_velocity_m_s if loaded else runs.lead_velocity_m_s[:, 0]
 
 
 def _forces(
@@ -122,7 +148,7 @@ def _forces(
         trajectory = moved[i]
         terms = evaluate(model, trial, trajectory.time_s, trajectory.lead_position_m, trajectory.lead_velocity_m_s)
         drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
-        tension = np.where(np.abs(terms.tension_N) < ZERO_TENSION * drive_N, 0.0, terms.tension_N)
+        tension = np.where(np.abs(terms.tension_N) < 1e-9 * drive_N, 0.0, terms.tension_N)
         reached = places_m <= trajectory.lead_position_m[-1]
         tension_N[i, reached] = np.interp(places_m[reached], trajectory.lead_position_m, tension)
         pressure_Pa[i, reached] = np.interp(places_m[reached], trajectory.lead_position_m, terms.pressure_Pa)
@@ -151,27 +177,15 @@ SAMPLES = 1000  # Draws of a prediction (derived)
 
 CONTRIBUTION_SAMPLES = 400  # Draws for the band of one uncertainty alone (derived)
 
-FINAL_AT_FRACTION = 0.95  # y/L at which the final speed without payload is evaluated (convention)
-
 # y/L of the curves, dense at the start
 ALONG = np.concatenate([[0.0, 0.0005, 0.001, 0.002, 0.004, 0.007], np.linspace(0.01, 0.99, 99)])
 
 CURVE_COLUMNS = (
-    "condition",
-    "y_over_L",
-    "lead_position_m",
-    "time_s",
-    "time_low_90_s",
-    "time_high_90_s",
-    "lead_velocity_m_s",
-    "lead_velocity_low_90_m_s",
-    "lead_velocity_high_90_m_s",
-    "tail_velocity_m_s",
-    "tension_N",
-    "tension_low_90_N",
-    "tension_high_90_N",
-    "pressure_kPa",
-)
+    "condition", "y_over_L", "lead_position_m",
+    "time_s", "time_low_90_s", "time_high_90_s",
+    "lead_velocity_m_s", "lead_velocity_low_90_m_s", "lead_velocity_high_90_m_s", "tail_velocity_m_s",
+    "tension_N", "tension_low_90_N", "tension_high_90_N", "pressure_kPa",
+)  # fmt: skip
 TABLE_COLUMNS = ("condition", "quantity", "y_over_L", "median", "low_90", "high_90", "unit")
 
 TIME, TO_THE_END = "time to get there", "time to the end"
@@ -251,7 +265,7 @@ def final_name(inputs: PredictiveInputs) -> str:
 
 
 def predict_vine(
-    inputs: PredictiveInputs, *, samples: int = SAMPLES, seed: int = 1, at_fraction: float = FINAL_AT_FRACTION
+    inputs: PredictiveInputs, *, samples: int = SAMPLES, seed: int = 1, at_fraction: float = 0.95
 ) -> VinePrediction:
     """Predict a trial by Monte Carlo: medians, 90 % bands, and the contribution of each uncertain input.
 
@@ -335,44 +349,25 @@ def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int)
 
 def _curve(inputs: PredictiveInputs, runs: Runs, along: Floats) -> pd.DataFrame:
     time, speed, tension, pressure = (
-        band(values) for values in (runs.time_s, runs.lead_velocity_m_s, runs.tension_N, runs.pressure_Pa)
+        band(values)[[1, 0, 2]] for values in (runs.time_s, runs.lead_velocity_m_s, runs.tension_N, runs.pressure_Pa)
     )
-    columns = (
-        np.full(along.size, inputs.trial.condition, dtype=object),
-        along,
-        runs.places_m,
-        time[1],
-        time[0],
-        time[2],
-        speed[1],
-        speed[0],
-        speed[2],
-        inputs.trial.travel_ratio * speed[1],
-        tension[1],
-        tension[0],
-        tension[2],
-        pressure[1] / 1e3,
-    )
+    condition = np.full(along.size, inputs.trial.condition, dtype=object)
+    tail_velocity, pressure_kPa = inputs.trial.travel_ratio * speed[0], pressure[0] / 1e3
+    columns = (condition, along, runs.places_m, *time, *speed, tail_velocity, *tension, pressure_kPa)
     return pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True)))
 
 
 def _contributions(inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int) -> tuple[Contribution, ...]:
     """Band of the final speed with one uncertain input each, widest first."""
     contributions = []
-    place_m = np.array([at_fraction * inputs.trial.length_m])
     for uncertainty in inputs.uncertainties:
-        runs = run(inputs, place_m, samples, seed, only=[uncertainty.name], with_tension=False)
-        loaded = told_by_payload(inputs.trial)
-        speed = inputs.trial.travel_ratio * runs.end_lead_velocity_m_s if loaded else runs.lead_velocity_m_s[:, 0]
-        low, _, high = band(speed)
+        low, _, high = band(drawn_final_speeds(inputs, at_fraction, samples, seed, [uncertainty.name]))
         contributions.append(Contribution(uncertainty.name, uncertainty.words, float(low), float(high)))
     return tuple(sorted(contributions, key=lambda share: share.low - share.high))
 
 
 # ------------------------------------------------------------------------------
 # Checks of a planned vine: burst, no growth, a compressed or slack tail, and effects that the model leaves out.
-
-LEAST_FULL_GROWTH = 0.95  # Fraction of draws that must grow to the end, or a warning is given (chosen)
 
 WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
 
@@ -437,7 +432,7 @@ def _no_growth(prediction: VinePrediction) -> Iterator[str]:
             f"{trial.pressure_Pa / 1e3:g} kPa lies below the yield pressure, {median:.3g} kPa ({low:.2g} to "
             f"{high:.2g}): nothing would evert; raise the pressure"
         )
-    elif prediction.arrives < LEAST_FULL_GROWTH:
+    elif prediction.arrives < 1 - WARNING_FRACTION:
         yield (
             f"in {1 - prediction.arrives:.0%} of the draws the vine does not grow to its end; raise the pressure or "
             "measure its yield pressure"
@@ -475,7 +470,7 @@ def _least_tension(prediction: VinePrediction) -> str:
 def _rules(prediction: VinePrediction) -> Iterator[str]:
     """Warnings of the audit along the median motion, except the one about the tail, which `_slack` gives."""
     inputs = prediction.inputs
-    (moved,), _ = follow(inputs, *_medians(inputs))
+    (moved,), _ = grown(inputs.model, *_medians(inputs))
     keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
     motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
     violations = audit(inputs.model, [motion]).violations
@@ -490,50 +485,28 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
     """Return the final speed at the medians with each of the universal effects added, largest change first. Each is
     added by itself at its typical size; effects whose columns are blank are left out.
     """
-    host = host_for(inputs.model)
+    host, trial = host_for(inputs.model), inputs.trial
+    # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
+    kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * FILM_MODULUS_PA * trial.thickness_m)
     without = final_m_s(inputs, inputs.model, host, at_fraction)
     neglected_effects = []
     for name in UNIVERSAL_EFFECTS:
         effect = catalogue()[name]
         is_in_model = name in inputs.model or any(name in other.replaces for other in inputs.model)
-        if is_in_model or (name == "payload_drag" and inputs.trial.payload_kg == 0):
+        if is_in_model or (name == "payload_drag" and trial.payload_kg == 0):
             continue
-        sizes = typical_sizes(name, inputs.trial)
-        model = (inputs.model + effect).with_values(sizes)
+        sizes = {p: kappa if name == "wall_stretch" else p.default for p in effect.parameters}
+        model = (inputs.model + effect).with_values({f"{name}.{p.name}": value for p, value in sizes.items()})
         try:
             final = final_m_s(inputs, model, host, at_fraction)
         except EffectError:
             continue
-        neglected_effects.append(Neglected(name, _words(effect, sizes), final, without))
+        words = [f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in sizes.items()]
+        neglected_effects.append(Neglected(name, ", ".join(words), final, without))
     return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
 
 
-def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
-    """Return parameters of an effect that follow from the vine: for wall stretch κ = (1 − ν/4) D/(2Et), ν = ½. Source:
-    radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube. Returns by
-    `effect.parameter`, SI; empty where the defaults of the effect apply.
-    """
-    if name != "wall_stretch":
-        return {}
-    return {"wall_stretch.kappa": (1 - 0.5 / 4) * trial.diameter_m / (2 * FILM_MODULUS_PA * trial.thickness_m)}
-
-
-def _words(effect: Effect, sizes: Mapping[str, float]) -> str:
-    """Parameters of an effect at these or else their typical sizes, such as `C_D = 1`."""
-    values = [(p, sizes.get(f"{effect.name}.{p.name}", p.default)) for p in effect.parameters]
-    return ", ".join(f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in values)
-
-
 def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
-    """Return the final speed at the medians under this model: a payload's at the end, else the leading edge's. Returns
-    0 where the vine does not grow to its end.
-    """
-    (trial,), _ = _medians(inputs)
-    (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host)
-    if end.status != "ended":
-        return 0.0
-    times = end.end_time_s * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS)
-    (moved,) = simulate_many(model, [trial], [times], host=host)
-    if told_by_payload(trial):
-        return float(trial.travel_ratio * moved.lead_velocity_m_s[-1])
-    return float(np.interp(at_fraction * trial.length_m, moved.lead_position_m, moved.lead_velocity_m_s))
+    """Return the final speed at the medians under this model, m/s, see `final_speeds`."""
+    trials, _ = _medians(inputs)
+    return float(final_speeds(model, trials, at_fraction, host=host)[0])

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import ndtri
 
 from vinetrack.core import published
 from vinetrack.core.problems import Problem
@@ -39,10 +40,6 @@ if TYPE_CHECKING:
 # t/D, so they do not determine the exponents of t and D separately: `SPLIT_SIGMA` allows for that. None of these
 # values is a measurement, and every output that uses them says so.
 
-DIAMETER_EXPONENT = 0.75  # Exponent of D in the prior of B (derived)
-
-THICKNESS_EXPONENT = 1.0  # Exponent of t in the prior of B (published)
-
 SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
 
 SPLIT_SIGMA = 0.25  # Standard error of the exponent of t against that of D, at constant sum
@@ -52,12 +49,7 @@ PRINTED_ERROR = 0.05  # Relative standard error of a printed B, for which only R
 YIELD_PRESSURE_PA = 1000 * published.YIELD_PRESSURE_KPA
 PRINTED_YIELD_SIGMA_PA = 1000 / math.sqrt(12)  # Standard error of the printed yield pressure, Pa
 
-# Factor of the one printed yield pressure within which nine of ten other vines are assumed to lie (chosen)
-YIELD_FACTOR = 3.0
-
 BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
-
-NINE_OF_TEN = 1.6448536269514722  # Half width of the central 90 % of the normal distribution, in standard deviations
 
 PRESSURE_SPREAD, DAMPING_SPREAD = 0.01, 0.03  # Relative between-trial standard deviations of pressure and B (chosen)
 
@@ -67,7 +59,7 @@ def damping_prior(diameter_m: float, thickness_m: float) -> float:
     largest = max(published.DAMPING_B)
     thickness = thickness_m / (1e-6 * published.THICKNESS_UM[largest])
     diameter = diameter_m / (1e-3 * published.DIAMETER_MM[largest])
-    return published.DAMPING_B[largest] * thickness**THICKNESS_EXPONENT * diameter**DIAMETER_EXPONENT
+    return published.DAMPING_B[largest] * thickness * diameter**0.75
 
 
 def damping_scatter() -> float:
@@ -120,11 +112,6 @@ def exponent_sigma() -> float:
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
-def yield_log_sigma() -> float:
-    """Return the standard deviation of the logarithm of the prior of a yield pressure."""
-    return math.log(YIELD_FACTOR) / NINE_OF_TEN
-
-
 def burst_pressure_Pa(diameter_m: float, thickness_m: float) -> float:
     """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; a guess from one vine."""
     return 2 * thickness_m * BURST_STRESS_PA / diameter_m
@@ -139,8 +126,6 @@ def hoop_stress_Pa(pressure_Pa: float, diameter_m: float, thickness_m: float) ->
 PRESSURE, YIELD = "pressure_Pa", "yield_pressure_Pa"
 
 BAND = (0.05, 0.5, 0.95)  # Convention: median and 90 % band of a prediction
-
-_BAND_SAMPLES = 4000  # Draws for the bands of the inputs (derived)
 
 Draws = dict[str, Floats]  # Values, shape (n,), by name of a parameter (`effect.parameter`) or of a pressure
 
@@ -210,7 +195,7 @@ class PredictiveInputs:
 
     def bands(self, seed: int = 1) -> list[Input]:
         """Return every input with its 90 % band; fixed inputs have a band of zero width."""
-        draws = self.draw(_BAND_SAMPLES, seed)
+        draws = self.draw(4000, seed)
         names = {
             f"{effect.name}.{parameter.name}": (parameter.symbol, parameter.unit)
             for effect in self.model
@@ -232,15 +217,6 @@ def _within_bounds(draws: Draws, model: Model) -> Draws:
     bounds = {f"{effect.name}.{p.name}": p.bounds for effect in model for p in effect.parameters}
     bounds |= {YIELD: (0.0, math.inf), PRESSURE: (0.0, math.inf)}
     return {name: np.clip(values, *bounds[name]) for name, values in draws.items()}
-
-
-def wanted_model(
-    names: Iterable[str] = BASE_EFFECTS,
-    further: Iterable[str] = (),
-    user_effects: Mapping[str, Effect] | None = None,
-) -> Model:
-    """Return a model of these effects and further ones, each once."""
-    return make_model(dict.fromkeys([*names, *further]), user_effects)
 
 
 @dataclass(frozen=True)
@@ -293,60 +269,40 @@ def _size(effect: Effect, parameter: str, cell: str, bounds: tuple[float, float]
     return Size(low, high)
 
 
-LARGEST_T_DEVIATE = 20.0  # At which deviates of Student's t are clipped (chosen)
+def _varied(name: str, change: Callable[[Floats, np.random.Generator], Floats]) -> Sampler:
+    """Return a sampler in which one input varies."""
+    return lambda draws, draw: {**draws, name: change(draws[name], draw)}
 
 
-def _deviates(draw: np.random.Generator, count: int, dof: float = math.inf) -> Floats:
+def _deviates(draw: np.random.Generator, count: int, dof: float) -> Floats:
     """Standard normal deviates, or deviates of Student's t with `dof` degrees of freedom, shape (count,)."""
-    if math.isinf(dof):
-        return draw.standard_normal(count)
-    return np.clip(draw.standard_t(dof, count), -LARGEST_T_DEVIATE, LARGEST_T_DEVIATE)
+    return draw.standard_normal(count) if math.isinf(dof) else np.clip(draw.standard_t(dof, count), -20.0, 20.0)
 
 
 def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Sampler:
     """Return a sampler that multiplies an input by a log-normal (or log-t) factor."""
+    return _varied(name, lambda values, draw: values * np.exp(log_sigma * _deviates(draw, values.size, dof)))
 
-    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] * np.exp(log_sigma * _deviates(draw, draws[name].size, dof))}
 
-    return sample
+def relative(name: str, sigma: float, dof: float) -> Sampler:
+    """Return a sampler that multiplies an input by one plus a normal (or t) deviate."""
+    return _varied(name, lambda values, draw: values * (1 + sigma * _deviates(draw, values.size, dof)))
 
 
 def shifted(name: str, sigma: float) -> Sampler:
     """Return a sampler that adds a normal deviate to an input."""
-
-    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] + sigma * draw.standard_normal(draws[name].size)}
-
-    return sample
-
-
-def relative(name: str, sigma: float, dof: float = math.inf) -> Sampler:
-    """Return a sampler that multiplies an input by one plus a normal (or t) deviate."""
-
-    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] * (1 + sigma * _deviates(draw, draws[name].size, dof))}
-
-    return sample
+    return _varied(name, lambda values, draw: values + sigma * draw.standard_normal(values.size))
 
 
 def even(name: str, size: Size) -> Sampler:
     """Return a sampler that draws an input uniformly from a range."""
-
-    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draw.uniform(size.low, size.high, draws[name].size)}
-
-    return sample
+    return _varied(name, lambda values, draw: draw.uniform(size.low, size.high, values.size))
 
 
 # ------------------------------------------------------------------------------
 # Fitted parameters in the form from which predictions draw: means, covariance, between-trial standard deviations.
 #
 # They come from a `Fit` or from `fit.json`. B is held as its logarithm, as in the fit.
-
-LEAST_DOF = 3  # Least degrees of freedom of a between-trial standard deviation (derived)
-
-NORMAL_95 = 1.959963984540054  # Standard normal quantile of 0.975
 
 _VINE = re.compile(r"([\d.]+)mm-([\d.]+)um(?:-([\d.]+)mm)?")
 
@@ -413,7 +369,7 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
     if between.shape == covariance.shape:
         # A prediction is of one trial, whose parameters differ from the shared ones.
         covariance = covariance + np.nan_to_num(between)
-    dof = float(max(len(content["trials"]) - len(numbers), LEAST_DOF))
+    dof = float(max(len(content["trials"]) - len(numbers), 3))  # t of fewer degrees of freedom has no variance
     scale = np.where(is_known, slopes * widening, 0.0)
     return FitNumbers(
         source=source,
@@ -440,7 +396,7 @@ def _widening(number: Mapping[str, Any], log: bool) -> float:
     if number["interval"] != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
         return 1.0
     half = (math.log(high / low) if log else high - low) / 2
-    return max(half / (NORMAL_95 * (sigma / number["value"] if log else sigma)), 1.0)
+    return max(half / (float(ndtri(0.975)) * (sigma / number["value"] if log else sigma)), 1.0)
 
 
 def numbers_of(fit: Fit) -> FitNumbers:
@@ -458,25 +414,20 @@ def numbers_of(fit: Fit) -> FitNumbers:
     return fit_numbers(content, "the fit")
 
 
-def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """Return the fitted vine of this diameter and wall and any length, since B belongs to the tip; None without one."""
-    sizes = [
-        (vine, size) for vine, size in numbers.sizes().items() if alike(size, (trial.diameter_m, trial.thickness_m))
-    ]
-    exact = [vine for vine, _ in sizes if vine == trial.vine]
-    return exact[0] if exact else sizes[0][0] if sizes else None
-
-
 def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
     """Return whether two sizes are equal to five digits."""
     return all(abs(a / b - 1) < 1e-5 for a, b in zip(first, second, strict=True))
 
 
-def nearest_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """Return the fitted vine nearest in ln diameter and ln thickness; None where no name contains a size."""
-    target = np.log([trial.diameter_m, trial.thickness_m])
-    sizes = numbers.sizes()
-    return min(sizes, key=lambda vine: float(np.sum((np.log(sizes[vine]) - target) ** 2)), default=None)
+def fitted_vine(numbers: FitNumbers, trial: Trial) -> tuple[str, bool]:
+    """Return the vine of a fit from which a trial is predicted, and whether it has the same diameter and wall, at any
+    length, since B belongs to the tip; else the nearest in their logarithms, blank where no name contains a size.
+    """
+    size, sizes = (trial.diameter_m, trial.thickness_m), numbers.sizes()
+    same = [vine for vine in sizes if alike(sizes[vine], size)]
+    if same:
+        return (trial.vine if trial.vine in same else same[0]), True
+    return min(sizes, key=lambda vine: float(np.sum((np.log(sizes[vine]) - np.log(size)) ** 2)), default=""), False
 
 
 def yield_place(numbers: FitNumbers, vine: str, stated_Pa: float) -> int | None:
@@ -486,11 +437,8 @@ def yield_place(numbers: FitNumbers, vine: str, stated_Pa: float) -> int | None:
         for k, (key, name) in enumerate(zip(numbers.keys, numbers.vines, strict=True))
         if key == YIELD_PRESSURE and (name == vine or name.startswith(f"{vine}, "))
     ]
-    if not places:
-        return None
-    if not math.isfinite(stated_Pa):
-        return places[0]
-    return min(places, key=lambda k: abs(float(numbers.mean[k]) - stated_Pa))
+    # Nothing is nearer than the first to a value that is not stated.
+    return min(places, key=lambda k: np.nan_to_num(abs(float(numbers.mean[k]) - stated_Pa)), default=None)
 
 
 # ------------------------------------------------------------------------------
@@ -538,6 +486,13 @@ class _Sources:
     def set(self, name: str, value: float, origin: str) -> None:
         self.values[name], self.origins[name] = value, origin
 
+    def set_fitted(self, name: str, place: int, factor: float = 1.0, origin: str = "fitted, {}") -> None:
+        """Take an input from the fit, multiplied by a factor."""
+        assert self.fit is not None
+        mean = float(self.fit.mean[place])
+        self.from_fit[name] = place
+        self.set(name, factor * (math.exp(mean) if self.fit.log[place] else mean), origin.format(self.fit.source))
+
     def add_uncertainty(self, name: str, words: str, key: str, sample: Sampler) -> None:
         self.uncertainties.append(Uncertainty(name, words, key, sample))
 
@@ -578,10 +533,11 @@ def predictive_inputs(
         stated = replace(stated, user_effects={**{effect.name: effect for effect in fit.model}, **stated.user_effects})
         fit = numbers_of(fit)
     sources = _Sources(trial, fit)
-    model = wanted_model(fit.model if fit else stated.model, stated.effects, stated.user_effects)
+    names = [*(fit.model if fit else stated.model), *stated.effects]
+    model = make_model(dict.fromkeys(names), stated.user_effects)
     if fit is not None and DAMPING not in fit.keys:
         raise FitError(f"{fit.source} is not a fit of everting vines: it has no B to predict with.")
-    anchor = _fitted_vine(sources)
+    anchor = ("", False) if fit is None else fitted_vine(fit, sources.trial)
     _damping(sources, stated, anchor)
     _exponent(sources, stated)
     _yield_pressure(sources, anchor)
@@ -599,16 +555,6 @@ def predictive_inputs(
     )
 
 
-def _fitted_vine(sources: _Sources) -> tuple[str, bool]:
-    """The vine of the fit on which the prediction is based, and whether it is the same; blank without a fit."""
-    if sources.fit is None:
-        return "", False
-    same = same_vine(sources.fit, sources.trial)
-    if same is not None:
-        return same, True
-    return nearest_vine(sources.fit, sources.trial) or "", False
-
-
 def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) -> None:
     vine, is_same = anchor
     trial, fit = sources.trial, sources.fit
@@ -620,14 +566,12 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
         return
     place = fit.place(DAMPING, vine) if fit else None
     if fit is not None and place is not None:
-        sources.from_fit[DAMPING] = place
-        fitted_B = math.exp(float(fit.mean[place])) if fit.log[place] else float(fit.mean[place])
         if is_same or fit.vines[place] == "":
-            sources.set(DAMPING, fitted_B, f"fitted, {fit.source}")
+            sources.set_fitted(DAMPING, place)
             return
         size = fit.sizes()[vine]
         factor = damping_prior(trial.diameter_m, trial.thickness_m) / damping_prior(*size)
-        sources.set(DAMPING, fitted_B * factor, f"scaled from {vine} of {fit.source} as t·D^0.75: a guess")
+        sources.set_fitted(DAMPING, place, factor, f"scaled from {vine} of {{}} as t·D^0.75: a guess")
         sources.notes.append(
             f"no vine of {fit.source} has this diameter and wall: B is carried over from {vine} by the scaling prior, "
             "a guess"
@@ -683,9 +627,8 @@ def _exponent(sources: _Sources, stated: StatedValues) -> None:
             sources.add_uncertainty("error of n", words, "n given", shifted(EXPONENT, stated.n_error))
         return
     place = sources.fit.place(EXPONENT) if sources.fit else None
-    if sources.fit is not None and place is not None:
-        sources.from_fit[EXPONENT] = place
-        sources.set(EXPONENT, float(sources.fit.mean[place]), f"fitted, {sources.fit.source}")
+    if place is not None:
+        sources.set_fitted(EXPONENT, place)
         return
     sigma = exponent_sigma()
     sources.set(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
@@ -698,8 +641,7 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
     trial, fit = sources.trial, sources.fit
     place = yield_place(fit, vine, trial.yield_pressure_Pa) if fit and is_same else None
     if fit is not None and place is not None and _agrees(fit, place, trial):
-        sources.from_fit[YIELD] = place
-        sources.set(YIELD, float(fit.mean[place]), f"fitted, {fit.source}")
+        sources.set_fitted(YIELD, place)
     elif math.isfinite(trial.yield_pressure_Pa):
         sources.set(YIELD, trial.yield_pressure_Pa, "given")
         sigma = trial.yield_pressure_sigma_Pa
@@ -712,11 +654,9 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
         sources.add_uncertainty("printed P_y", words, "P_y printed", shifted(YIELD, PRINTED_YIELD_SIGMA_PA))
     else:
         sources.set(YIELD, YIELD_PRESSURE_PA, "guess: the one that is printed, for another vine")
-        words = (
-            f"{published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine; nine of ten others within a factor "
-            f"{YIELD_FACTOR:g}"
-        )
-        sources.add_uncertainty("guess of P_y", words, "P_y guess", scaled(YIELD, yield_log_sigma()))
+        words = f"{published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine; nine of ten others within a factor 3"
+        log_sigma = math.log(3.0) / float(ndtri(0.95))
+        sources.add_uncertainty("guess of P_y", words, "P_y guess", scaled(YIELD, log_sigma))
 
 
 def _agrees(fit: FitNumbers, place: int, trial: Trial) -> bool:
@@ -746,9 +686,8 @@ def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anc
                 if size.high > size.low:
                     words = f"{parameter.symbol} of {effect.name} uniform between {size.low:g} and {size.high:g}"
                     sources.add_uncertainty(f"{parameter.symbol} ({effect.name})", words, name, even(name, size))
-            elif sources.fit is not None and place is not None:
-                sources.from_fit[name] = place
-                sources.set(name, float(sources.fit.mean[place]), f"fitted, {sources.fit.source}")
+            elif place is not None:
+                sources.set_fitted(name, place)
             else:
                 fixed = "constant" if parameter.held else "typical size, without an error"
                 sources.set(name, parameter.default, fixed)
@@ -817,15 +756,6 @@ FAR_OFF = 4.0  # Factor between implied and prior damping from which another uni
 NEAR = 2.5  # Factor to the prior within which the other unit explains the speeds (chosen)
 
 
-def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield_pressure_Pa: float) -> float:
-    """Return the damping coefficient that a trial implies over its scaling prior; NaN without growth or drive."""
-    drive_N = (pressure_Pa - yield_pressure_Pa) * trial.area_m2
-    if not (drive_N > 0 and mean_speed_m_s > 0 and math.isfinite(mean_speed_m_s)):
-        return math.nan
-    damping = drive_N / (trial.travel_ratio * mean_speed_m_s) ** published.EXPONENT
-    return damping / damping_prior(trial.diameter_m, trial.thickness_m)
-
-
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     """Return a warning if the speeds contradict the pressures as stated but agree with them in another unit. The other
     unit is psi, kPa where psi are stated, or absolute instead of gauge pressure.
@@ -858,12 +788,14 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
 
 
 def _middle_ratio(pairs: list[tuple[Trial, float]], factor: float, yield_factor: float) -> float:
-    """Median over the trials of `implied_ratio`, pressures multiplied by `factor`; NaN where no trial has a ratio. A
-    trial that moves although the pressure does not exceed the yield pressure counts as a ratio of 0.
+    """Median over the trials of the implied damping over its prior, pressures multiplied by `factor`; NaN without
+    growth. A trial that moves although the pressure does not exceed the yield pressure counts as a ratio of 0.
     """
     ratios = []
     for trial, speed in pairs:
-        ratio = implied_ratio(trial, speed, factor * trial.pressure_Pa, yield_factor * trial.yield_pressure_Pa)
-        ratios.append(0.0 if math.isnan(ratio) and speed > 0 else ratio)
+        if speed > 0 and math.isfinite(speed):
+            drive_N = (factor * trial.pressure_Pa - yield_factor * trial.yield_pressure_Pa) * trial.area_m2
+            damping = drive_N / (trial.travel_ratio * speed) ** published.EXPONENT if drive_N > 0 else 0.0
+            ratios.append(damping / damping_prior(trial.diameter_m, trial.thickness_m))
     known = [ratio for ratio in ratios if math.isfinite(ratio)]
     return float(np.median(known)) if known else math.nan
