@@ -19,7 +19,7 @@ import pandas as pd
 import yaml
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Trial
+from vinetrack.core.records import Trial
 from vinetrack.core.tables import replacing, write_csv, write_text
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import Experiment, read_experiment
@@ -30,11 +30,8 @@ from vinetrack.laboratory.tracks import VirtualTrial
 
 Frame = NDArray[np.uint8 | np.uint16]
 
-CODECS = {"h264": "libx264", "ffv1": "ffv1"}
 GREY_FORMATS = {8: "gray", 12: "gray12le", 16: "gray16le"}
 CONTAINER_FPS = 60  # Frames per second that a file of a high-speed camera claims (chosen)
-LIMITED_RANGE = 1  # Code of the H.264 stream for levels of 16…235 (defined)
-TINT = (12, -8)  # Offsets (U, V) of a colour recording from grey: a warm wall and bluish film under LED lamps (chosen)
 
 
 def render_recording(
@@ -93,13 +90,13 @@ def _write_video(frame: Callable[..., Frame], n_frames: int, scene: Scene, path:
     chroma = _chroma(scene)
     options = {"movflags": "+faststart"} if path.suffix.lower() in (".mp4", ".mov") else {}
     with av.open(str(path), "w", options=options) as container:
-        stream: Any = container.add_stream(CODECS[encoding.codec], rate=Fraction(CONTAINER_FPS))
+        stream: Any = container.add_stream("libx264" if is_h264 else encoding.codec, rate=Fraction(CONTAINER_FPS))
         stream.width, stream.height, stream.pix_fmt = scene.camera.width_px, scene.camera.height_px, pixel_format
         stream.codec_context.thread_count = 1
         if is_h264:
             stream.options = {"preset": "superfast", "bf": "0", "sc_threshold": "0", **_rate(scene)}
             stream.gop_size = encoding.gop
-            stream.codec_context.color_range = LIMITED_RANGE
+            stream.codec_context.color_range = 1  # levels of 16…235
         for index in range(n_frames):
             picture = av.VideoFrame(scene.camera.width_px, scene.camera.height_px, pixel_format)
             for plane, values in zip(picture.planes, (frame(index, **levels), *chroma), strict=False):
@@ -120,7 +117,7 @@ def _chroma(scene: Scene) -> tuple[Frame, Frame]:
     """The two colour planes at half resolution, constant in time, since film is transparent; even for a grey scene."""
     rows, columns = (scene.camera.height_px + 1) // 2, (scene.camera.width_px + 1) // 2
     fade = np.linspace(0, 1, columns)[None, :] + 0.2 * np.linspace(0, 1, rows)[:, None]
-    u, v = TINT if scene.sensor.colour else (0, 0)
+    u, v = (12, -8) if scene.sensor.colour else (0, 0)  # a warm wall and bluish film under LED lamps
     return (128 - u * fade).astype(np.uint8), (128 - v * fade).astype(np.uint8)
 
 
@@ -228,20 +225,15 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
     """Film one simulated trial; its truth is returned and not written."""
     capture_fps = trial.stated.capture_fps
     n_frames = int(trial.track.time_s.size)
+    time_s = np.linspace(0.0, n_frames / capture_fps, FINE_STEPS * n_frames + 1)
     return render_recording(
         scene_of(trial.stated, filming),
-        _motion(trial, n_frames / capture_fps, FINE_STEPS * n_frames),
+        (time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m),
         n_frames=n_frames,
         capture_fps=capture_fps,
         out_path=out_path,
         seed=seed,
     )
-
-
-def _motion(trial: VirtualTrial, duration_s: float, steps: int) -> tuple[Floats, Floats]:
-    """True lead position at times much finer than the frames, s and m."""
-    time_s = np.linspace(0.0, duration_s, steps + 1)
-    return time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m
 
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
@@ -254,10 +246,6 @@ def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
         temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 
-SETTINGS = "experiment.yaml"
-TARGET = "calibration/board.png"
-
-
 def recording_experiment(experiment: Experiment, trials: Sequence[str], filming: Filming, folder: Path) -> Experiment:
     """Write sheet and settings of an experiment of recordings of these trials; nothing is filmed yet."""
     if experiment.settings.calibration is not None or any(trial.video for trial in experiment.trials):
@@ -268,9 +256,9 @@ def recording_experiment(experiment: Experiment, trials: Sequence[str], filming:
     sheet = sheet[sheet["trial"].isin(list(trials))].rename(columns={"track": "video"})
     sheet["video"] = [f"videos/{trial}.mp4" for trial in sheet["trial"]]
     write_csv(folder / SHEET, sheet)
-    path = experiment.folder / SETTINGS
+    path = experiment.folder / "experiment.yaml"
     shared = path.read_text(encoding="utf-8") if path.exists() else ""
-    write_text(folder / SETTINGS, shared + _camera_settings(experiment, filming))
+    write_text(folder / "experiment.yaml", shared + _camera_settings(experiment, filming))
     return read_experiment(folder, strict=True)
 
 
@@ -284,7 +272,7 @@ def _camera_settings(experiment: Experiment, filming: Filming) -> str:
         raise ValueError("trials have several frame rates, so that no single exposure can be stated")
     board = {
         "kind": target.kind,
-        "image": TARGET,
+        "image": "calibration/board.png",
         "squares": list(target.squares),
         "square_mm": round(1e3 * target.square_m, 6),
         "marker_mm": round(1e3 * target.marker_m, 6),

@@ -29,8 +29,6 @@ Image = NDArray[np.float32]
 # All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that
 # changing one surface does not change the others.
 
-OVERSAMPLING = 4  # Sub-pixels per pixel for drawing lines (derived)
-
 
 def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
     """Periodic Gaussian noise with mean 0 and standard deviation 1, smoothed over `sigma_y`, `sigma_x` px."""
@@ -41,14 +39,6 @@ def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: flo
     white[0, 0] = 0
     field = np.fft.irfft2(white, s=shape)
     return (field / field.std()).astype(np.float32)
-
-
-def _along_and_across(scene: Scene, shape: tuple[int, int], corner: tuple[int, int]) -> tuple[Image, Image]:
-    """Coordinates along the path and across it (px) of each canvas pixel, each of shape `shape`."""
-    yy, xx = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
-    dx, dy = xx + corner[0] - scene.origin[0], yy + corner[1] - scene.origin[1]
-    ux, uy = scene.direction
-    return (dx * ux + dy * uy).astype(np.float32), (dy * ux - dx * uy).astype(np.float32)
 
 
 def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
@@ -75,15 +65,11 @@ def _paste(canvas: Image, patch: Image, mask: Image, matrix: NDArray[np.float64]
     return np.asarray(canvas * (1 - weight) + laid, dtype=np.float32)
 
 
-def _axis_matrix(
-    scene: Scene, corner: tuple[int, int], along_px: float, across_px: float, turned: bool = False
-) -> NDArray[np.float64]:
+def _axis_matrix(scene: Scene, corner: tuple[int, int], along_px: float, across_px: float) -> NDArray[np.float64]:
     """Affine map of a patch drawn along the path to the canvas; its top left is at (along_px, across_px)."""
     ux, uy = scene.direction
     x0 = scene.origin[0] - corner[0] + along_px * ux - across_px * uy
     y0 = scene.origin[1] - corner[1] + along_px * uy + across_px * ux
-    if turned:
-        return np.array([[-ux, uy, x0], [-uy, -ux, y0]])
     return np.array([[ux, -uy, x0], [uy, ux, y0]])
 
 
@@ -91,7 +77,7 @@ def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random
     """Paint a steel ruler, shape (width_px, length_px): tick k mm is centred k·px_per_mm from the first column."""
     import cv2
 
-    k = OVERSAMPLING
+    k = 4  # sub-pixels per pixel
     big = np.full((width_px * k, length_px * k), 0.62, dtype=np.float32)
     ink = np.zeros(big.shape, dtype=np.uint8)
     finest_mm = next((step for step in (1, 2, 5, 10) if step * px_per_mm >= 2.2), 10)
@@ -164,7 +150,9 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
     """Paint the static scene, blurred by the optics."""
     import cv2
 
-    along, _ = _along_and_across(scene, shape, corner)
+    yy, xx = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    dx, dy = xx + corner[0] - scene.origin[0], yy + corner[1] - scene.origin[1]
+    along = (dx * scene.direction[0] + dy * scene.direction[1]).astype(np.float32)
     canvas = _wall_paper(scene, rng, along)
     if scene.backdrop.clutter:
         canvas = _clutter(canvas, scene, rng)
@@ -235,8 +223,7 @@ def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
 
 def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px: int) -> Image:
     """Return running sums along the tail's texture, which is periodic with mean 0; shape (rows, period_px + 1). The
-    mean over any stretch, as in motion blur, is then the difference of two entries over the length. Shape (rows,
-    period_px + 1).
+    mean over any stretch, as in motion blur, is then the difference of two entries over the length.
     """
     rows = 2 * math.ceil(radius_px * tube.tail_width) + 5
     shape = (rows, period_px)
@@ -303,9 +290,7 @@ def _paint_board(
 
 
 def plane_seen(camera: Camera) -> Floats:
-    """Return the point of the plane at the centre of each pixel, relative to the optical axis; (height, width, 2), m.
-    Shape (height, width, 2).
-    """
+    """Return the point of the plane that each pixel sees, from the optical axis, m. Shape (height, width, 2)."""
     grid = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1).astype(float)
     return np.asarray((camera.plane_from_picture(grid) - np.array(camera.centre_px)) * camera.m_per_px)
 
@@ -544,28 +529,13 @@ def expose(
 
 Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]  # Lead position in metres against time in seconds
 
-FASTEST_PAYLOAD_M_S = 150.0  # Largest speed of a payload that leaves the vine (chosen)
 
-RELEASE_TRAVEL_M = 1e-5  # Travel from which a vine counts as released (chosen)
-
-EVENT_STEPS = 10  # Steps per frame of the search for the release and the exit of the tail (chosen)
-
-
-def motion_function(motion: Motion) -> Callable[[Floats], Floats]:
-    """Return a motion as a function; samples are interpolated by monotone cubics (PCHIP) and constant outside. Returns
-    function from times, s, to positions, m. Shapes: motion (n,).
-    """
-    if callable(motion):
-        return motion
+def _interpolated(time_s: Floats, lead_position_m: Floats) -> Callable[[Floats], Floats]:
+    """A sampled motion as a function: monotone cubics (PCHIP), constant outside."""
     from scipy.interpolate import PchipInterpolator
 
-    time_s, lead_position_m = (np.asarray(part, dtype=float) for part in motion)
     cubic = PchipInterpolator(time_s, lead_position_m)
-
-    def position_m(at_s: Floats) -> Floats:
-        return np.asarray(cubic(np.clip(at_s, time_s[0], time_s[-1])))
-
-    return position_m
+    return lambda at_s: np.asarray(cubic(np.clip(at_s, time_s[0], time_s[-1])))
 
 
 class SceneMotion:
@@ -575,10 +545,10 @@ class SceneMotion:
         self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float, seed: int
     ) -> None:
         self.scene, self.capture_fps, self.exposure_s = scene, capture_fps, exposure_s
-        self._position_m = motion_function(motion)
-        grid_s = np.arange(0, (n_frames + 1) * EVENT_STEPS) / (EVENT_STEPS * capture_fps)
+        self._position_m = motion if callable(motion) else _interpolated(*motion)
+        grid_s = np.arange(0, (n_frames + 1) * 10) / (10 * capture_fps)
         lead_m = np.asarray(self._position_m(grid_s), dtype=float)
-        moving = np.flatnonzero(lead_m > lead_m[0] + RELEASE_TRAVEL_M)
+        moving = np.flatnonzero(lead_m > lead_m[0] + 1e-5)
         self.release_s = float(grid_s[moving[0]]) if moving.size else math.inf
         self._exit_s, self._exit_px_s = self._find_exit(grid_s, lead_m)
         rng = np.random.default_rng([seed, 1])
@@ -597,7 +567,7 @@ class SceneMotion:
             return math.inf, 0.0
         k = out[0]
         lead_speed_m_s = (lead_m[k - 1] - lead_m[k - 2]) / (grid_s[k - 1] - grid_s[k - 2])
-        return float(grid_s[k]), min(2 * lead_speed_m_s, FASTEST_PAYLOAD_M_S) / self.scene.camera.m_per_px
+        return float(grid_s[k]), min(2 * lead_speed_m_s, 150.0) / self.scene.camera.m_per_px
 
     def mid_exposure_s(self, frame: int | NDArray[np.int_]) -> Floats:
         """Return the middle of the exposure of frames."""
@@ -634,8 +604,8 @@ class SceneMotion:
         return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
-        """Return the displacement of the picture (x, y): six sinusoids of joint rms 1, and a damped kick at release.
-        Returns plane pixels along x and y.
+        """Return the displacement of the picture (x, y), plane pixels: six sinusoids of joint rms 1, and a damped kick
+        at release.
         """
         if not self.scene.shake_px:
             return 0.0, 0.0
@@ -679,16 +649,12 @@ class SceneMotion:
 # ------------------------------------------------------------------------------
 # Moving objects in front of the backdrop: tube, ball and door, each composited over the light of a frame.
 
-EXPOSURE_PIECES = 4  # Straight pieces that approximate the path of the tip over an exposure (derived)
 TABLE_STEP_PX = 1 / 16  # Steps of the table of covers along the path (chosen)
 
 PROFILE_PER_PX = 16  # Entries per pixel of the profiles across (chosen)
 
 # How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)
 SLOPES = np.linspace(1.0, 4.0, 7)
-TAIL_PERIOD_PX = 4096  # Period of the texture of the tail (chosen)
-
-BALL_STEP_PX = 0.7  # Distance of the centres over which a moving ball is averaged (chosen)
 
 
 class PathMaps:
@@ -700,14 +666,6 @@ class PathMaps:
         dx, dy = self.plane_x - np.float32(scene.origin[0]), self.plane_y - np.float32(scene.origin[1])
         self.along: Image = (dx * ux + dy * uy).astype(np.float32)
         self.across: Image = (dy * ux - dx * uy).astype(np.float32)
-
-    def rows_within(self, touched: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First and one-past-last column of each row that `touched` marks; equal where it marks none. Returns two
-        arrays, shape (height,). Shapes: touched (height, width).
-        """
-        any_in_row = touched.any(axis=1)
-        last = touched.shape[1] - touched[:, ::-1].argmax(axis=1)
-        return np.where(any_in_row, touched.argmax(axis=1), 0), np.where(any_in_row, last, 0)
 
 
 class TubeLayer:
@@ -721,7 +679,7 @@ class TubeLayer:
         length = max(math.ceil(float(maps.along.max())) + 8, 64)
         self._wall = film_wall(self._tube, rng, radius, length)
         self._girth = film_girth(self._tube, rng, length)
-        self._tail = tail_sums(self._tube, rng, radius, TAIL_PERIOD_PX)
+        self._tail = tail_sums(self._tube, rng, radius, period_px=4096)
         self._profiles = tip_profiles(self._tube, radius, self._psf_px)
         self._ghost_across = 1.35 * radius
         shake = 4 * scene.shake_px
@@ -729,7 +687,10 @@ class TubeLayer:
         touched = np.abs(maps.across) < reach
         if self._tube.reflection:
             touched |= np.abs(maps.across - self._ghost_across) < reach
-        self._first_x, self._last_x = maps.rows_within(touched & (maps.along > -4 - shake))
+        touched &= maps.along > -4 - shake
+        # First and one-past-last column of each row that the tube may touch, equal where it touches none.
+        in_row, last = touched.any(axis=1), touched.shape[1] - touched[:, ::-1].argmax(axis=1)
+        self._first_x, self._last_x = np.where(in_row, touched.argmax(axis=1), 0), np.where(in_row, last, 0)
         self._payload: BallLayer | None = None
         if self._tube.payload_diameter_m:
             metal = Ball(
@@ -746,7 +707,7 @@ class TubeLayer:
             self._payload.lay(light, frame, shift)
         scene_motion, tube = self._motion, self._tube
         middle_s = float(scene_motion.mid_exposure_s(frame))
-        part = np.linspace(0, 1, EXPOSURE_PIECES + 1)
+        part = np.linspace(0, 1, 5)  # the path of the tip over an exposure in four straight pieces
         path = scene_motion.lead_px(frame / scene_motion.capture_fps + scene_motion.exposure_s * part)
         tip = float(scene_motion.lead_px(middle_s))
         table, first = self._edge_table(path - tip)
@@ -778,8 +739,8 @@ class TubeLayer:
 
 
 def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, NDArray[np.int64], Image, Image]:
-    """Profiles over the distance v from the axis, PROFILE_PER_PX a pixel: setback, slope row, side and core. Returns
-    setback, slope row, side, core, each of shape (n_entries,).
+    """Profiles over the distance v from the axis, PROFILE_PER_PX a pixel: setback, slope row, side and core, each of
+    shape (n_entries,).
     """
     from scipy.special import ndtr
 
@@ -813,13 +774,13 @@ class BallLayer:
         self._surface = ball_surface(ball, rng, max(self._radius_px, 2.0))
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
-        """Lay the ball over a picture, in place, averaged over centres at most BALL_STEP_PX apart. Shapes: light
+        """Lay the ball over a picture, in place, averaged over centres at most 0.7 px apart. Shapes: light
         (height, width).
         """
         scene_motion = self._motion
         begin_s, span_s = frame / scene_motion.capture_fps, scene_motion.exposure_s
         ends = self._centre_px(begin_s + np.array([0, span_s]))
-        pieces = int(min(max(math.ceil(abs(ends[1] - ends[0]) / BALL_STEP_PX), 3), 80))
+        pieces = int(min(max(math.ceil(abs(ends[1] - ends[0]) / 0.7), 3), 80))
         path = self._centre_px(begin_s + span_s * (np.arange(pieces) + 0.5) / pieces)
         box = self._box(path, max(abs(part) for part in shift), (light.shape[0], light.shape[1]))
         if box[2] > box[0] and box[3] > box[1]:
