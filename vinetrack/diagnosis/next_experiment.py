@@ -44,7 +44,7 @@ from vinetrack.planning.discriminating_design import (
     sampling_of,
     worth,
 )
-from vinetrack.planning.simulated_campaigns import DesignProblem, expected_rises, mean_separation, simulated_rises
+from vinetrack.planning.simulated_campaigns import DesignProblem, mean_separation, simulated_rises
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
 
@@ -115,7 +115,7 @@ def _without_nan(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Option:
-    """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `expected_rises`."""
+    """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `simulated_rises`."""
 
     design: tuple[int, ...]
     rises: Floats
@@ -239,7 +239,9 @@ def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed
         design, predicted = best_design(terms, allowed, limits.trials)
         if predicted > LEAST_GAIN * before:
             before = predicted
-            options.append(_Option(tuple(design.tolist()), expected_rises(bench, design.tolist(), [0], seed)))
+            options.append(
+                _Option(tuple(design.tolist()), simulated_rises(bench, design.tolist(), [0], seed, thorough=False))
+            )
     return options
 
 
@@ -275,12 +277,15 @@ def _recommended(options: Sequence[_Option]) -> _Option:
 
 def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int) -> NextExperiment:
     best = _recommended(options)
-    best = _Option(best.design, np.concatenate([best.rises, expected_rises(bench, best.design, [1], seed)]))
+    second = simulated_rises(bench, best.design, [1], seed, thorough=False)
+    best = _Option(best.design, np.concatenate([best.rises, second]))
     names = [hypothesis.name for hypothesis in bench.hypotheses]
     expected_sigma = _by_pair(best.separations)
     worth_it = max(expected_sigma.values()) >= LEAST_SEPARATION
     draws = max(CHECK_DRAWS.get(len(names), 1) - (min(expected_sigma.values()) > CLEAR_SEPARATION), 1)
-    simulated = _simulated_separations(simulated_rises(bench, best.design, range(draws), seed)) if worth_it else {}
+    simulated = {}
+    if worth_it:
+        simulated = _simulated_separations(simulated_rises(bench, best.design, range(draws), seed, thorough=True))
     unresolved = [
         pair
         for pair, sigma in expected_sigma.items()

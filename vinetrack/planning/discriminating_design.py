@@ -52,20 +52,14 @@ from vinetrack.tracks.position_noise import ar1_noise
 
 SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
 
-HEADROOM = 1.25  # Highest candidate pressure, as a multiple of the highest used (chosen)
-
 # Lowest candidate pressure of a vine without payload, as a multiple of the yield pressure (chosen)
 LOWEST_PRESSURE_RATIO = 1.15
 
 PRESSURE_STEP_PA = 100.0  # Resolution of set pressures, Pa (chosen)
 
-PAYLOAD_KG = 0.05  # Payload offered where none was used yet, kg (chosen)
-
 CANDIDATE_PRESSURES = 6  # Candidate pressures of a vine (chosen)
 
 MOST_NEW_VINES = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
-
-EQUAL_TOLERANCE = 1e-4  # Relative difference below which two values are equal (chosen)
 
 
 @dataclass(frozen=True)
@@ -139,7 +133,7 @@ def _allowed(vine: Trial, limits: Limits) -> bool:
 
 
 def _is_among(value: float, values: Iterable[float]) -> bool:
-    return any(math.isclose(value, listed, rel_tol=EQUAL_TOLERANCE, abs_tol=1e-12) for listed in values)
+    return any(math.isclose(value, listed, rel_tol=1e-4, abs_tol=1e-12) for listed in values)
 
 
 def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
@@ -184,7 +178,7 @@ def _loads(rig: Trial, like: int, effort: int, used: Sequence[Trial], limits: Li
 def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
     """No payload (or the lightest allowed), the heaviest, and those used in between."""
     payloads = {trial.payload_kg for trial in used}
-    heaviest = max(payloads) if max(payloads) > 0 else PAYLOAD_KG
+    heaviest = max(payloads) if max(payloads) > 0 else 0.05  # kg, where none was used yet
     low, high = (0.0, heaviest) if limits.payload_g is None else (1e-3 * g for g in limits.payload_g)
     return sorted({low, high, *(payload for payload in payloads if low <= payload <= high)})
 
@@ -194,7 +188,7 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
     pressures = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
     if not pressures:
         return []
-    low, high = min(pressures), HEADROOM * max(pressures)
+    low, high = min(pressures), 1.25 * max(pressures)  # a quarter above the highest used
     if limits.pressure_kPa is not None:
         low, high = (1e3 * kPa for kPa in limits.pressure_kPa)
     stress_Pa = hoop_stress_Pa(1.0, rig.diameter_m, rig.thickness_m)
@@ -330,13 +324,11 @@ class Hypothesis:
         lower, upper = self.layout.bounds
         return np.minimum(lower - self.theta, 0.0), np.maximum(upper - self.theta, 0.0)
 
-    def layout_of(self, places: Sequence[int]) -> ParameterMap:
-        """Return the parameter map of some of the conditions."""
-        return replace(self.layout, index=self.layout.index[list(places)], base=self.layout.base[list(places)])
-
     def predictor(self, places: Sequence[int], items: Sequence[FitTrial]) -> Predictor:
         """Return a predictor of these trials, one for each of the conditions at `places`."""
-        predictor = Predictor(self.layout_of(places), items, self.fit.predictor.host)
+        rows = list(places)
+        layout = replace(self.layout, index=self.layout.index[rows], base=self.layout.base[rows])
+        predictor = Predictor(layout, items, self.fit.predictor.host)
         predictor.steps = self.fit.predictor.steps.copy()
         return predictor
 
@@ -350,7 +342,7 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     for condition in conditions:
         row = old.index[condition.like].copy()
         for column, key in enumerate(old.keys):
-            if row[column] >= 0 and old.free[row[column]].vine and condition.trial.vine != _vine_of(fit, condition):
+            if row[column] >= 0 and old.free[row[column]].vine and _has_new_vine(fit, condition):
                 spot = (key, condition.trial.vine)
                 if spot not in places:
                     places[spot] = len(numbers)
@@ -359,7 +351,8 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
         index.append(row)
     added = numbers[len(old.free) :]
     precision_of_new = np.array([1 / NEW_VINE_SD**2 + (number.scale / number.prior_sd) ** 2 for number in added])
-    sd_of_new = [damping_scatter() if number.key == DAMPING else _stated_sd(number) for number in added]
+    stated_sd = [number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0 for number in added]
+    sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
     base = np.array([_base_row(fit, condition) for condition in conditions])
     return Hypothesis(
         name=name,
@@ -385,7 +378,7 @@ def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, .
             min(s * factor, most) if can and s > LEAST_BETWEEN_TRIAL_SD else s
             for s, factor, most, can in zip(state.spread, factors, LARGEST_SPREAD, fit.solution.estimable, strict=True)
         )
-        pair = (max(spread[0], LEAST_BETWEEN_TRIAL_SD), max(spread[1], LEAST_BETWEEN_TRIAL_SD))
+        pair = _at_least(spread)
         if pair in levels:
             continue
         of_old, gradient_of_old, square, log_det = normal_equations(reduced, problem, state, pair)
@@ -394,33 +387,28 @@ def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, .
         information[:old, :old] = of_old
         information[range(old, size), range(old, size)] = precision_of_new
         as_fitted = as_fitted if levels else square + log_det
-        ratios = (
-            pair[0] / max(state.spread[0], LEAST_BETWEEN_TRIAL_SD),
-            pair[1] / max(state.spread[1], LEAST_BETWEEN_TRIAL_SD),
-        )
+        fitted = _at_least(state.spread)
+        ratios = (pair[0] / fitted[0], pair[1] / fitted[1])
         gradient = np.concatenate([gradient_of_old, np.zeros(size - old)])
         levels[pair] = ScatterLevel(pair, ratios, information, gradient, square + log_det - as_fitted)
     return tuple(levels.values())
 
 
-def _stated_sd(number: FreeParameter) -> float:
-    return number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0
+def _at_least(spread: Sequence[float]) -> tuple[float, float]:
+    return max(spread[0], LEAST_BETWEEN_TRIAL_SD), max(spread[1], LEAST_BETWEEN_TRIAL_SD)
 
 
-def _vine_of(fit: Fit, condition: Condition) -> str:
-    return fit.predictor.data[condition.like].trial.vine
+def _has_new_vine(fit: Fit, condition: Condition) -> bool:
+    return condition.trial.vine != fit.predictor.data[condition.like].trial.vine
 
 
 def _of_new_vine(fit: Fit, like: FreeParameter, trial: Trial) -> FreeParameter:
     """The parameter of a new vine that replaces the one of the vine it is modelled on."""
     if like.key == YIELD_PRESSURE:
         return replace(like, vine=trial.vine, start=trial.yield_pressure_Pa)
-    start = _new_damping(fit, trial) if like.key == DAMPING else _mean_of_vines(fit, like.key)
+    of_measured = [number.value for number in fit.numbers if number.key == like.key]
+    start = _new_damping(fit, trial) if like.key == DAMPING else float(np.mean(of_measured))
     return replace(like, vine=trial.vine, start=float(np.clip(start, like.lower, like.upper)))
-
-
-def _mean_of_vines(fit: Fit, key: str) -> float:
-    return float(np.mean([number.value for number in fit.numbers if number.key == key]))
 
 
 def _new_damping(fit: Fit, trial: Trial) -> float:
@@ -444,7 +432,7 @@ def _base_row(fit: Fit, condition: Condition) -> Floats:
     """Model parameters of a condition: those of the trial it is modelled on, with the B of the new vine."""
     rows, _ = fit.predictor.layout.rows(fit.solution.state.theta)
     row = np.array(rows[condition.like])
-    if fit.predictor.damping_column >= 0 and condition.trial.vine != _vine_of(fit, condition):
+    if fit.predictor.damping_column >= 0 and _has_new_vine(fit, condition):
         row[fit.predictor.damping_column] = _new_damping(fit, condition.trial)
     return row
 
@@ -452,17 +440,11 @@ def _base_row(fit: Fit, condition: Condition) -> Floats:
 # ------------------------------------------------------------------------------
 # Simulated tracks of candidate trials, sampled as the camera of the experiment would.
 
-LONGEST = 1.5  # Longest recording, as a multiple of the longest so far (chosen)
-
 LEAST_GROWTH = 0.3  # Fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
-
-SIMULATED_TIMES = 400  # Times at which a condition is simulated (derived)
 
 # Ratio of tail speed to steady speed at the same pressure above which the model predicts compression in the tail
 # (chosen)
 LARGEST_SPEED_RATIO = 1.05
-
-FEWEST_REST_FRAMES = 3  # Frames at rest that are planned, at least (chosen)
 
 
 @dataclass(frozen=True)
@@ -481,9 +463,9 @@ def sampling_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
     moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
     return TrackSampling(
         frame_s=data[like].frame_s,
-        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), FEWEST_REST_FRAMES),
+        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
         frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
-        longest_s=LONGEST * float(max(moving_s)),
+        longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
     )
 
 
@@ -513,10 +495,7 @@ def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], 
     lead_position_m (n_points,).
     """
     like = data[condition.like]
-    trace = None
-    if like.trace is not None:
-        ends = np.array([-1e3, 1e3])
-        trace = (ends, np.full(2, condition.trial.pressure_Pa))
+    constant = (np.array([-1e3, 1e3]), np.full(2, condition.trial.pressure_Pa))
     return FitTrial(
         trial=condition.trial,
         time_s=time_s,
@@ -525,7 +504,7 @@ def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], 
         n_rest=int(np.count_nonzero(time_s <= 0)),
         noise_m=like.noise_m,
         correlation=like.correlation,
-        trace=trace,
+        trace=None if like.trace is None else constant,
     )
 
 
@@ -534,7 +513,7 @@ def growth_courses(
 ) -> list[GrowthCourse | None]:
     """Return the course of growth of every condition; None where it is not worth filming or the model is in doubt."""
     data = hypotheses[0].fit.predictor.data
-    times = [np.linspace(0.0, camera.longest_s, SIMULATED_TIMES) for camera in cameras]
+    times = [np.linspace(0.0, camera.longest_s, 400) for camera in cameras]
     items = [blank_trial(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
     trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
     runs: list[list[Trajectory | None]] = []
@@ -618,8 +597,8 @@ def film_trials(
     deviations: Floats,
     rng: np.random.Generator,
 ) -> list[FitTrial | None]:
-    """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise.
-    Shapes: theta (n_free,); deviations (n_places, 2).
+    """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise, and
+    select usable points as for a fit; None where there are too few. Shapes: theta (n_free,); deviations (n_places, 2).
     """
     chosen, of_chosen = [conditions[k] for k in places], [cameras[k] for k in places]
     data = truth.fit.predictor.data
@@ -634,7 +613,7 @@ def film_trials(
     trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
     trial_effects[:, PRESSURE] = np.where(predictor.has_pressure_deviation, deviations[:, 0], 0.0)
     trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.has_damping_deviation, deviations[:, 1], 0.0)
-    tracks = []
+    tracks: list[FitTrial | None] = []
     for i, moved in enumerate(predictor.run(predictor.jobs(theta, trial_effects))):
         stop = times[i].size
         if moved.status == "ended":
@@ -642,33 +621,20 @@ def film_trials(
             stop = min(stop, int(np.searchsorted(times[i], last_s)) + of_chosen[i].frames_behind_end)
         noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - truth.rho**2)), truth.rho, rng)
         position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
-        tracks.append(_usable_points(chosen[i], times[i][:stop], position_m, items[i].trace))
+        pressure_Pa = None if items[i].trace is None else np.full(stop, chosen[i].trial.pressure_Pa)
+        try:
+            tracks.append(
+                prepare_trial(chosen[i].trial, plain_track(times[i][:stop], position_m, pressure_Pa=pressure_Pa))
+            )
+        except FitError:
+            tracks.append(None)
     return tracks
-
-
-def _usable_points(
-    condition: Condition, time_s: Floats, position_m: Floats, trace: tuple[Floats, Floats] | None
-) -> FitTrial | None:
-    """The usable points of a simulated track, selected as for a fit; None where there are too few."""
-    pressure = None if trace is None else np.full(time_s.size, trace[1][0])
-    try:
-        return prepare_trial(condition.trial, plain_track(time_s, position_m, pressure_Pa=pressure))
-    except FitError:
-        return None
 
 
 POINTS = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
 
-PAST_THE_END = 1.05  # Time at which the vine is evaluated after its end, in end times (chosen)
-
 # Separation, in standard deviations, at which a pair has half of its largest worth (chosen)
 WELL_SEPARATED = 5.0
-
-MOST_PASSES = 4  # Passes of the exchange, at most (chosen)
-
-GAIN = 1.005  # Factor by which an exchange must raise the worth (chosen)
-
-BOUND_PASSES = 4  # Passes that fix parameters at their bounds (chosen)
 
 
 @dataclass(frozen=True)
@@ -742,7 +708,7 @@ def _times(camera: TrackSampling, run: GrowthCourse) -> tuple[Floats, Floats]:
     step_s = run.near_end_s / POINTS
     moving = (np.arange(POINTS) + 0.5) * step_s
     ends_filmed = np.isfinite(run.ends_s) and camera.frames_behind_end > 0
-    last_s = PAST_THE_END * run.ends_s if ends_filmed else moving[-1] + step_s
+    last_s = 1.05 * run.ends_s if ends_filmed else moving[-1] + step_s  # just past the end
     weights = np.full(POINTS + 2, step_s / camera.frame_s)
     weights[0], weights[-1] = camera.rest_frames, camera.frames_behind_end if ends_filmed else 0.0
     return np.concatenate([[-camera.frame_s], moving, [last_s]]), weights
@@ -825,7 +791,7 @@ def _largest_gain(information: Floats, gradient: Floats, down: Floats, up: Float
     n, size = gradient.shape
     step = np.zeros((n, size))
     fixed: NDArray[np.bool_] = np.broadcast_to((down == 0) & (up == 0), (n, size)).copy()
-    for _ in range(BOUND_PASSES):
+    for _ in range(4):
         free = ~fixed
         right = np.where(free, gradient - np.einsum("nij,nj->ni", information, np.where(fixed, step, 0.0)), 0.0)
         of_free = information * (free[:, :, None] & free[:, None, :]) + fixed[:, :, None] * np.eye(size)
@@ -857,13 +823,13 @@ def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.int_], trials: 
     replicates = np.repeat(np.arange(allowed.size)[:, None], trials, axis=1)
     values = worth(separations(of_allowed, replicates))
     design, best = replicates[int(np.argmax(values))].copy(), float(np.max(values))
-    for _ in range(MOST_PASSES):
+    for _ in range(4):
         before = best
         for exchanged in range(trials):
             designs = np.repeat(design[None], allowed.size, axis=0)
             designs[:, exchanged] = np.arange(allowed.size)
             values = worth(separations(of_allowed, designs))
-            if np.max(values) > GAIN * best:
+            if np.max(values) > 1.005 * best:  # a gain, not rounding
                 design, best = designs[int(np.argmax(values))], float(np.max(values))
         if best <= before:
             break

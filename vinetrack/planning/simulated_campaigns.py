@@ -107,11 +107,14 @@ def make(
 # between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can explain
 # part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
 #
-# There are two levels of detail. `expected_rises` sets the truth to the best values and treats the old trials as
-# linear in the parameters, which is fast enough to compare designs. `simulated_rises` draws the truth from its
-# distribution given the old trials and simulates every trajectory anew, as a check.
+# There are two levels of detail. The quick one sets the truth to the best values and treats the old trials as linear in
+# the parameters, which is fast enough to compare designs. The thorough one draws the truth from its distribution given
+# the old trials and simulates every trajectory anew, as a check.
 
 MOST_ITERATIONS = 20  # Iterations of a refit, at most (chosen)
+
+# Deviations of pressure and B in standard deviations, balanced over replicates (derived)
+ALTERNATING = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
 
 # Standard deviations at which draws of the true parameters are clipped, since the linearised fit is not valid beyond
 FURTHEST_DRAW = 2.0
@@ -172,23 +175,14 @@ class DesignProblem:
     cameras: Sequence[TrackSampling]
 
 
-def expected_rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
-    """Return the rise of −2 ln L of every (true, refitted) pair, the truth at its best values; NaN where a refit fails.
-    The deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the average.
-    Shape (n_draws, n, n).
+def simulated_rises(
+    bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool
+) -> Floats:
+    """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
+    values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
+    average. If `thorough`, both are random and every trajectory is simulated: only where the pressure was recorded do
+    the old trials stay linear, for to simulate those takes a hundred times as long. Shape (n_draws, n, n).
     """
-    return _rises(bench, design, draws, seed, thorough=False)
-
-
-def simulated_rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
-    """Return the rises of `expected_rises` with random true parameters and deviations and every trajectory simulated.
-    Only where the pressure was recorded do the old trials stay linear: to simulate with a recorded pressure takes a
-    hundred times as long. Shape (n_draws, n, n).
-    """
-    return _rises(bench, design, draws, seed, thorough=True)
-
-
-def _rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool) -> Floats:
     n = len(bench.hypotheses)
     rises = np.full((len(draws), n, n), math.nan)
     before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in bench.hypotheses])
@@ -196,7 +190,8 @@ def _rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], se
         rng = np.random.default_rng([seed, int(thorough), draws[k], a])
         truth = bench.hypotheses[a]
         theta = draw_parameters(truth, rng) if thorough else truth.theta
-        deviations = rng.standard_normal((len(design), 2)) if thorough else _alternating(design, draws[k])
+        alternating = ALTERNATING[(np.arange(len(design)) + draws[k]) % 4]
+        deviations = rng.standard_normal((len(design), 2)) if thorough else alternating
         try:
             filmed = film_trials(truth, design, bench.conditions, bench.cameras, theta, deviations * truth.spread, rng)
         except SimulationError:
@@ -206,12 +201,6 @@ def _rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], se
             after = np.array([_refitted(hypothesis, new, thorough=thorough) for hypothesis in bench.hypotheses])
             rises[k, a] = after - before - (after[a] - before[a])
     return rises
-
-
-def _alternating(design: Sequence[int], draw: int) -> Floats:
-    """Deviations of pressure and B, ±1 standard deviation, balanced over replicates, shape (n_trials, 2)."""
-    signs = np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]], dtype=float)
-    return signs[(np.arange(len(design)) + draw) % 4]
 
 
 def mean_separation(rises: Floats) -> Floats:
@@ -291,6 +280,3 @@ def _extended_state(hypothesis: Hypothesis, predictor: PartlyLinear, data: Seque
     return replace(
         before, theta=theta, trial_effects=np.concatenate([before.trial_effects, trial_effects]), variance=variance
     )
-
-
-__all__ = ["DesignProblem", "PartlyLinear", "draw_parameters", "expected_rises", "mean_separation", "simulated_rises"]
