@@ -239,9 +239,7 @@ def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed
         design, predicted = best_design(terms, allowed, limits.trials)
         if predicted > LEAST_GAIN * before:
             before = predicted
-            options.append(
-                _Option(tuple(design.tolist()), simulated_rises(bench, design.tolist(), [0], seed, thorough=False))
-            )
+            options.append(_Option(tuple(design.tolist()), simulated_rises(bench, design.tolist(), [0], seed)))
     return options
 
 
@@ -277,8 +275,7 @@ def _recommended(options: Sequence[_Option]) -> _Option:
 
 def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int) -> NextExperiment:
     best = _recommended(options)
-    second = simulated_rises(bench, best.design, [1], seed, thorough=False)
-    best = _Option(best.design, np.concatenate([best.rises, second]))
+    best = _Option(best.design, np.concatenate([best.rises, simulated_rises(bench, best.design, [1], seed)]))
     names = [hypothesis.name for hypothesis in bench.hypotheses]
     expected_sigma = _by_pair(best.separations)
     worth_it = max(expected_sigma.values()) >= LEAST_SEPARATION

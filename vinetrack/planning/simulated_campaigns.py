@@ -176,7 +176,7 @@ class DesignProblem:
 
 
 def simulated_rises(
-    bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool
+    bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
 ) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
     values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
