@@ -233,7 +233,9 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class Window:
-    """A window of a trial tested for steadiness by one rule: whether it was accepted, and the reason."""
+    """A window of a trial tested for steadiness by one rule: whether it was accepted, and the reason. `doubtful`: one
+    chosen by hand that is used though it is not shown to be steady.
+    """
 
     rule: str
     accepted: bool
@@ -246,3 +248,4 @@ class Window:
     drift: float = math.nan
     drift_95: tuple[float, float] = field(default=(math.nan, math.nan))
     cv: float = math.nan
+    doubtful: bool = False

@@ -350,7 +350,7 @@ def gated_window(
         f"steady over {window.n_points} of {moving} moving points: speed changes by {_percent(window)},"
         f" within ±{100 * drift_limit:g} %"
     )
-    return _with(window, True, reason)
+    return replace(window, accepted=True, reason=reason)
 
 
 def user_window(
@@ -366,14 +366,16 @@ def user_window(
         )
     window = judge(time_s, position_m, kinematics, int(inside[0]), int(inside[-1]), "user")
     if not window.x_ss_m_s > 0:
-        return _with(window, True, f"chosen by hand; warning: the mean tail speed is {window.x_ss_m_s:.3g} m/s")
+        reason = f"chosen by hand; warning: the mean tail speed is {window.x_ss_m_s:.3g} m/s"
+        return replace(window, accepted=True, doubtful=True, reason=reason)
     steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= 0.03
     warnings = [] if steady else ["not shown to be steady"]
     first, last, why = _gate(kinematics, START_FRACTION, START_SIGMAS)
     if not why and inside[-1] > _before_the_end(track, position_m, first, last, length_m):
         warnings.append("runs into the end of growth")
     verdict = "; warning: ".join(["chosen by hand", *warnings])
-    return _with(window, True, f"{verdict}: speed changes by {_percent(window)} over {window.n_points} points")
+    reason = f"{verdict}: speed changes by {_percent(window)} over {window.n_points} points"
+    return replace(window, accepted=True, doubtful=bool(warnings), reason=reason)
 
 
 def _points(track: Track, kinematics: Kinematics) -> tuple[Floats, Floats]:
@@ -504,10 +506,6 @@ class _Search:
 def _percent(window: Window) -> str:
     low, high = window.drift_95
     return f"{100 * window.drift:.2g} % (95 %: {100 * low:.2g} to {100 * high:.2g} %)"
-
-
-def _with(window: Window, accepted: bool, reason: str) -> Window:
-    return replace(window, accepted=accepted, reason=reason)
 
 
 def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, min_points: int = 3) -> Window:

@@ -349,7 +349,7 @@ def _warnings(track: Track, release: Release, windows: Mapping[str, Window]) -> 
     warnings = list(track.notes)
     if release.moving_from_start or not math.isfinite(release.time_s):
         warnings.append(release.reason)
-    if "user" in windows and ("warning" in windows["user"].reason or not windows["user"].accepted):
+    if "user" in windows and (windows["user"].doubtful or not windows["user"].accepted):
         warnings.append(windows["user"].reason)
     return warnings
 
