@@ -207,7 +207,7 @@ def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions() -> None
 
 def test_a_sparkline_marks_the_steady_window() -> None:
     time_s = np.linspace(0, 1, 50)
-    svg = speed_sparkline(time_s, np.ones(50), (0.5, 1.0))
+    svg = speed_sparkline(pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": np.ones(50)}), (0.5, 1.0))
     steady = re.search(r'class="steady" points="([^"]+)"', svg)
     assert steady is not None
     x = [float(pair.split(",")[0]) for pair in steady[1].split()]
@@ -274,18 +274,17 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
 
 
 def test_upper_limits_are_in_the_displayed_unit() -> None:
-    table = upper_limit_table([Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))])
-    assert table is not None
+    table = upper_limit_table(
+        [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))], {}
+    )
     assert table.rows == [("leak", "k", "2.50 kPa")]
     unfitted = candidate("leak", 1.0, numbers=[], largest={"leak.k": 2500.0, "leak.j": 1.0})
     table = upper_limit_table([Candidate.from_json(unfitted)], {"leak.k": ("κ", "Pa")})
-    assert table is not None
     assert table.rows == [("leak", "κ", "2.50 kPa"), ("leak", "j", "1.00 SI")]
 
 
 def test_the_parameters_of_all_models_are_in_one_table() -> None:
     table = moved_table(moved())
-    assert table is not None
     rows = [list(row) for row in table.rows]
     assert rows == [["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"], ["γ", "–", "1.1700 ± 0.0040"]]
 
@@ -342,7 +341,7 @@ def test_the_page_says_what_the_trials_could_have_seen() -> None:
     assert 'id="power"' not in page(diagnosis=DiagnosisResult(read(diagnosis("adequate"))))
     wary = diagnosis_section(DiagnosisResult(replace(told, power=replace(power, wary="the model is far off"))))
     assert wary is not None
-    assert wary["power"]["table"] is None
+    assert not wary["power"]["table"]
 
 
 # The section on the model in use, from tables written by hand.

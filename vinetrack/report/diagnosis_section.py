@@ -76,8 +76,14 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "ladder": ladder_table(result.ladder),
         "where": [line for line in diagnosis.where if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
-        "rounds": [_round(i, entry) for i, entry in enumerate(diagnosis.rounds)],
-        "hidden": _upper_limits(diagnosis, result.units),
+        "rounds": [
+            {"table": ranking_table(entry), "blind": _not_testable(entry.ranking), "of": entry}
+            for entry in diagnosis.rounds
+        ],
+        # Upper limits are valid only if no effect is missing.
+        "hidden": upper_limit_table(
+            diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), result.units
+        ),
         "power": power_entry(diagnosis.power),
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
@@ -88,10 +94,8 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
     }
 
 
-def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
-    """Return the errors of every model of `ladder.csv`, mm; None if there is no ladder."""
-    if ladder is None or not len(ladder):
-        return None
+def ladder_table(ladder: pd.DataFrame | None) -> ReportTable:
+    """Return the errors of every model of `ladder.csv`, mm."""
     keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
     head = (
         "Model",
@@ -103,7 +107,7 @@ def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
     )
     rows = [
         (_step(str(row["added"] or ""), row.get("partial")), *(number(1e3 * float(row[key])) for key in keys))
-        for row in ladder.to_dict("records")
+        for row in ([] if ladder is None else ladder.to_dict("records"))
     ]
     note = (
         "Root mean square error of position. Left out: every condition is predicted by the model fitted to all others; "
@@ -118,7 +122,8 @@ def _step(added: str, partial: object = False) -> str:
     return f"+ {listed_names(added.split('+'))}{mark}" if added else "initial model"
 
 
-def _round(index: int, entry: Round) -> dict[str, Any]:
+def ranking_table(entry: Round) -> ReportTable:
+    """Return the candidates of a round that could be tested."""
     head = ("Candidate", "kind", "Δχ²", "σ", "size", "status", "")
     rows = [
         (
@@ -133,29 +138,11 @@ def _round(index: int, entry: Round) -> dict[str, Any]:
         for row in entry.ranking
         if row.status != NOT_TESTABLE
     ]
-    return {
-        "title": f"Round {index + 1}: {round_question(entry)}",
-        "verdict": entry.verdict,
-        "explanation": entry.explanation,
-        "table": ReportTable("", head, rows, frozenset({2, 3}), ABOUT_SIGMA) if rows else None,
-        "blind": _not_testable(entry.ranking),
-    }
+    return ReportTable("", head, rows, frozenset({2, 3}), ABOUT_SIGMA)
 
 
-def round_question(entry: Round) -> str:
-    """Return the question of a round."""
-    return f"which effect is missing from {listed_names(entry.model)}?"
-
-
-def _upper_limits(diagnosis: Diagnosis, units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
-    """Upper limits on undetected effects; they are valid only if no effect is missing."""
-    return upper_limit_table(diagnosis.rounds[-1].ranking, units) if diagnosis.final_verdict == ADEQUATE else None
-
-
-def upper_limit_table(
-    ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]] | None = None
-) -> ReportTable | None:
-    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None if there are none."""
+def upper_limit_table(ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]]) -> ReportTable:
+    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; `units` as in the result."""
     rows = []
     for row in ranking:
         of = {entry.key.split(".")[-1]: (entry.symbol, entry.unit) for entry in row.numbers}
@@ -163,11 +150,9 @@ def upper_limit_table(
             if not is_finite(largest):
                 continue
             short = name.split(".")[-1]
-            symbol, unit = of.get(short) or (units or {}).get(f"{row.effect}.{short}") or (short, "SI")
+            symbol, unit = of.get(short) or units.get(f"{row.effect}.{short}") or (short, "SI")
             shown, factor = display_unit(unit)
             rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
-    if not rows:
-        return None
     note = (
         "Larger sizes contradict these trials (95 %, one-sided; of the sign with the larger limit). Sizes that would "
         "have been detected are larger; they are given with the verdict."
@@ -181,11 +166,9 @@ def power_entry(power: Power | None) -> dict[str, Any] | None:
     """Return what the trials could have detected, for the template: sentences and a table of sizes; None if unknown."""
     if power is None:
         return None
-    table = None
-    if power.effects and not power.wary:
-        order = sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
-        head = ("Effect", "number", *POWER_COLUMNS[2:])
-        table = ReportTable("", head, power_rows(order), frozenset({2, 3, 4, 5}), ABOUT_POWER)
+    order = [] if power.wary else sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
+    head = ("Effect", "number", *POWER_COLUMNS[2:])
+    table = ReportTable("", head, power_rows(order), frozenset({2, 3, 4, 5}), ABOUT_POWER)
     return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "table": table}
 
 
@@ -231,11 +214,12 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         )
         for pair, sigma in (content.get("separation_sigma") or {}).items()
     ]
-    separation_table = ReportTable("", ("They separate", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2}))
     return {
         "text": str(content.get("text") or ""),
-        "trials": ReportTable("", head, rows, frozenset(range(len(head)))) if rows and head else None,
-        "separations": separation_table if separations else None,
+        "trials": ReportTable("", head, rows if head else (), frozenset(range(len(head)))),
+        "separations": ReportTable(
+            "", ("They separate", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2})
+        ),
         "calibration": str(content.get("calibration") or ""),
     }
 
@@ -259,36 +243,33 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         for law in content.get("laws") or []
     ]
     head = ("Simple law", "explains of the missing force", "size (N)")
-    table = ReportTable("Simple laws that resemble it", head, rows, frozenset({1, 2})) if rows else None
     learned = content.get("learned") or {}
     weights = [
         (" and ".join(name.split("+")), f"{100 * float(weight):.1f} %")
         for name, weight in (learned.get("weights") or {}).items()
     ]
-    weight_table = ReportTable(
-        "Variables of the learned force", ("Variables", "posterior weight"), weights, frozenset({1})
-    )
     return {
         "sentence": str(content.get("sentence") or content.get("text") or ""),
-        "laws": table,
+        "laws": ReportTable("Simple laws that resemble it", head, rows, frozenset({1, 2})),
         "learned": str(learned.get("sentence") or ""),
-        "weights": weight_table if weights else None,
+        "weights": ReportTable(
+            "Variables of the learned force", ("Variables", "posterior weight"), weights, frozenset({1})
+        ),
     }
 
 
-def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
-    """Return the change of the parameters as effects were added, one column per model; None without any."""
-    if moved is None or not len(moved):
-        return None
-    steps = list(dict.fromkeys(moved["added"].fillna("").astype(str)))
-    head = ["Parameter", *map(_step, steps)]
+def moved_table(moved: pd.DataFrame | None) -> ReportTable:
+    """Return the change of the parameters as effects were added, one column per model."""
+    entries = [] if moved is None else moved.fillna({"vine": "", "added": ""}).to_dict("records")
     cells: dict[tuple[str, str], dict[str, str]] = {}
     titles: dict[tuple[str, str], str] = {}
-    for entry in moved.fillna({"vine": "", "added": ""}).to_dict("records"):
+    for entry in entries:
         key = (str(entry["parameter"]), str(entry["vine"]))
         fitted = Number.from_json({str(k): v for k, v in entry.items()})
         titles[key] = fitted.title
         cells.setdefault(key, {})[str(entry["added"])] = quantity_text(fitted)
+    steps = list(dict.fromkeys(str(entry["added"]) for entry in entries))
+    head = ["Parameter", *map(_step, steps)]
     rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
     return ReportTable("Parameters of every model", head, rows, frozenset(range(1, len(head))))
 

@@ -8,8 +8,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
 from urllib.parse import quote
+
+from markupsafe import Markup
 
 from vinetrack.figures.style import TOKENS
 
@@ -23,18 +24,20 @@ _COLOURS = {colour: "currentColor" if token == "--ink" else f"var({token})" for 
 _COLOUR = re.compile("|".join(_COLOURS))
 
 
-def inline_picture(picture: str | bytes, prefix: str, description: str) -> str:
+def inline_picture(picture: str | bytes, prefix: str, description: str) -> Markup:
     """Return an SVG file or a PNG file as an element of the page, as wide as `--wide` where there is room: then its
-    text is as large as that of the page.
+    text is as large as that of the page. Blank for an empty file.
     """
+    if not picture:
+        return Markup()
     if isinstance(picture, str):
-        return _inline_svg(picture, prefix, description)
+        return Markup(_inline_svg(picture, prefix, description))
     from PIL import Image
 
     image = Image.open(io.BytesIO(picture))
     wide = 96 * image.width / image.info.get("dpi", (150, 150))[0]
     source = _as_webp(picture, _WEBP_QUALITY_WITH_TEXT)
-    return f'<img alt="{escape(description, quote=True)}" style="--wide:{wide:.0f}px" src="{source}">'
+    return Markup(f'<img alt="{escape(description, quote=True)}" style="--wide:{wide:.0f}px" src="{source}">')
 
 
 def _inline_svg(svg: str, prefix: str, description: str) -> str:
@@ -66,7 +69,12 @@ def _as_webp(png: bytes, quality: int) -> str:
     is_opaque = picture.mode != "RGBA" or picture.getchannel("A").getextrema() == (255, 255)
     file = io.BytesIO()
     picture.convert("RGB" if is_opaque else "RGBA").save(file, "WEBP", quality=quality, method=4)
-    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+    return base64_uri("image/webp", file.getvalue())
+
+
+def base64_uri(kind: str, content: bytes) -> str:
+    """Return a file as a data URI."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 _UNESCAPED = ",;:!*'()/ -._~+@=$?"  # Characters that need no escaping in a quoted URL
@@ -83,16 +91,29 @@ class ReportFigure:
     data_name: str = ""
     data: str = ""
 
+    @property
+    def element(self) -> Markup:
+        """The picture as an element of the page."""
+        return inline_picture(self.picture, self.key, self.title)
+
+    @property
+    def data_uri(self) -> str:
+        """The data as a file to download."""
+        return data_uri(self.data_name, self.data)
+
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table of the report, as text in rows; `numbers` are the right-aligned columns."""
+    """A table of the report, as text in rows, false if it has none; `numbers` are the right-aligned columns."""
 
     title: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     numbers: frozenset[int] = frozenset()
     note: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.rows)
 
 
 @dataclass(frozen=True)
@@ -106,35 +127,9 @@ class ReportSection:
     figures: Sequence[ReportFigure] = ()
 
 
-def figure_entry(figure: ReportFigure) -> dict[str, Any]:
-    """Return a figure for the template."""
-    from markupsafe import Markup
-
-    return {
-        "key": figure.key,
-        "title": figure.title,
-        "caption": figure.caption,
-        "picture": Markup(inline_picture(figure.picture, figure.key, figure.title)),
-        "data_name": figure.data_name,
-        "data_uri": data_uri(figure.data_name, figure.data) if figure.data else "",
-    }
-
-
-def section_entry(section: ReportSection) -> dict[str, Any]:
-    """Return a section for the template."""
-    return {
-        "key": section.key,
-        "title": section.title,
-        "paragraphs": list(section.paragraphs),
-        "tables": list(section.tables),
-        "figures": [figure_entry(figure) for figure in section.figures],
-    }
-
-
 def data_uri(name: str, text: str) -> str:
     """Return a file as a data URI, in the shorter of two encodings."""
     kind = "application/json" if name.endswith(".json") else "text/csv"
-    escaped = quote(text, safe=_UNESCAPED)
-    encoded = "base64," + base64.b64encode(text.encode("utf-8")).decode("ascii")
-    head = f"data:{kind};charset=utf-8"
-    return f"{head};{encoded}" if len(encoded) <= len(escaped) else f"{head},{escaped}"
+    escaped = f"data:{kind};charset=utf-8,{quote(text, safe=_UNESCAPED)}"
+    encoded = base64_uri(f"{kind};charset=utf-8", text.encode("utf-8"))
+    return min(encoded, escaped, key=len)
