@@ -169,10 +169,12 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         raise ResultsError(f"{folder} has no trial to explore: {why}")
     fitted = read_fit(results)
     refused = fitted.refused
-    compared = {} if refused else _compared(results)
+    comparison = None if refused else read_result(results.comparison)
+    conditions = [] if comparison is None else list(comparison["condition"].astype(str))
+    floors = [] if comparison is None else map(float, comparison["replicate_floor_m"])
+    compared = {name: read_result(results.trajectories(name)) for name in conditions}
     aligned = _align_trials(data, compared)
     effects = {**catalogue(), **user_effects}
-    floors = {} if refused else _floors(results)
     return Campaign(
         name=folder.name,
         folder=folder,
@@ -182,7 +184,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         trials=tuple(aligned),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
         bands=_bands(compared),
-        floors_m=floors,
+        floors_m=dict(zip(conditions, floors, strict=True)),
         numbers={entry.name: entry.value for entry in fitted.numbers},
         log_likelihood=fitted.log_likelihood,
         refused=refused,
@@ -190,17 +192,6 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         in_use=fitted.names if fitted.names and set(fitted.names) <= set(effects) else tuple(experiment.settings.model),
         unusable=_unusable(effects.values(), [trial_data.trial for trial_data in data]),
     )
-
-
-def _compared(results: Results) -> dict[str, pd.DataFrame]:
-    """`comparison/<condition>.csv` by condition."""
-    conditions = read_result(results.comparison)["condition"]
-    return {str(name): read_result(results.trajectories(str(name))) for name in conditions}
-
-
-def _floors(results: Results) -> dict[str, float]:
-    table = read_result(results.comparison)
-    return dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
 
 
 def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[ExplorerTrial]:
@@ -305,11 +296,12 @@ class Prediction:
 
 def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[str, float] | None = None) -> Prediction:
     """Predict every trial by a choice; the scatter of replicates hardly depends on it, and is taken as given."""
-    sized = sized_model(campaign, choice)
-    data = [
-        replace(trial.data, trial=with_yield_pressure(trial.data.trial, sized.yield_Pa)) for trial in campaign.trials
-    ]
-    predicted = predict_from_rest(sized.model, data, campaign.host)
+    yields_Pa = fitted_yield_pressures(campaign, choice.numbers)
+    data = [trial.data for trial in campaign.trials]
+    for i, aligned in enumerate(campaign.trials):
+        if aligned.name in yields_Pa:
+            data[i] = replace(data[i], trial=replace(data[i].trial, yield_pressure_Pa=yields_Pa[aligned.name]))
+    predicted = predict_from_rest(sized_model(campaign, choice), data, campaign.host)
     squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in predicted]
     errors_m = {
         condition: math.sqrt(float(np.mean([squares[i] for i in campaign.indices_of_condition(condition)])))
@@ -328,19 +320,6 @@ def predict_fit(campaign: Campaign, fitted: Fit) -> Prediction:
         for column in ("rms_position_m", "replicate_floor_m")
     )
     return Prediction(tuple(by_name[trial.name] for trial in campaign.trials), errors_m, floors_m)
-
-
-@dataclass(frozen=True)
-class SizedModel:
-    """A model with its parameter values, and yield pressures, Pa, by name of trial."""
-
-    model: Model
-    yield_Pa: Mapping[str, float]
-
-
-def with_yield_pressure(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
-    """Return the trial with the fitted yield pressure of its vine, if there is one."""
-    return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
 
 
 def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
@@ -412,7 +391,11 @@ class ModelChoice:
 
     def with_size(self, name: str, value: float) -> ModelChoice:
         """Return the choice with another value of one parameter."""
-        return replace(self, numbers={**self.numbers, name: value})
+        return self.with_sizes({name: value})
+
+    def with_sizes(self, numbers: Mapping[str, float]) -> ModelChoice:
+        """Return the same effects with these values of parameters."""
+        return replace(self, numbers={**self.numbers, **numbers})
 
 
 def choice_in_use(campaign: Campaign) -> ModelChoice:
@@ -453,7 +436,7 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
     return max(low, parameter.bounds[0]), min(high, parameter.bounds[1]) if value < parameter.bounds[1] else value
 
 
-def sized_model(campaign: Campaign, choice: ModelChoice) -> SizedModel:
+def sized_model(campaign: Campaign, choice: ModelChoice) -> Model:
     """Return the chosen model with its sizes, ready to be simulated."""
     effects = tuple(campaign.effects[name] for name in choice.effects)
     values: dict[str, Value] = {}
@@ -466,12 +449,7 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> SizedModel:
                 values[size.key] = {**by_vine, size.vine: value}
             else:
                 values[size.key] = value
-    return SizedModel(Model(effects, values), fitted_yield_pressures(campaign, choice.numbers))
-
-
-def is_removable(effect: str) -> bool:
-    """Return whether an effect may be removed: the base effects may not, since all others are added to them."""
-    return effect not in BASE_EFFECTS
+    return Model(effects, values)
 
 
 # ------------------------------------------------------------------------------
@@ -510,7 +488,7 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
     the first start reaches it, no others are tried.
     """
     started = time.perf_counter()
-    model = sized_model(campaign, choice).model
+    model = sized_model(campaign, choice)
     # A falling body has no other parameter.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     bare = replace(model, values={})
@@ -527,10 +505,10 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
     than without the new effects, or has not converged, it is refitted from their defaults.
     """
     started = time.perf_counter()
-    model = replace(sized_model(campaign, choice).model, values={})
+    sized = sized_model(campaign, choice)
+    model = replace(sized, values={})
     new = [effect for effect in model if effect.name not in before.model]
-    values = sized_model(campaign, choice).model.values
-    chosen = {key: value for effect in new for key, value in values.items() if key.startswith(f"{effect.name}.")}
+    chosen = {key: value for effect in new for key, value in sized.values.items() if key.startswith(f"{effect.name}.")}
     result = refit(before, model, start=chosen, watch=watch)
     is_larger = set(before.model.names) <= set(model.names)
     is_worse = is_larger and result.log_likelihood < before.log_likelihood - CLEARLY_WORSE
@@ -542,13 +520,8 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
 
 
 def _evaluated(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: float) -> Fitted:
-    fitted_choice = with_numbers(choice, {number.name: number.value for number in result.numbers})
+    fitted_choice = choice.with_sizes({number.name: number.value for number in result.numbers})
     return Fitted(fitted_choice, result, predict_fit(campaign, result), seconds)
-
-
-def with_numbers(choice: ModelChoice, numbers: Mapping[str, float]) -> ModelChoice:
-    """Return the same effects with these sizes."""
-    return replace(choice, numbers={**choice.numbers, **numbers})
 
 
 def likelihood_change_text(before: Fit, after: Fit) -> str:

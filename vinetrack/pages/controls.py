@@ -24,7 +24,8 @@ from bokeh.models import (
 
 from vinetrack.core.problems import ExperimentError, UserError, format_problems
 from vinetrack.core.tables import TableError
-from vinetrack.effects import Effect, load_effect
+from vinetrack.diagnosis.result import UNEXPLAINED
+from vinetrack.effects import BASE_EFFECTS, Effect, load_effect
 from vinetrack.experiment.folder import save_model
 from vinetrack.pages.campaign import (
     BackgroundFit,
@@ -36,7 +37,6 @@ from vinetrack.pages.campaign import (
     SizeControl,
     choice_in_use,
     commands,
-    is_removable,
     model_text,
     read_campaign,
     sizes_of,
@@ -81,7 +81,7 @@ class EffectRow:
         self.tick = Checkbox(
             label=effect.name.replace("_", " "),
             active=effect.name in choice,
-            disabled=bool(unusable) or not is_removable(effect.name),
+            disabled=bool(unusable) or effect.name in BASE_EFFECTS,  # all others are added to these
             name=f"tick_{effect.name}",
             stylesheets=[stylesheet(TICK)],
             margin=(6, 0, 0, 0),
@@ -100,12 +100,13 @@ class EffectRow:
 def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
     unit, factor = size.shown
     low, high = factor * size.low, factor * size.high
+    what = size.vine or size.parameter.meaning
     return Slider(
         start=low,
         end=high,
         value=factor * choice.numbers.get(size.name, size.parameter.default),
         step=_step(low, high),
-        title=_title(size),
+        title=f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol,
         format=PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
         sizing_mode="stretch_width",
         disabled=disabled,
@@ -113,11 +114,6 @@ def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
         stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; }")],
         margin=(2, 0, 6, 0),
     )
-
-
-def _title(size: SizeControl) -> str:
-    what = size.vine or size.parameter.meaning
-    return f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol
 
 
 def _step(low: float, high: float) -> float:
@@ -324,7 +320,6 @@ INTRODUCTION = (
     "No effect of the catalogue explains these trials. The missing force can be learned from them and written"
     " as an effect file of your own, beside the experiment. It takes minutes."
 )
-RELOAD = "location.reload()"
 TYPICAL_DURATION_S = 150.0  # Time in which the progress bar of a search is two thirds full (chosen)
 
 
@@ -356,15 +351,16 @@ class ProposalPanel:
         self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)
         self.text = html_div(name="proposal")
         self._reload = ColumnDataSource({"times": [0]}, name="reload")
-        self._reload.js_on_change("data", CustomJS(code=RELOAD))
+        self._reload.js_on_change("data", CustomJS(code="location.reload()"))
         buttons = side_by_side(self.button, self.open)
         self.root = stacked(self.text, buttons, name="propose_panel", tags=[self._reload])
         self.show()
 
     def show(self) -> None:
         """Update after a change of the diagnosis, and as time passes."""
-        summary = self._page.summary
-        self.root.visible = self._job is not None or self._outcome is not None or bool(summary and summary.unexplained)
+        diagnosis = self._page.diagnosis
+        unexplained = diagnosis is not None and UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
+        self.root.visible = self._job is not None or self._outcome is not None or unexplained
         if self._job is not None:
             self._say(progress_bar(*self._progress.state(time.monotonic(), self._task)))
         elif self._outcome is None and not self.text.text:

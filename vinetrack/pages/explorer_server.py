@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import socket
 import sys
-import threading
-import webbrowser
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
@@ -17,35 +16,20 @@ from bokeh.document import Document
 from bokeh.server.server import Server
 from tornado.web import ErrorHandler
 
-from vinetrack.pages.campaign import BackgroundFit, read_campaign
+from vinetrack.pages.campaign import BackgroundFit, Campaign, read_campaign
 from vinetrack.pages.local_page import (
     LOOPBACK,
     allowed_hosts,
     secret_path,
     serve_on_free_port,
-    stop_on_signals,
+    serve_until_stopped,
 )
-
-if TYPE_CHECKING:
-    from vinetrack.pages.campaign import Campaign
-
+from vinetrack.pages.page import Page
 
 SILENCED_LOGGERS = ("bokeh", "tornado")
 THREAD_SWITCH_S = 1e-3  # Thread switch interval
 
 KEEP_ALIVE_MS = 20_000  # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
-
-
-def application(background: BackgroundFit) -> Application:
-    """Return the application, which creates a page for each visitor."""
-    from vinetrack.pages.page import Page
-
-    shown = [background]
-
-    def open_page(document: Document) -> None:
-        Page(shown[-1], document, shown.append)
-
-    return Application(FunctionHandler(open_page, trap_exceptions=False))
 
 
 def start_server(background: BackgroundFit, port: int | None = None) -> Server:
@@ -60,8 +44,13 @@ def _bind(background: BackgroundFit, port: int) -> Server:
         probe.bind((LOOPBACK, port))
         free_port = int(probe.getsockname()[1])
     hosts = allowed_hosts(free_port)
+    shown = [background]
+
+    def open_page(document: Document) -> None:
+        Page(shown[-1], document, shown.append)
+
     server = Server(
-        {"/": application(background)},
+        {"/": Application(FunctionHandler(open_page, trap_exceptions=False))},
         prefix=secret_path(),
         address=LOOPBACK,
         port=free_port,
@@ -96,27 +85,6 @@ def address(server: Server) -> str:
     return f"http://{LOOPBACK}:{server.port}{server.prefix}/"
 
 
-def serve(
-    background: BackgroundFit, say: Callable[[str], None], port: int | None = None, *, browser: bool = True
-) -> None:
-    """Serve until Ctrl-C (or SIGTERM)."""
-    for name in SILENCED_LOGGERS:
-        logging.getLogger(name).setLevel(logging.ERROR)
-    # A background fit would otherwise delay the page.
-    sys.setswitchinterval(THREAD_SWITCH_S)
-    server = start_server(background, port)
-    where = address(server)
-    background.begin()
-    say(f"Explorer: {where}")
-    say("For this machine only. Ctrl-C ends it.")
-    if browser:
-        threading.Thread(target=webbrowser.open, args=(where,), daemon=True).start()
-    with stop_on_signals(lambda: server.io_loop.add_callback_from_signal(server.io_loop.stop)):
-        server.io_loop.start()
-    server.stop()
-    say("Explorer ended.")
-
-
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """Open a results folder and its experiment."""
     from vinetrack.pipeline.effects_stage import effects_of
@@ -129,9 +97,18 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
 def explore(
     folder: Path, experiment: Path | None, say: Callable[[str], None], port: int | None, *, browser: bool
 ) -> None:
-    """Serve the page of a results folder."""
+    """Serve the page of a results folder until Ctrl-C (or SIGTERM)."""
     from vinetrack.core.terminal import waiting
 
     with waiting(f"opening {folder}"):
-        campaign = open_campaign(folder, experiment)
-    serve(BackgroundFit(campaign), say, port, browser=browser)
+        background = BackgroundFit(open_campaign(folder, experiment))
+    for name in SILENCED_LOGGERS:
+        logging.getLogger(name).setLevel(logging.ERROR)
+    # A background fit would otherwise delay the page.
+    sys.setswitchinterval(THREAD_SWITCH_S)
+    server = start_server(background, port)
+    background.begin()
+    loop = server.io_loop
+    end = partial(loop.add_callback_from_signal, loop.stop)
+    serve_until_stopped("Explorer", address(server), loop.start, end, say, browser=browser)
+    server.stop()

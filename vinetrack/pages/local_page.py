@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import secrets
 import signal
-from collections.abc import Callable, Iterator
+import threading
+import webbrowser
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinetrack.core.problems import UserError
@@ -48,19 +50,29 @@ def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Serv
     raise PageError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
 
 
-@contextlib.contextmanager
-def stop_on_signals(end: Callable[[], object]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end a server between two iterations of its loop."""
-
-    def handle(_number: int, _frame: Any) -> None:
-        end()
-
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+def serve_until_stopped(
+    name: str,
+    address: str,
+    run: Callable[[], object],
+    end: Callable[[], object],
+    say: Callable[[str], None],
+    *,
+    browser: bool,
+) -> None:
+    """Run a server whose page is at `address` until Ctrl-C or SIGTERM, which call `end` between two iterations of its
+    loop.
+    """
+    say(f"{name}: {address}")
+    say("For this machine only. Ctrl-C ends it.")
+    if browser:
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    previous = {number: signal.signal(number, lambda *_: end()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        run()
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+    say(f"{name} ended.")
 
 
 def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None = None) -> bytes:

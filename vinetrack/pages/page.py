@@ -8,8 +8,10 @@ from typing import Any
 
 from bokeh.document import Document
 from bokeh.models import CustomJS
+from bokeh.themes import Theme
+from markupsafe import Markup
 
-from vinetrack.figures.style import follows_screen
+from vinetrack.figures.style import TOKENS, follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.optimiser import Step
 from vinetrack.pages.campaign import (
@@ -21,37 +23,32 @@ from vinetrack.pages.campaign import (
     Prediction,
     fit_choice,
     predict_choice,
-    with_numbers,
 )
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
 from vinetrack.pages.film_panel import FilmPanel
 from vinetrack.pages.plots import (
+    TEMPLATES,
+    THEME,
     Plots,
     button,
     escaped,
     html_div,
-    page_style,
-    page_template,
     progress_bar,
-    screen_script,
     side_by_side,
     stacked,
-    theme,
     vine_colours,
 )
 from vinetrack.pages.text_panels import (
-    DIAGNOSIS,
-    DiagnosisSummary,
     HeldModel,
-    LadderEntry,
     comparison_table,
+    diagnosis_of,
     fitted_numbers_html,
     headline,
-    ladder_entry,
     next_panel,
-    read_summary,
+    suspects,
     tied_panel,
 )
+from vinetrack.results.folder_layout import Results
 
 # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
 REDRAW_DELAY_MS = 4
@@ -78,11 +75,9 @@ class Page:
         self.background, self.campaign, self.document = background, background.campaign, document
         self.choice: ModelChoice = background.opening_choice
         self.shown: Prediction | None = None
-        self.last: Fitted | None = None
-        self.fitted_models: list[LadderEntry] = []
+        self.fits: list[Fitted] = []
         self.held: HeldModel | None = None
-        self.summary: DiagnosisSummary | None = read_summary(self.campaign.folder)
-        self._summary_time = self._diagnosed_at()
+        self.diagnosis, self._diagnosed_at = diagnosis_of(self.campaign.folder), self._diagnosis_time()
         self._sizes_changed = False
         self._redraw_pending = self._text_pending = False
         self._job: FitJob[Step, Fitted] | None = None
@@ -104,8 +99,7 @@ class Page:
         self.numbers, self.tied, self.next = html_div(name="numbers"), html_div(name="tied"), html_div(name="next")
         self.selector = TrialSelector(campaign, self._selection_changed)
         self.plots = Plots(campaign, self.selector.toggle)
-        suspects = self.summary.best if self.summary is not None else ()
-        self.panel = EffectPanel(campaign, self.choice, suspects, self._ticked, self._size_moved)
+        self.panel = EffectPanel(campaign, self.choice, suspects(self.diagnosis), self._ticked, self._size_moved)
         self.film = FilmPanel(campaign, self.document, self._instant)
         self.save_panel = SavePanel(self)
         self.proposal = ProposalPanel(self, reopen)
@@ -126,9 +120,11 @@ class Page:
         figures = [self.plots.motion, self.plots.residual, self.plots.errors, self.film.figure]
         self.document.js_on_event("document_ready", CustomJS(args={"plots": figures}, code=LET_SCROLL))
         # A recording keeps its greys, and the edges their colours over them.
-        self.document.js_on_event("document_ready", screen_script(figures[:-1]))
+        code = (TEMPLATES / "screen.js").read_text(encoding="utf-8")
+        screen = CustomJS(args={"plots": figures[:-1], "tokens": TOKENS}, code=code)
+        self.document.js_on_event("document_ready", screen)
         self.document.title = f"{campaign.name} – vinetrack explorer"
-        self.document.theme = theme()
+        self.document.theme = Theme(json=THEME)
         self._set_template()
 
     def _set_template(self) -> None:
@@ -136,10 +132,11 @@ class Page:
 
         trials, conditions = len(self.campaign.trials), len(self.campaign.conditions)
         out = len(self.campaign.left_out)
-        self.document.template = Environment(autoescape=True).from_string(page_template())
+        page, style = ((TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.html", "page.css"))
+        self.document.template = Environment(autoescape=True).from_string(page)
         self.document.template_variables.update(
             name=self.campaign.name,
-            style=_Markup(page_style()),
+            style=Markup(page_frame() + style),
             vines=[(vine, follows_screen(colour)) for vine, colour in vine_colours(self.campaign)],
             tally=f"{trials} trials, {conditions} conditions" + (f", {out} left out" if out else ""),
         )
@@ -201,6 +198,11 @@ class Page:
             self._update_text()
 
     @property
+    def last(self) -> Fitted | None:
+        """The last fit."""
+        return self.fits[-1] if self.fits else None
+
+    @property
     def _reference(self) -> HeldModel:
         """The model for comparison: the one that is held, else the model in use."""
         if self.held is not None:
@@ -238,8 +240,7 @@ class Page:
             self._redraw_soon()
 
     def _show_first_fit(self, fitted: Fitted) -> None:
-        self.last = fitted
-        self.fitted_models = [ladder_entry(self.campaign, fitted, None)]
+        self.fits = [fitted]
         if self.choice is self.background.initial:
             self.choice = fitted.choice
             self.panel.show(self.choice, fitted)
@@ -273,15 +274,14 @@ class Page:
             return
         self._progress.update(step)
         self._update_status()
-        self._predict(with_numbers(self.choice, step.values))
+        self._predict(self.choice.with_sizes(step.values))
         self._update_text_soon()
 
     def _fit_done(self, fitted: Fitted) -> None:
         if self._job is None:
             return
         self._job = None
-        before, self.last = self.last, fitted
-        self.fitted_models.append(ladder_entry(self.campaign, fitted, before))
+        self.fits.append(fitted)
         self.choice, self._sizes_changed = fitted.choice, False
         self.shown = fitted.prediction
         self.panel.show(self.choice, fitted)
@@ -360,10 +360,10 @@ class Page:
         )
         _set(
             self.numbers,
-            comparison + fitted_numbers_html(self.campaign, self.last, self.fitted_models, self._sizes_changed),
+            comparison + fitted_numbers_html(self.campaign, self.fits, self._sizes_changed),
         )
-        _set(self.tied, tied_panel(self.campaign, self.summary, self.last))
-        _set(self.next, next_panel(self.campaign, self.summary))
+        _set(self.tied, tied_panel(self.campaign, self.diagnosis, self.last))
+        _set(self.next, next_panel(self.campaign, self.diagnosis))
         _set(self.command_text, self.save_panel.commands())
 
     def _update_status(self) -> None:
@@ -395,14 +395,13 @@ class Page:
         shown = {self.campaign.trials[i].name for i in self.selector.shown}
         self.plots.set_instant(since_s if trial in shown else None)
 
-    def _diagnosed_at(self) -> float:
-        path = self.campaign.folder / DIAGNOSIS
+    def _diagnosis_time(self) -> float:
+        path = Results(self.campaign.folder).diagnosis
         return path.stat().st_mtime if path.exists() else 0.0
 
     def _check_for_diagnosis(self) -> None:
-        if self._diagnosed_at() != self._summary_time:
-            self._summary_time = self._diagnosed_at()
-            self.summary = read_summary(self.campaign.folder)
+        if self._diagnosis_time() != self._diagnosed_at:
+            self.diagnosis, self._diagnosed_at = diagnosis_of(self.campaign.folder), self._diagnosis_time()
             self._update_text()
 
     def is_fitted(self) -> bool:
@@ -422,9 +421,3 @@ def _set(piece: Any, text: str) -> None:
     """Change a piece of HTML only if it differs, because whatever is sent is drawn again."""
     if piece.text != text:
         piece.text = text
-
-
-def _Markup(text: str) -> Any:
-    from markupsafe import Markup
-
-    return Markup(text)

@@ -15,7 +15,6 @@ from bokeh.models import (
     CategoricalColorMapper,
     Column,
     ColumnDataSource,
-    CustomJS,
     CustomJSTickFormatter,
     Div,
     HoverTool,
@@ -27,10 +26,9 @@ from bokeh.models import (
     UIElement,
 )
 from bokeh.plotting import figure
-from bokeh.themes import Theme
 
 from vinetrack.core.records import Floats
-from vinetrack.figures.style import GRID, INK, MUTED, TOKENS, VINE_COLOURS, page_frame, vine_styles
+from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Prediction, condition_labels
 
 # ------------------------------------------------------------------------------
@@ -61,27 +59,6 @@ THEME: dict[str, Any] = {
         "Grid": {"grid_line_color": GRID, "grid_line_width": 0.8},
     }
 }
-
-
-def theme() -> Theme:
-    """Return the style of plots and widgets."""
-    return Theme(json=THEME)
-
-
-def page_template() -> str:
-    """Return the template of the page, for jinja2."""
-    return (TEMPLATES / "page.html").read_text(encoding="utf-8")
-
-
-def page_style() -> str:
-    """Return the CSS of the page around the widgets."""
-    return page_frame() + (TEMPLATES / "page.css").read_text(encoding="utf-8")
-
-
-def screen_script(figures: Sequence[figure]) -> CustomJS:
-    """Return a script that adapts figures to a light or dark colour scheme."""
-    code = (TEMPLATES / "screen.js").read_text(encoding="utf-8")
-    return CustomJS(args={"plots": list(figures), "tokens": TOKENS}, code=code)
 
 
 def vine_colour() -> dict[str, Any]:

@@ -7,7 +7,6 @@ import json
 import logging
 import math
 import threading
-import webbrowser
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,6 +21,7 @@ from vinetrack.core.units import UNITS, split_unit
 from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import SETTINGS, check_experiment, corrections_text
 from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
 from vinetrack.pages.clip_views import ClipStore, track_row, warm_up
 from vinetrack.pages.draft_files import (
@@ -47,7 +47,7 @@ from vinetrack.pages.local_page import (
     jpeg,
     secret_path,
     serve_on_free_port,
-    stop_on_signals,
+    serve_until_stopped,
 )
 from vinetrack.video.frames import RecordingError
 
@@ -79,14 +79,22 @@ def page_state(folder: Path) -> dict[str, Any]:
         "known": {name: _column_json(name) for name in COLUMNS if name not in ("trial", "video")},
         "units": {key: unit.text for key, unit in UNITS.items()},
         "offered": list(OFFERED_COLUMNS),
-        "sheet": _sheet_json(draft.sheet),
+        "sheet": {
+            "columns": list(draft.sheet.columns),
+            "rows": [dict(row) for row in draft.sheet.rows],
+            "delimiter": draft.sheet.delimiter,
+            "decimal": draft.sheet.decimal,
+        },
         "kept": list(present.columns) if present.rows else ["trial", "video"],
         "unsaved": not (folder / SETTINGS).exists() or not present.rows or not same_cells(present, draft.sheet),
         "shared": shared,
         "calibration": content.get("calibration"),
         "axis": content.get("axis"),
         "corrections": {
-            trial: [vars(correction) | _place(correction) for correction in given]
+            trial: [
+                vars(correction) | {"edge_px": correction.edge_px if math.isfinite(correction.edge_px) else None}
+                for correction in given
+            ]
             for trial, given in draft.corrections.items()
         },
         "recordings": list_recordings(folder),
@@ -107,16 +115,6 @@ def _column_json(name: str) -> dict[str, Any]:
         "default": column.default,
         "shared": name in SHARED,
     }
-
-
-def _sheet_json(sheet: SheetDraft) -> dict[str, Any]:
-    rows = [dict(row) for row in sheet.rows]
-    return {"columns": list(sheet.columns), "rows": rows, "delimiter": sheet.delimiter, "decimal": sheet.decimal}
-
-
-def _place(correction: Correction) -> dict[str, Any]:
-    """New position of a moved point for JSON, with None for NaN."""
-    return {"edge_px": correction.edge_px if math.isfinite(correction.edge_px) else None}
 
 
 def _correction(point: Mapping[str, Any]) -> Correction:
@@ -177,11 +175,6 @@ def _scale_missing(draft: Draft) -> list[Problem]:
         return []
     remedy = "click two marks on a ruler, or choose a picture of a printed board"
     return [Problem(message="is missing: no recording has a scale", file=SETTINGS, column="calibration", remedy=remedy)]
-
-
-def problems_json(error: ExperimentError) -> list[dict[str, Any]]:
-    """Return the problems of a draft that cannot be read at all."""
-    return [_problem_json(problem, None) for problem in error.problems]
 
 
 def _problem_json(problem: Problem, draft: Draft | None) -> dict[str, Any]:
@@ -296,11 +289,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _check(self, content: dict[str, Any]) -> dict[str, Any]:
         draft = draft_from_json(self.server.folder, content)
-        checked = draft_problems(self.server.folder, draft, thorough=bool(content.get("thorough")))
-        texts = {"sheet_text": draft.sheet.text(), "settings_text": draft.settings}
         return {
-            **checked,
-            **texts,
+            **draft_problems(self.server.folder, draft, thorough=bool(content.get("thorough"))),
+            "sheet_text": draft.sheet.text(),
+            "settings_text": draft.settings,
             "corrections_text": corrections_text(draft.corrections) if draft.corrections else "",
         }
 
@@ -336,7 +328,10 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             content = answer()
         except ExperimentError as error:
-            self._send_json({"problems": problems_json(error), "words": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY)
+            self._send_json(
+                {"problems": [_problem_json(problem, None) for problem in error.problems], "words": str(error)},
+                HTTPStatus.UNPROCESSABLE_ENTITY,
+            )
         except (UserError, RecordingError) as error:
             self._send_json({"words": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY)
         except (KeyError, ValueError, TypeError, OSError) as error:
@@ -392,15 +387,14 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
     page_state(folder)
     server = start_server(folder, port)
     threading.Thread(target=warm_up, daemon=True, name=f"{THREAD_PREFIX}warm-up").start()
-    say(f"Set-up: {server.address}")
-    say("For this machine only. Ctrl-C ends it.")
-    if browser:
-        threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
     # A shutdown from the serving thread would wait for itself.
-    with stop_on_signals(lambda: threading.Thread(target=server.shutdown, daemon=True).start()):
-        server.serve_forever(poll_interval=0.2)
-    server.server_close()
-    say("Set-up ended.")
+    end = threading.Thread(target=server.shutdown, daemon=True).start
+    try:
+        serve_until_stopped(
+            "Set-up", server.address, lambda: server.serve_forever(poll_interval=0.2), end, say, browser=browser
+        )
+    finally:
+        server.server_close()
 
 
 # ------------------------------------------------------------------------------
@@ -418,7 +412,8 @@ def write_templates(folder: Path, say: Callable[[str], None]) -> None:
     if not written:
         say(f"{SHEET} and {SETTINGS} of {folder} already contain every recording.")
     say(f"{len(rows)} trials; from the names of recordings: {', '.join(filled) if filled else 'nothing'}.")
-    blanks = sorted({problem.column for problem in _missing(folder) if problem.column}, key=_setup_command_place)
+    missing = {problem.column for problem in _missing(folder) if problem.column}
+    blanks = [*(name for name in COLUMNS if name in missing), *sorted(missing - COLUMNS.keys())]
     if blanks:
         say(f"To fill in: {', '.join(blanks)}. A value that all trials share goes into {SETTINGS}.")
     say(f"Then: vinetrack check {folder}")
@@ -428,17 +423,7 @@ def _missing(folder: Path) -> list[Problem]:
     """What is still missing in the files."""
     problems = [problem for problem in check_experiment(folder) if problem.severity == "error"]
     missing = [problem for problem in problems if problem.code in ("missing", "blank")]
-    try:
-        from vinetrack.experiment.settings import read_experiment_settings
-
+    with contextlib.suppress(ExperimentError):
         if read_experiment_settings(folder / SETTINGS).calibration is None:
             missing.append(Problem(message="is missing", code="missing", file=SETTINGS, column="calibration"))
-    except ExperimentError:
-        pass
     return missing
-
-
-def _setup_command_place(column: str) -> int:
-    from vinetrack.experiment.schema import COLUMNS
-
-    return list(COLUMNS).index(column) if column in COLUMNS else len(COLUMNS)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
-from vinetrack.diagnosis.result import UNEXPLAINED
+from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
@@ -33,15 +33,6 @@ FLOOR_MARGIN = 1.15  # Chosen: an error up to 1.15 times the replicate scatter c
 MAX_PAIRS = 6  # Pairs of correlated parameters shown; chosen: the card has room for six lines
 
 MAX_COMPARED_EFFECTS = 8  # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
-
-
-@dataclass(frozen=True)
-class LadderEntry:
-    """One model fitted on this page: its effects, its error over all conditions, and the change of −2 ln L as text."""
-
-    effects: tuple[str, ...]
-    rms_m: float
-    gained: str
 
 
 @dataclass(frozen=True)
@@ -113,12 +104,11 @@ def _mm(value_m: float) -> str:
     return f"{1e3 * value_m:.3g} mm"
 
 
-def fitted_numbers_html(
-    campaign: Campaign, fitted: Fitted | None, fitted_models: Sequence[LadderEntry], sizes_changed: bool
-) -> str:
-    """Return the table of fitted parameters and the models fitted so far, as HTML."""
-    if fitted is None:
+def fitted_numbers_html(campaign: Campaign, fits: Sequence[Fitted], sizes_changed: bool) -> str:
+    """Return the table of the parameters of the last fit of this page, and all its fits, as HTML."""
+    if not fits:
         return "<p class='muted'>The model in use is being fitted; its parameters will appear here.</p>"
+    fitted = fits[-1]
     vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
     known = vines if len(vines) > 1 else {}
     rows = [_number_row(number, known.get(number.vine, number.vine) or "all") for number in fitted.fit.numbers]
@@ -134,7 +124,7 @@ def fitted_numbers_html(
     facts = [noise, chi2, f"between-trial standard deviations: {spreads}" if spreads else "", f"{fitted.seconds:.2g} s"]
     parts.append(f"<p><small>{' · '.join(fact for fact in facts if fact)}</small></p>")
     parts += [f"<p><small>{escaped(message)}</small></p>" for message in fitted.fit.messages]
-    parts.append(_ladder(campaign, fitted_models))
+    parts.append(_ladder(campaign, fits))
     return "".join(parts)
 
 
@@ -150,42 +140,38 @@ def _number_row(number: Number, vine: str) -> tuple[str, ...]:
     return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
 
 
-def _ladder(campaign: Campaign, fitted_models: Sequence[LadderEntry]) -> str:
+def _ladder(campaign: Campaign, fits: Sequence[Fitted]) -> str:
     """The models fitted on this page, with the error in excess of replicate scatter."""
-    if not fitted_models:
-        return ""
     floor = overall_m(campaign.floors_m, campaign.conditions)
     rows = []
-    for rung in fitted_models:
-        beyond = math.sqrt(max(rung.rms_m**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
-        rows.append((model_text(rung.effects), _mm(rung.rms_m), _mm(beyond) if math.isfinite(beyond) else "–"))
-    gained = f"<p><small>{escaped(fitted_models[-1].gained)}</small></p>" if fitted_models[-1].gained else ""
+    for fitted in fits:
+        rms = overall_m(fitted.prediction.errors_m, campaign.conditions)
+        beyond = math.sqrt(max(rms**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
+        rows.append((model_text(fitted.choice.effects), _mm(rms), _mm(beyond) if math.isfinite(beyond) else "–"))
+    gained = likelihood_change_text(fits[-2].fit, fits[-1].fit) if len(fits) > 1 else ""
     return (
-        "<h3>Fitted on this page</h3>" + table(rows, ("model", "rms error", "excess over replicates"), (1, 2)) + gained
+        "<h3>Fitted on this page</h3>"
+        + table(rows, ("model", "rms error", "excess over replicates"), (1, 2))
+        + (f"<p><small>{escaped(gained)}</small></p>" if gained else "")
     )
 
 
-def ladder_entry(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> LadderEntry:
-    """Return the entry of a fit in the table of fitted models."""
-    gained = "" if before is None else likelihood_change_text(before.fit, fitted.fit)
-    return LadderEntry(fitted.choice.effects, overall_m(fitted.prediction.errors_m, campaign.conditions), gained)
-
-
-def tied_panel(campaign: Campaign, summary: DiagnosisSummary | None, fitted: Fitted | None) -> str:
+def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None, fitted: Fitted | None) -> str:
     """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations."""
     parts = []
-    if summary is None:
+    if diagnosis is None:
         parts.append(
             "<p>No diagnosis yet: it tests every effect and states which of them these trials cannot tell apart. It"
             " appears here after</p>"
         )
         parts.append(command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"]))
     else:
-        parts.append(f"<p><b>{escaped(summary.verdict)}</b>: {escaped(summary.explanation)}</p>")
-        if len(summary.answer_set) > 1:
-            names = ", ".join(name.replace("_", " ") for name in summary.answer_set)
+        verdict = diagnosis.verdict or "not diagnosed"
+        parts.append(f"<p><b>{escaped(verdict)}</b>: {escaped(diagnosis.explanation)}</p>")
+        if len(diagnosis.answer_set) > 1:
+            names = ", ".join(name.replace("_", " ") for name in diagnosis.answer_set)
             parts.append(f"<p>Cannot be told apart: <b>{escaped(names)}</b>.</p>")
-        parts.append(cosine_grid(summary))
+        parts += [_cosine_grid(diagnosis)] if diagnosis.rounds else []
     if fitted is not None:
         pairs_words = correlated_pairs_text(fitted.fit)
         parts.append("<h3>In the last fit</h3>")
@@ -195,18 +181,21 @@ def tied_panel(campaign: Campaign, summary: DiagnosisSummary | None, fitted: Fit
     return "".join(parts)
 
 
-def cosine_grid(summary: DiagnosisSummary) -> str:
-    """Return the cosines between the effects of the likeliest candidates as a table; blank for fewer than two."""
-    names = [name for name in summary.best if name in summary.cosine_names]
-    names += [name for *pair, _ in summary.most_tied() for name in pair]
-    names = list(dict.fromkeys(names))[:MAX_COMPARED_EFFECTS]
+def _cosine_grid(diagnosis: Diagnosis) -> str:
+    """The cosines between the effects of the likeliest candidates as a table; blank for fewer than two."""
+    known, cosines = diagnosis.rounds[0].cosine_names, diagnosis.rounds[0].cosines
+    pairs = [(abs(cosines[i][k]), name, other) for i, name in enumerate(known) for k, other in enumerate(known[:i])]
+    tied = sorted((pair for pair in pairs if pair[0] >= TIED_COSINE), key=lambda pair: -pair[0])
+    likely = [name for name in suspects(diagnosis) if name in known]
+    names = list(dict.fromkeys([*likely, *(name for _, *pair in tied for name in pair)]))[:MAX_COMPARED_EFFECTS]
     if len(names) < 2:
         return ""
-    place = [summary.cosine_names.index(name) for name in names]
-    head = "".join(f"<th class='up'><span>{escaped(_spaced(name))}</span></th>" for name in names)
+    place = [known.index(name) for name in names]
+    titles = [escaped(name.replace("_", " ")) for name in names]
+    head = "".join(f"<th class='up'><span>{title}</span></th>" for title in titles)
     body = "".join(
-        f"<tr><th>{escaped(_spaced(name))}</th>" + "".join(_cosine_cell(summary.cosines[i][k]) for k in place) + "</tr>"
-        for name, i in zip(names, place, strict=True)
+        f"<tr><th>{title}</th>" + "".join(_cosine_cell(cosines[i][k]) for k in place) + "</tr>"
+        for title, i in zip(titles, place, strict=True)
     )
     caption = (
         "<small>Cosines between the effects on the trajectories: near ±1 two effects cannot be told apart.</small>"
@@ -224,16 +213,12 @@ def _cosine_cell(cosine: float) -> str:
     return f"<td style='background:{colour};color:{ink}'>{cosine:+.2f}</td>"
 
 
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def next_panel(campaign: Campaign, summary: DiagnosisSummary | None) -> str:
+def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
     """Return the next experiment of the diagnosis, as HTML."""
-    if summary is None:
+    if diagnosis is None:
         command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
         return f"<p>A diagnosis states which trial would separate the candidates best.</p>{command}"
-    advice = summary.next_experiment
+    advice = diagnosis.next_experiment
     if not advice:
         return "<p>The diagnosis proposes no further trial.</p>"
     parts = [f"<p>{escaped(advice.get('text', ''))}</p>"]
@@ -270,64 +255,17 @@ def _cell(value: Any) -> str:
     return "–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-DIAGNOSIS = "diagnosis.json"
+def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
+    """Return the effects worth trying first, best first."""
+    if diagnosis is None:
+        return ()
+    ranked = [candidate.effect for candidate in diagnosis.ranking if math.isfinite(candidate.delta_chi2)]
+    return tuple(dict.fromkeys([*diagnosis.answer_set, *ranked]))
 
 
-@dataclass(frozen=True)
-class RankedCandidate:
-    """A candidate of the ranking: the decrease of −2 ln L with it, and whether it is in the answer set."""
-
-    effect: str
-    delta_chi2: float
-    in_answer_set: bool
-
-
-@dataclass(frozen=True)
-class DiagnosisSummary:
-    """The first round of a diagnosis, and the next experiment. `cosines` is a matrix in the order of `cosine_names`."""
-
-    verdict: str
-    unexplained: bool
-    explanation: str
-    answer_set: tuple[str, ...]
-    suspects: tuple[RankedCandidate, ...]
-    cosine_names: tuple[str, ...]
-    cosines: tuple[tuple[float, ...], ...]
-    next_experiment: Mapping[str, Any] | None
-
-    @property
-    def best(self) -> tuple[str, ...]:
-        """Effects worth trying first, best first."""
-        ranked = [candidate.effect for candidate in self.suspects if math.isfinite(candidate.delta_chi2)]
-        return tuple(dict.fromkeys([*self.answer_set, *ranked]))
-
-    def most_tied(self, least: float = TIED_COSINE) -> list[tuple[str, str, float]]:
-        """Return the pairs of candidates with |cosine| of at least `least`, largest first."""
-        pairs = [
-            (name, other, self.cosines[i][k])
-            for i, name in enumerate(self.cosine_names)
-            for k, other in enumerate(self.cosine_names[:i])
-            if abs(self.cosines[i][k]) >= least
-        ]
-        return sorted(pairs, key=lambda pair: -abs(pair[2]))
-
-
-def read_summary(folder: Path) -> DiagnosisSummary | None:
+def diagnosis_of(folder: Path) -> Diagnosis | None:
     """Return the diagnosis of a results folder, None if there is none or it cannot be read."""
     try:
-        diagnosis = read_diagnosis(Results(folder))
+        return read_diagnosis(Results(folder))
     except ResultsError:
         return None
-    if diagnosis is None:
-        return None
-    first = diagnosis.rounds[0] if diagnosis.rounds else None
-    return DiagnosisSummary(
-        verdict=diagnosis.verdict or "not diagnosed",
-        unexplained=UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict),
-        explanation=diagnosis.explanation,
-        answer_set=diagnosis.answer_set,
-        suspects=tuple(RankedCandidate(c.effect, c.delta_chi2, c.in_answer_set) for c in diagnosis.ranking),
-        cosine_names=first.cosine_names if first else (),
-        cosines=tuple(tuple(row) for row in first.cosines) if first else (),
-        next_experiment=diagnosis.next_experiment,
-    )
