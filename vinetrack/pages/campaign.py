@@ -25,10 +25,9 @@ from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.diagnosis.ladder import compare
 from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
-from vinetrack.inference.fit_data import FitError, FitTrial, prepare
+from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import Fit, Number, TrialFit
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, group_names
@@ -612,16 +611,19 @@ class BackgroundFit:
         self.step: Step | None = None
         self.failure = ""
         self._listeners: list[Callable[[], None]] = []
-        self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}background")
+        self._job: FitJob[Step, Fitted] | None = None
 
     def begin(self) -> BackgroundFit:
         """Start the thread."""
-        self._thread.start()
+        self._job = FitJob(
+            self._work, on_progress=self._on_step, on_success=self._on_success, on_failure=self._on_failure
+        )
         return self
 
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait until it has finished or failed."""
-        self._thread.join(timeout_s)
+        if self._job is not None:
+            self._job.wait(timeout_s)
 
     def add_listener(self, listener: Callable[[], None]) -> None:
         """Call `listener` whenever there is a new result or step."""
@@ -634,19 +636,20 @@ class BackgroundFit:
 
     @property
     def running(self) -> bool:
-        """Whether the thread is running."""
-        return self._thread.is_alive()
+        """Whether the fit is awaited."""
+        return self._job is not None and self.fitted is None and not self.failure
 
-    def _run(self) -> None:
-        try:
-            self.prediction = predict_choice(self.campaign, self.initial)
-            self._notify()
-            self.fitted = first_fit(self.campaign, self.initial, self._on_step)
-        except (FitError, EffectError, SimulationError) as error:
-            self.failure = str(error)
-        except Exception:
-            log.exception("the model in use")
-            self.failure = FAULT
+    def _work(self, watch: Watch) -> Fitted:
+        self.prediction = predict_choice(self.campaign, self.initial)
+        self._notify()
+        return first_fit(self.campaign, self.initial, watch)
+
+    def _on_success(self, fitted: Fitted) -> None:
+        self.fitted = fitted
+        self._notify()
+
+    def _on_failure(self, reason: str) -> None:
+        self.failure = reason
         self._notify()
 
     def _on_step(self, step: Step) -> None:

@@ -28,9 +28,6 @@ from vinetrack.video.survey import Measurement, measure_recording, proposed_axis
 from vinetrack.video.target_corners import find_board
 from vinetrack.video.track import Tracking, track_recording
 
-CACHED_CLIPS = 2  # Recordings whose frames are cached; chosen: the current and the previous one
-THUMBNAIL_PX = 220  # Width of the pictures in the list; chosen: as wide as its column
-BLANK_GREY = 128  # Grey level of the strip where no frame was decoded (chosen)
 PATH_STEP_PX = 4.0  # Spacing of the points of a curve sent to the page, px (chosen)
 STRIP_PX = 1600  # Longest side of a strip; chosen: twice the page's width on a common screen
 
@@ -68,14 +65,16 @@ class ClipStore:
         with self._lock:
             if key not in self._clips:
                 self._clips[key] = _decoded(path)
-                while len(self._clips) > CACHED_CLIPS:
+                # Recordings whose frames are cached; chosen: the current and the previous one
+                while len(self._clips) > 2:
                     self._clips.popitem(last=False)
             self._clips.move_to_end(key)
             return self._clips[key]
 
     def thumbnail(self, recording: str) -> bytes:
         """Return the first frame as a small JPEG, without decoding more."""
-        return jpeg(_first_frame(safe_join(self.folder, recording)), THUMBNAIL_PX)
+        # Width of the pictures in the list; chosen: as wide as its column
+        return jpeg(_first_frame(safe_join(self.folder, recording)), 220)
 
     def picture(self, name: str) -> NDArray[Any]:
         """Return a single picture, or the first frame of a film, as grey levels. Shape (height, width)."""
@@ -203,7 +202,8 @@ def _axis_of(trial: Trial, settings: ExperimentSettings) -> Axis | None:
 def _track_json(tracking: Tracking) -> dict[str, Any]:
     track, strip = tracking.track, tracking.kymograph
     dark, light = np.nanpercentile(strip, [1, 99])
-    grey = np.full((len(track.time_s), strip.shape[1]), BLANK_GREY, np.uint8)
+    # Grey level of the strip where no frame was decoded (chosen)
+    grey = np.full((len(track.time_s), strip.shape[1]), 128, np.uint8)
     grey[tracking.strip_rows] = (255 * (strip - dark) / max(float(light - dark), 1.0)).clip(0, 255).astype(np.uint8)
     import cv2
 

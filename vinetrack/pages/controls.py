@@ -320,7 +320,6 @@ INTRODUCTION = (
     "No effect of the catalogue explains these trials. The missing force can be learned from them and written"
     " as an effect file of your own, beside the experiment. It takes minutes."
 )
-TYPICAL_DURATION_S = 150.0  # Time in which the progress bar of a search is two thirds full (chosen)
 
 
 @dataclass(frozen=True)
@@ -345,7 +344,8 @@ class ProposalPanel:
     def __init__(self, page: Page, reopen: Reopen | None) -> None:
         self._page, self._reopen = page, reopen
         self._job: FitJob[str, ReadProposal] | None = None
-        self._task, self._progress = "", FitProgress(TYPICAL_DURATION_S)
+        # Time in which the progress bar of a search is two thirds full (chosen)
+        self._task, self._progress = "", FitProgress(150.0)
         self._outcome: ReadProposal | None = None
         self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
         self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)

@@ -26,11 +26,6 @@ from vinetrack.pages.local_page import (
 )
 from vinetrack.pages.page import Page
 
-SILENCED_LOGGERS = ("bokeh", "tornado")
-THREAD_SWITCH_S = 1e-3  # Thread switch interval
-
-KEEP_ALIVE_MS = 20_000  # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
-
 
 def start_server(background: BackgroundFit, port: int | None = None) -> Server:
     """Return a server that is bound to the loopback address and refuses requests from other pages."""
@@ -55,7 +50,8 @@ def _bind(background: BackgroundFit, port: int) -> Server:
         address=LOOPBACK,
         port=free_port,
         allow_websocket_origin=sorted(hosts),
-        keep_alive_milliseconds=KEEP_ALIVE_MS,
+        # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
+        keep_alive_milliseconds=20_000,
         check_unused_sessions_milliseconds=5_000,
         unused_session_lifetime_milliseconds=10_000,
         use_index=False,
@@ -102,10 +98,10 @@ def explore(
 
     with waiting(f"opening {folder}"):
         background = BackgroundFit(open_campaign(folder, experiment))
-    for name in SILENCED_LOGGERS:
+    for name in ("bokeh", "tornado"):
         logging.getLogger(name).setLevel(logging.ERROR)
     # A background fit would otherwise delay the page.
-    sys.setswitchinterval(THREAD_SWITCH_S)
+    sys.setswitchinterval(1e-3)  # Thread switch interval
     server = start_server(background, port)
     background.begin()
     loop = server.io_loop

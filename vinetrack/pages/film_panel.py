@@ -36,8 +36,6 @@ from vinetrack.pipeline.overlays_stage import shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from vinetrack.video.axis import Axis
 
 
@@ -48,8 +46,6 @@ if TYPE_CHECKING:
 # second of a high-speed camera takes a few tens of megabytes.
 
 MAX_WIDTH_PX = 960  # Chosen: as wide as the page shows a recording
-
-PROGRESS_EVERY_FRAMES = 10  # Frames between two reports of progress; chosen: several reports a second
 
 
 @dataclass(frozen=True)
@@ -109,15 +105,10 @@ def recording_view(results: Results, trial: Trial) -> RecordingView | str:
         return str(error)
     if not axis:
         return f"The position of the axis of {trial.name} in its picture was not stored: run snakemake again."
-    return _view(trial, axis, table)
-
-
-def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> RecordingView:
     from vinetrack.video.curved_axis import axis_from_entry
 
     line = axis_from_entry(axis)
     width = axis.get("width_px")
-    assert trial.video is not None
     return RecordingView(
         trial=trial.name,
         path=trial.video,
@@ -169,7 +160,8 @@ class DecodedRecording:
                 self.shape, self.scale = (max(1, round(height * shown_px / width)), shown_px), shown_px / width
                 self._frames.append(jpeg(luma, MAX_WIDTH_PX, 2.0**recording.bit_depth - 1))
                 self.count += 1
-                if on_progress is not None and self.count % PROGRESS_EVERY_FRAMES == 1:
+                # Frames between two reports of progress; chosen: several reports a second
+                if on_progress is not None and self.count % 10 == 1:
                     on_progress(self)
         except (RecordingError, OSError) as error:
             self.error = str(error)
@@ -185,10 +177,6 @@ class DecodedRecording:
     def cancel(self) -> None:
         """Stop decoding."""
         self._cancelled = True
-
-
-PLAY_MS = 70  # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
-NARROW = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
 
 
 class FilmPanel:
@@ -222,7 +210,13 @@ class FilmPanel:
         self.figure = self._draw()
         self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
         self.frame.on_change("value", lambda _attr, _old, new: self._show_frame(int(new)))
-        controls = side_by_side(self.trial_select, self.play, self.frame, css=NARROW, sizing_mode="stretch_width")
+        controls = side_by_side(
+            self.trial_select,
+            self.play,
+            self.frame,
+            css=":host { flex-wrap: wrap; gap: 6px; align-items: end; }",
+            sizing_mode="stretch_width",
+        )
         self.root = stacked(controls, self.figure, self.caption, name="film")
 
     def _draw(self) -> Any:
@@ -273,11 +267,8 @@ class FilmPanel:
         self._view = view
         self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
         self._film = DecodedRecording(view.path)
-        self._film.start_decoding(self._on_decoded)
-
-    def _on_decoded(self, film: DecodedRecording) -> None:
-        """Called from the decoding thread."""
-        self._document.add_next_tick_callback(partial(self._decoded, film))
+        # The decoding thread only asks for a callback in that of the document.
+        self._film.start_decoding(lambda film: self._document.add_next_tick_callback(partial(self._decoded, film)))
 
     def _decoded(self, film: DecodedRecording) -> None:
         if film is not self._film or self._view is None:
@@ -291,19 +282,14 @@ class FilmPanel:
         if film.count == 0:
             self.caption.text = f'<span class="bad">{escaped(film.error or "no frame could be decoded")}</span>'
             return
-        moving = self._first_moving()
+        # The frame shown first is half-way along the motion.
+        known = np.flatnonzero(np.isfinite(self._view.edge_px))
+        moving = int(min(known[known.size // 2], film.count - 1)) if known.size else 0
         self.frame.update(start=0, end=max(film.count - 1, 1))
         if self.frame.value != moving:
             self.frame.value = moving
         else:
             self._show_frame(moving)
-
-    def _first_moving(self) -> int:
-        """The frame shown first: half-way along the motion."""
-        if self._view is None or self._film is None:
-            return 0
-        known = np.flatnonzero(np.isfinite(self._view.edge_px))
-        return 0 if not known.size else int(min(known[known.size // 2], self._film.count - 1))
 
     def _fit_figure(self, film: DecodedRecording) -> None:
         height, width = film.shape
@@ -321,15 +307,16 @@ class FilmPanel:
 
     def _time_s(self, frame: int) -> float:
         """Time of a frame on the clock of the track."""
-        times = self._shown_trial().data.time_s if self._view is None else self._view.time_s
+        times = self._shown.data.time_s if self._view is None else self._view.time_s
         return float(times[min(frame, times.size - 1)])
 
-    def _shown_trial(self) -> ExplorerTrial:
+    @property
+    def _shown(self) -> ExplorerTrial:
         return self.campaign.trial(self.trial_select.value)
 
     def _positions(self, frame: int) -> tuple[float, float, float]:
         """Positions of the edge, m: measured, of the model for comparison, of the current model; NaN if unknown."""
-        time_s, aligned = self._time_s(frame), self._shown_trial()
+        time_s, aligned = self._time_s(frame), self._shown
         place = self.campaign.trials.index(aligned)
         # The model is defined between the first and the last frame of the fit.
         model_m = [
@@ -371,13 +358,12 @@ class FilmPanel:
         }
 
     def _update_caption(self, frame: int, reason: str = "") -> None:
-        aligned = self._shown_trial()
+        aligned = self._shown
         since_s = self._time_s(frame) - aligned.release_s
-        positions = zip(("tracked", "comparison", "model"), self._positions(frame), strict=True)
-        colours = {"tracked": MEASURED_EDGE, "comparison": REFERENCE_EDGE, "model": MODEL_EDGE}
+        names, colours = ("tracked", "comparison", "model"), (MEASURED_EDGE, REFERENCE_EDGE, MODEL_EDGE)
         positions_text = [
-            f'<span style="border-bottom:3px solid {colours[name]}">{name} {1e3 * (m - aligned.origin_m):.1f} mm</span>'
-            for name, m in positions
+            f'<span style="border-bottom:3px solid {colour}">{name} {1e3 * (m - aligned.origin_m):.1f} mm</span>'
+            for name, colour, m in zip(names, colours, self._positions(frame), strict=True)
             if math.isfinite(m)
         ]
         if not reason and self._view is None:
@@ -399,7 +385,8 @@ class FilmPanel:
             self._stop()
             return
         self.play.label = "❚❚ pause"
-        self._playing = self._document.add_periodic_callback(self._next_frame, PLAY_MS)
+        # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
+        self._playing = self._document.add_periodic_callback(self._next_frame, 70)
 
     def _next_frame(self) -> None:
         step = max(int(self.frame.end) // 150, 1)

@@ -50,15 +50,9 @@ from vinetrack.pages.text_panels import (
 )
 from vinetrack.results.folder_layout import Results
 
-# Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
-REDRAW_DELAY_MS = 4
-
 # Chosen: text follows a slider at reading speed, because each change makes the browser lay out the page again
 TEXT_DELAY_MS = 150
 
-DIAGNOSIS_POLL_MS = 2000  # Chosen: interval at which the page looks for a new diagnosis
-
-STATUS_INTERVAL_MS = 200  # Chosen: the status line shows tenths of a second
 
 # A swipe over a figure scrolls the page, as it does elsewhere
 LET_SCROLL = """
@@ -87,8 +81,9 @@ class Page:
         self._build(reopen)
         background.add_listener(self._on_background_change)
         document.on_session_destroyed(lambda _context: self.close())
-        document.add_periodic_callback(self._check_for_diagnosis, DIAGNOSIS_POLL_MS)
-        document.add_periodic_callback(self._update_status, STATUS_INTERVAL_MS)
+        # Chosen: interval at which the page looks for a new diagnosis
+        document.add_periodic_callback(self._check_for_diagnosis, 2000)
+        document.add_periodic_callback(self._update_status, 200)  # Chosen: the status line shows tenths of a second
         self._background_changed()
 
     # ---- layout ----------------------------------------------------------------------------------------------------
@@ -303,7 +298,8 @@ class Page:
     def _redraw_soon(self) -> None:
         if not self._redraw_pending:
             self._redraw_pending = True
-            self.document.add_timeout_callback(self._redraw, REDRAW_DELAY_MS)
+            # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
+            self.document.add_timeout_callback(self._redraw, 4)
 
     def _redraw(self) -> None:
         self._redraw_pending = False

@@ -300,11 +300,6 @@ def _mm(value: float | None) -> float:
     return math.nan if value is None else 1e3 * value
 
 
-ROW_PX = 25  # Height of a bar of the errors; chosen: a label of 12 pixels and a gap of equal height
-
-MAX_BANDS = 4  # Chosen: bands of more conditions overlap and hide the curves
-
-
 class Plots:
     """Figures and their data sources; the `set_…` methods update the data."""
 
@@ -356,7 +351,8 @@ class Plots:
 
     def _draw_errors(self) -> Any:
         names = list(reversed(self.campaign.conditions))
-        height = 70 + ROW_PX * max(len(names), 2)
+        # Height of a bar of the errors; chosen: a label of 12 pixels and a gap of equal height
+        height = 70 + 25 * max(len(names), 2)
         fig = plot(height, "rms error of position (mm)", "", name="errors", y_range=names, x_range=Range1d(0, 1))
         common = {"y": "condition", "source": self._bars}
         fig.hbar(
@@ -404,7 +400,8 @@ class Plots:
         self.residual.x_range.update(start=bottom, end=top)
         self._measured.data = lines
         self.set_reference(reference, shown)
-        few = len({self.campaign.trials[i].condition for i in shown}) <= MAX_BANDS
+        # Chosen: bands of more conditions overlap and hide the curves
+        few = len({self.campaign.trials[i].condition for i in shown}) <= 4
         self._band.data = replicate_bands(self.campaign, shown if few else [])
 
     def set_reference(self, reference: Prediction | None, shown: Sequence[int]) -> None:

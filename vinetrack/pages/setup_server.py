@@ -210,9 +210,7 @@ def _as_drafted(column: str, draft: Draft) -> str:
 log = logging.getLogger(__name__)
 
 TEMPLATES = Path(__file__).with_name("templates")
-MAX_REQUEST_BYTES = 20_000_000  # Chosen: a sheet of ten thousand rows takes a few megabytes
 
-REQUEST_HEADER = "X-Vinetrack"  # Header required for requests that change or compute something
 
 CONTENT_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
 CONTENT_SECURITY_POLICY = (
@@ -273,7 +271,9 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_authorised():
             return
         length = int(self.headers.get("Content-Length") or 0)
-        if self.headers.get(REQUEST_HEADER) != "setup" or not 0 < length <= MAX_REQUEST_BYTES:
+        # Chosen: a sheet of ten thousand rows takes a few megabytes
+        # Header required for requests that change or compute something
+        if self.headers.get("X-Vinetrack") != "setup" or not 0 < length <= 20_000_000:
             self.close_connection = True
             self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
             return

@@ -28,12 +28,6 @@ from vinetrack.pages.campaign import (
 from vinetrack.pages.plots import command_block, escaped, table, vine_colours
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
-FLOOR_MARGIN = 1.15  # Chosen: an error up to 1.15 times the replicate scatter counts as equal to it
-
-MAX_PAIRS = 6  # Pairs of correlated parameters shown; chosen: the card has room for six lines
-
-MAX_COMPARED_EFFECTS = 8  # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
-
 
 @dataclass(frozen=True)
 class HeldModel:
@@ -78,7 +72,8 @@ def headline(
     if not math.isfinite(now):
         reason = f"The model in use was not fitted: {escaped(campaign.refused)}" if campaign.refused else "Preparing …"
         return f"<h1>{reason}</h1>"
-    at_floor = math.isfinite(floor) and now <= FLOOR_MARGIN * floor
+    # Chosen: an error up to 1.15 times the replicate scatter counts as equal to it
+    at_floor = math.isfinite(floor) and now <= 1.15 * floor
     grade = "good" if at_floor else "bad"
     was = f", {_mm(before)} when the page opened" if math.isfinite(before) and _mm(before) != _mm(now) else ""
     if math.isfinite(floor):
@@ -175,7 +170,8 @@ def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None, fitted: Fitted |
     if fitted is not None:
         pairs_words = correlated_pairs_text(fitted.fit)
         parts.append("<h3>In the last fit</h3>")
-        parts += [f"<p>{escaped(line)}</p>" for line in pairs_words[:MAX_PAIRS]] or [
+        # Pairs of correlated parameters shown; chosen: the card has room for six lines
+        parts += [f"<p>{escaped(line)}</p>" for line in pairs_words[:6]] or [
             "<p class='muted'>No two parameters have a correlation above 0.9.</p>"
         ]
     return "".join(parts)
@@ -187,7 +183,8 @@ def _cosine_grid(diagnosis: Diagnosis) -> str:
     pairs = [(abs(cosines[i][k]), name, other) for i, name in enumerate(known) for k, other in enumerate(known[:i])]
     tied = sorted((pair for pair in pairs if pair[0] >= TIED_COSINE), key=lambda pair: -pair[0])
     likely = [name for name in suspects(diagnosis) if name in known]
-    names = list(dict.fromkeys([*likely, *(name for _, *pair in tied for name in pair)]))[:MAX_COMPARED_EFFECTS]
+    # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
+    names = list(dict.fromkeys([*likely, *(name for _, *pair in tied for name in pair)]))[:8]
     if len(names) < 2:
         return ""
     place = [known.index(name) for name in names]

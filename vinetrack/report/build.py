@@ -264,8 +264,6 @@ def _rms_mm(values_m: pd.Series) -> str:
 
 __all__ = ["Clip", "ReportContent", "ReportFigure", "ReportSection", "ReportTable", "build_report"]
 
-MAX_CLIP_BYTES = 2_500_000  # Chosen: a sixth of the 15 MB that a report may have
-
 
 @dataclass(frozen=True)
 class Clip:
@@ -345,7 +343,8 @@ def build_report(content: ReportContent) -> str:
         final_errors=final_errors,
         diagnosis=diagnosis_section(content.diagnosis),
         figures=figures,
-        clip=content.clip if content.clip is not None and len(content.clip.mp4) <= MAX_CLIP_BYTES else None,
+        # Chosen: a sixth of the 15 MB that a report may have
+        clip=content.clip if content.clip is not None and len(content.clip.mp4) <= 2_500_000 else None,
         sections=content.sections,
         trials=trials,
         rule_names=RULE_NAMES,

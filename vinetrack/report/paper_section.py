@@ -52,7 +52,7 @@ def table_one(table: pd.DataFrame) -> ReportTable:
         (
             str(scale),
             *(
-                _shown(_published_of(by_row, f"{name}_R{scale}"))
+                _shown(_value(by_row.get(f"{name}_R{scale}"), "published"))
                 for name in ("thickness", "diameter", "press", "laser")
             ),
             f"{published.DAMPING_B[scale]:g}",
@@ -136,7 +136,8 @@ def every_row(table: pd.DataFrame) -> list[ReportTable]:
         if len(members):
             body = [
                 (
-                    f"{row.quantity}{', ' if row.setting else ''}{row.setting}{_unit(row.unit)}",
+                    f"{row.quantity}{', ' if row.setting else ''}{row.setting}"
+                    + ("" if row.unit == "1" else f" ({row.unit})"),
                     row.as_printed,
                     _ours(row),
                     row.mark,
@@ -163,10 +164,6 @@ _PARTS = {
 _ELSEWHERE = "The fast vine, air drag, pressures"
 
 
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else f" ({unit})"
-
-
 def _part(where: str) -> str:
     """The part of the paper of an entry of `where`, from its first reference."""
     first = where.split(";")[0].split(",")[0].split(" against")[0]
@@ -177,13 +174,9 @@ def _by_row(table: pd.DataFrame) -> Mapping[str, Any]:
     return {row.row: row for row in rows(table)}
 
 
-def _published_of(by_row: Mapping[str, Any], row: str) -> float | None:
-    """The published value of a row; None if there is no such row."""
-    return float(by_row[row].published) if row in by_row else None
-
-
-def _value(row: Any) -> float | None:
-    return None if row is None else float(row.ours)
+def _value(row: Any, column: str = "ours") -> float | None:
+    """The value of a row; None if there is no such row."""
+    return None if row is None else float(getattr(row, column))
 
 
 def _ours(row: Any) -> str:
@@ -201,10 +194,7 @@ def _shown(value: float | None) -> str:
 
 def _range(size: Mapping[str, float], low: str, high: str) -> str:
     """Two sizes as a range, the smaller first."""
-    pair = [size.get(name) for name in (low, high)]
-    first, last = (
-        (number(value) for value in sorted(value for value in pair if value is not None))
-        if None not in pair
-        else ("", "")
-    )
-    return f"{first} to {last}" if first != last else first or "–"
+    if low not in size or high not in size:
+        return "–"
+    first, last = (number(value) for value in sorted((size[low], size[high])))
+    return first if first == last else f"{first} to {last}"

@@ -14,8 +14,6 @@ from markupsafe import Markup
 
 from vinetrack.figures.style import TOKENS
 
-_WEBP_QUALITY = 45  # WebP quality of the images in a strip, 0 to 100
-_WEBP_QUALITY_WITH_TEXT = 85  # The same of a whole figure, whose letters must stay sharp (chosen)
 _DROPPED = re.compile(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", re.DOTALL)
 _DRAWING_TAG = re.compile(r"<(?!image)[^>]*>")  # Images are placed by matrices, which need all their decimals
 _IDENTIFIER = re.compile(r'\bid="|url\(#|href="#')
@@ -36,7 +34,7 @@ def inline_picture(picture: str | bytes, prefix: str, description: str) -> Marku
 
     image = Image.open(io.BytesIO(picture))
     wide = 96 * image.width / image.info.get("dpi", (150, 150))[0]
-    source = _as_webp(picture, _WEBP_QUALITY_WITH_TEXT)
+    source = _as_webp(picture, 85)  # The same of a whole figure, whose letters must stay sharp (chosen)
     return Markup(f'<img alt="{escape(description, quote=True)}" style="--wide:{wide:.0f}px" src="{source}">')
 
 
@@ -54,7 +52,8 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
 
     body = _DRAWING_TAG.sub(short, _DROPPED.sub("", found[3]))
     body = _IDENTIFIER.sub(lambda match: f"{match[0]}{escape(prefix, quote=True)}-", body)
-    body = _IMAGE.sub(lambda match: _as_webp(base64.b64decode(match[1]), _WEBP_QUALITY), body)
+    # WebP quality of the images in a strip, 0 to 100
+    body = _IMAGE.sub(lambda match: _as_webp(base64.b64decode(match[1]), 45), body)
     body = re.sub(r"\s*\n\s*", " ", body)
     label = escape(description, quote=True)
     head = f'viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{label}" style="--wide:{1.33 * width:.0f}px"'
