@@ -137,14 +137,14 @@ def test_metres_are_lengths_along_the_curve_in_the_tilted_plane(bent: BentScene)
     covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
     plane = PlaneMap(bent.plan.width, bent.plan.height, parameters, covariance)
     calibration = PlaneCalibration("charuco", plane, 0.1, 50, 1, 0.0, (0, 0, 639, 639))
-    tracking = followed(bent, drawn(bent), along_path=calibration.along_path)
+    scale = calibration.along_path(followed(bent, drawn(bent)).axis)
+    tracking = followed(bent, drawn(bent), position_m=scale.position_m)
     used = bent.moving & tracking.track.usable
     fine = np.arange(0.0, bent.arc_px[-1], 0.5)
     steps = np.linalg.norm(np.diff(plane.plane_m(bent.places(fine)), axis=0), axis=1)
     true_m = np.interp(bent.edge_px, fine, np.concatenate([[0.0], np.cumsum(steps)]))
     error = tracking.track.lead_position_m[used] - true_m[used]
     assert error.std() < 0.4 * 1.3e-3
-    scale = calibration.along_path(tracking.axis)
     chord = calibration.along(tracking.axis.from_px, tracking.axis.to_px)
     assert 0 < scale.scale_rel_sigma < 0.02
     assert scale.scale_rel_sigma != pytest.approx(chord.scale_rel_sigma, rel=1e-3)
