@@ -56,3 +56,10 @@ def test_a_command_answers_for_every_kind_of_results(command: tuple[str, ...], r
     written = tmp_path / "answer.json"
     run(*(results if word == "RESULTS" else word for word in command), "--json", written)
     assert json.loads(written.read_text())
+
+
+def test_a_diagnosis_asked_for_again_writes_all_that_the_run_wrote(results: Path) -> None:
+    files = {path: path.read_bytes() for path in [results / "diagnosis.json", *(results / "diagnosis").glob("*.csv")]}
+    assert results / "diagnosis" / "damping_laws.csv" in files
+    run("diagnose", results)
+    assert {path: path.read_bytes() for path in files} == files

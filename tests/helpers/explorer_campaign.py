@@ -60,7 +60,8 @@ def make_results(experiment: Path, results: Path) -> Path:
     run("trials", experiment, results)
     run("damping", experiment, results, "--settings", '{"damping": {"resamples": 100}}')
     fit_model(read_experiment(experiment), results, run_settings({}))
-    Results(results).provenance.write_text(json.dumps({"experiment": experiment.absolute().as_posix()}))
+    made = {"experiment": experiment.absolute().as_posix(), "settings": {"damping": {"resamples": 100}}}
+    Results(results).provenance.write_text(json.dumps(made))
     return results
 
 

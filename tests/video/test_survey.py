@@ -296,6 +296,18 @@ def test_check_reports_the_facts_of_a_correct_recording(clip: Path, tmp_path: Pa
     assert repr(facts) == repr(tracked)  # what the tracker says, to the last digit
 
 
+def test_a_trial_with_a_scale_of_its_own_is_looked_at_by_it_as_in_a_run(clip: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "v"
+    surveyed(clip, folder, "a,a.mp4,12,100,140,36,3\n", SETTINGS)
+    row = "a.mp4,12,100,140,36,3"
+    (folder / "trials.csv").write_text(f"{SHEET.strip()},mm_per_px\na,{row},\nb,{row},0.2\n")
+    surveyor = Surveyor()
+    check_experiment(folder, surveyor)
+    assert {trial.name: facts.mm_per_px for trial, facts in surveyor.facts.items()} == pytest.approx(
+        {"a": 0.24, "b": 0.2}
+    )
+
+
 @pytest.mark.parametrize(
     ("row", "settings", "expected"),
     [

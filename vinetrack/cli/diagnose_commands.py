@@ -46,19 +46,19 @@ def _diagnose(
 ) -> None:
     """Diagnose what the model lacks: verdict, candidates with sizes, errors before and after, next experiment."""
     with errors_as_sentences(log):
-        from vinetrack.core.tables import PROVENANCE
         from vinetrack.diagnosis.diagnose import diagnose
         from vinetrack.pipeline.workflow import find_experiment
+        from vinetrack.results.folder_layout import Results, read_json, read_source_experiment
 
+        results = Results(target)
         with progress_line() as report:
-            if (target / PROVENANCE).exists():
-                from vinetrack.pipeline.model_stage import diagnose_pairs, write_diagnosis
-                from vinetrack.results.folder_layout import Results, measured_trials, read_source_experiment
+            if results.provenance.exists():
+                from vinetrack.experiment.settings import run_settings
+                from vinetrack.pipeline.model_stage import diagnosed, write_diagnosis
 
-                read = read_source_experiment(target, experiment)
-                diagnosis = diagnose_pairs(read, measured_trials(read, Results(target))[0], report)
+                diagnosis, pairs = diagnosed(read_source_experiment(target, experiment), results, report)
                 if json_file is None:
-                    write_diagnosis(Results(target), diagnosis)
+                    write_diagnosis(results, diagnosis, pairs, run_settings(read_json(results.provenance)["settings"]))
             else:
                 diagnosis = diagnose(_tracks_only(find_experiment(target)), report=report)
         print_result([str(diagnosis)], diagnosis.to_json(), json_file)

@@ -65,7 +65,7 @@ class Kept:
         film, *others = inputs
         assert isinstance(film, Path)
         libraries = [version(name) for name in TRACKER_LIBRARIES]
-        self.tracked = _key(code_hash(*TRACKER), libraries, identity(film), others)
+        self.tracked = _key(code_hash(*TRACKER), libraries, film.resolve(), identity(film), others)
         path = self.folder / f"{self.tracked}.npz"
         if not (data := _read(path)):
             data = packed(make())

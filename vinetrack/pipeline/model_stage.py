@@ -195,6 +195,7 @@ def _shown(value: float, decimals: int) -> str:
 # A diagnosis that fails does not stop the run: `diagnosis.json` then has no verdict and states the reason.
 
 Report = Callable[[str], None]
+Pairs = Sequence[tuple[Trial, Track]]
 PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
@@ -213,28 +214,30 @@ def diagnose_results(
     `diagnosis.json` as written; `refused` is None, or the reason why there is no verdict.
     """
     results = Results(folder)
-    pairs, _ = measured_trials(experiment, results)
     try:
-        diagnosis = with_contradictions(diagnose_pairs(experiment, pairs, report, fitted), results, pairs)
+        diagnosis, pairs = diagnosed(experiment, results, report, fitted)
     except Exception as error:
         return _write_refusal(results, experiment, _reason(error))
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
-    content = write_diagnosis(results, diagnosis)
     report("fitting the damping law under every model")
-    _write_laws(results, diagnosis, pairs, settings)
-    return content
+    return write_diagnosis(results, diagnosis, pairs, settings)
 
 
-def diagnose_pairs(
-    experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet, fitted: Fit | None = None
-) -> Diagnosis:
-    """Diagnose trials with the model, candidates, user effects and limits that the experiment states."""
+def diagnosed(
+    experiment: Experiment, results: Results, report: Report = _quiet, fitted: Fit | None = None
+) -> tuple[Diagnosis, Pairs]:
+    """The diagnosis with the model, candidates, user effects and limits that the experiment states, and with what
+    recordings and speeds contradict in its sheet; and its trials.
+    """
     from vinetrack.diagnosis.diagnose import diagnose
 
-    return diagnose(experiment, tracks={trial.name: track for trial, track in pairs}, report=report, fitted=fitted)
+    pairs, _ = measured_trials(experiment, results)
+    tracks = {trial.name: track for trial, track in pairs}
+    diagnosis = diagnose(experiment, tracks=tracks, report=report, fitted=fitted)
+    return with_contradictions(diagnosis, results, pairs), pairs
 
 
-def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[tuple[Trial, Track]]) -> Diagnosis:
+def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) -> Diagnosis:
     """Add contradictions between measurements and sheet to a diagnosis: a wrong scale or unit can look like physics."""
     contradictions = sheet_contradictions(results, pairs)
     if not contradictions:
@@ -247,7 +250,7 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[
     )
 
 
-def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, str]:
+def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     """Return a sentence for each column of the sheet that recordings or speeds contradict. Returns by name of the
     column.
     """
@@ -288,7 +291,9 @@ def _emptied_folder(results: Results) -> Path:
     return folder
 
 
-def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
+def write_diagnosis(
+    results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings | None
+) -> dict[str, Any]:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`. Returns `diagnosis.json` as written."""
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
 
@@ -306,19 +311,17 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
         path = results.predictions(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_csv(path, table)
+    write_csv(folder / "damping_laws.csv", _laws(diagnosis, pairs, settings))
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
     content = diagnosis.to_json()
     write_json(results.diagnosis, content)
     return content
 
 
-def _write_laws(
-    results: Results, diagnosis: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
-) -> None:
+def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings | None) -> pd.DataFrame:
     """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
     from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 
-    path = results.folder / "diagnosis" / "damping_laws.csv"
     laws: dict[str, Any] = {}
     if len(diagnosis.fits) > 1:
         motions = look_at_motions(pairs, settings)
@@ -327,7 +330,7 @@ def _write_laws(
                 laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings).laws
             except ValueError as error:
                 log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
-    write_csv(path, law_table(laws) if laws else empty_table(LAW_COLUMNS))
+    return law_table(laws) if laws else empty_table(LAW_COLUMNS)
 
 
 def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:

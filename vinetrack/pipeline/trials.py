@@ -159,7 +159,9 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
         if trial.video is None:
             track = load_track(trial)
         else:
-            measurement = _measure(trial, experiment, kept)
+            from vinetrack.video.survey import measure_recording
+
+            measurement = measure_recording(trial, experiment.settings, experiment.folder, kept.track)
             contradictions = _contradictions(trial, measurement)
             track = measurement.tracking.track
             track = replace(track, notes=(*track.notes, *(problem.reason for problem in contradictions)))
@@ -192,34 +194,6 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
     if trial.video is not None:
         _draw_strip(trial, results, measurement, reason, settings.figures, kept)
     return name, reason, fault
-
-
-def _measure(trial: Trial, experiment: Experiment, kept: Kept) -> Measurement:
-    from vinetrack.video.frames import RecordingError, inspect_recording
-    from vinetrack.video.images import capture_rate
-    from vinetrack.video.survey import measure
-
-    assert trial.video is not None
-    recording = inspect_recording(trial.video)
-    capture_rate(trial, recording)
-    calibration, settings = None, experiment.settings.calibration
-    if not np.isfinite(trial.m_per_px) and settings is not None:
-        calibration = _calibration(settings, experiment.folder, recording.width, recording.height)
-        if isinstance(calibration, RecordingError):
-            raise calibration
-    return measure(trial, experiment.settings, recording, calibration, kept.track)
-
-
-@lru_cache(maxsize=8)
-def _calibration(settings: Any, folder: Path, width_px: int, height_px: int) -> Any:
-    """The calibration for a size of picture, or the error; each process looks at a board once."""
-    from vinetrack.video.calibration import CalibrationError, calibrate
-    from vinetrack.video.frames import RecordingError
-
-    try:
-        return calibrate(settings, folder, width_px, height_px)
-    except CalibrationError as error:
-        return RecordingError(f"calibration: {error}")
 
 
 def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:

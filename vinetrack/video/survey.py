@@ -11,6 +11,7 @@ import contextlib
 import math
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
-from vinetrack.experiment.settings import AxisSettings, ExperimentSettings
+from vinetrack.experiment.settings import AxisSettings, Calibration, ExperimentSettings
 from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.video.axis import Axis, askew_trials, slope_deg
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
@@ -73,25 +74,14 @@ Keep = Callable[[tuple[object, ...], Callable[[], Tracking]], Tracking]
 def measure_recording(
     trial: Trial, settings: ExperimentSettings, folder: Path, keep: Keep | None = None
 ) -> Measurement:
-    """Decode, calibrate and track the recording of one trial; see `measure`."""
+    """Track the recording of one trial by its own scale or the calibration of the experiment: the one look into a
+    recording. `keep` returns the tracking in pixels that it keeps for these inputs, or makes it by the function given.
+    """
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
-    capture_rate(trial, recording)
-    return measure(trial, settings, recording, calibration_of(trial, settings, folder, recording), keep)
-
-
-def measure(
-    trial: Trial,
-    settings: ExperimentSettings,
-    recording: Recording,
-    calibration: PlaneCalibration | None,
-    keep: Keep | None = None,
-) -> Measurement:
-    """Track the recording of one trial by a calibration, or by the trial's own scale: the one look into a recording.
-    `keep` returns the tracking in pixels that it keeps for these inputs, or makes it by the function it is given.
-    """
     capture_fps = capture_rate(trial, recording)
+    calibration = calibration_of(trial, settings, folder, recording)
     if calibration is None and not math.isfinite(trial.m_per_px):
         raise RecordingError(
             f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
@@ -126,10 +116,18 @@ def calibration_of(
     """The calibration of the experiment; None where the trial has its own scale or there is no calibration."""
     if math.isfinite(trial.m_per_px) or settings.calibration is None:
         return None
+    image = folder / (getattr(settings.calibration, "image", None) or "")
+    state = image.stat().st_mtime_ns if image.is_file() else 0
     try:
-        return calibrate(settings.calibration, folder, recording.width, recording.height)
+        return _calibrated(settings.calibration, folder, recording.width, recording.height, state)
     except CalibrationError as error:
         raise RecordingError(f"calibration: {error}") from error
+
+
+@lru_cache(maxsize=8)
+def _calibrated(target: Calibration, folder: Path, width_px: int, height_px: int, _state: int) -> PlaneCalibration:
+    """The calibration for a size of picture; a process looks at a target once while its picture stays the same."""
+    return calibrate(target, folder, width_px, height_px)
 
 
 def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
@@ -409,7 +407,7 @@ class Surveyor:
             facts, of_trial = _stated_facts(trial, experiment.settings, opened[trial], scale), []
             if trial in self.looked_into:
                 with contextlib.suppress(RecordingError):
-                    measurement = measure(trial, experiment.settings, opened[trial], scale, self.keep)
+                    measurement = measure_recording(trial, experiment.settings, experiment.folder, self.keep)
                     facts = tracked_facts(trial, measurement)
                     of_trial = [*size_problems(trial, facts), *exposure_problems(trial, measurement.tracking)]
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
