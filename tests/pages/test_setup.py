@@ -272,6 +272,18 @@ def test_a_wrong_cell_is_named_by_its_trial_and_its_column_in_the_unit_of_the_sh
     assert ("cell", "d15_24kPa_1", "pressure_psi") in found
 
 
+def test_what_is_not_filled_in_yet_is_told_from_what_is_wrong(clips: Path) -> None:
+    sheet = page_state(clips)["sheet"]
+    rows = [{"trial": f"t{k}", "pressure_kPa": f"{20 + k}", "yield_pressure_kPa": "x"} for k in range(12)]
+    sheet |= {"columns": [*sheet["columns"], "yield_pressure_kPa"], "rows": rows}
+    draft = draft_from_json(clips, sent(clips, sheet=sheet, shared={"capture_fps": "1000"}))
+    codes: dict[str, set[str]] = {}
+    for one in draft_problems(clips, draft)["problems"]:
+        codes.setdefault(one["column"], set()).add(one["code"])
+    assert codes["length_mm"] <= {"missing", "blank"}
+    assert not codes["yield_pressure_kPa"] & {"missing", "blank"}
+
+
 def test_a_whole_draft_has_no_errors(clips: Path) -> None:
     shared = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
     scale = {"kind": "two_points", "from_px": [10, 150], "to_px": [460, 150], "length_mm": 337.5}

@@ -197,6 +197,7 @@ def _problem_json(problem: Problem, draft: Draft | None) -> dict[str, Any]:
         "trial": problem.trial,
         "column": column,
         "text": problem.reason,
+        "code": problem.code,
         "of_a_measurement": problem.of_a_measurement,
     }
 
@@ -210,8 +211,6 @@ def _as_drafted(column: str, draft: Draft) -> str:
 log = logging.getLogger(__name__)
 
 TEMPLATES = Path(__file__).with_name("templates")
-
-
 CONTENT_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"

@@ -164,7 +164,7 @@ export function markProblems() {
     cell.classList.remove("bad", "odd");
     cell.querySelectorAll("small.said").forEach((words) => words.remove());
   }
-  for (const {severity, field, trial, column, text, of_a_measurement} of state.problems) {
+  for (const {severity, field, trial, column, text, code, of_a_measurement} of state.problems) {
     if (!["cell", "row", "shared"].includes(field)) continue;
     const row = field === "shared" ? "shared" : state.sheet.rows.findIndex((one) => one.trial === trial);
     const wanted = field === "row" ? "trial" : column;
@@ -176,7 +176,7 @@ export function markProblems() {
       placeless.push({severity, text});
       continue;
     }
-    const blank = /^\S+ is (blank|missing)/.test(text);
+    const blank = code === "missing" || code === "blank";
     if (blank && sharedValue(column)) continue;
     const cell = input.closest("td");
     cell.classList.add(severity === "error" ? "bad" : "odd");
