@@ -26,8 +26,7 @@ _PAGE_HEAD = """# Every column and key
 Generated from the declarations that validate them: `vinetrack settings` prints the same, `vinetrack settings --json -`
 prints it for a program, and `vinetrack settings --page docs/settings.md` writes this page. A column, or a key of
 `experiment.yaml`, may state another unit in its name (`pressure_psi`, `diameter_in`, …): it is converted, and
-`vinetrack check` reports the conversion. A blank cell means the default; a blank `growth_angle_deg` means straight
-down.
+`vinetrack check` reports the conversion. A blank cell means the default.
 """
 
 
@@ -111,9 +110,10 @@ def reference_page() -> str:
         heading, _, shared = title.partition("; ")
         parts += [f"## {heading}", ""]
         parts += [f"{shared[0].upper()}{shared[1:]}.", ""] if shared else []
-        parts += ["| name | unit | default | allowed | meaning | how to measure it |", "|---|---|---|---|---|---|"]
+        parts += ["| name | default | allowed | meaning, *how to measure it* |", "|---|---|---|---|"]
         for e in entries:
-            cells = (f"`{e.name}`", e.unit, e.default, e.allowed, e.meaning, e.measured)
+            measured = f" *{e.measured}*" if e.measured else ""
+            cells = (f"`{e.name}`", e.default, e.allowed, e.meaning + measured)
             parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         parts.append("")
     return "\n".join(parts)
