@@ -15,12 +15,14 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.track import track_recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [21402, 21403, 31114, 31207])
 def test_a_drawn_experiment_meets_no_fault_of_the_program(tmp_path: Path, seed: int) -> None:
     write_experiment(tmp_path / "drawn", seed)
     assert not is_let_through(tmp_path / "drawn") or run_through(tmp_path / "drawn", tmp_path / "out", False) == []
 
 
+@pytest.mark.slow
 def test_a_single_trial_of_a_falling_ball_reaches_the_end(tmp_path: Path) -> None:
     folder = tmp_path / "ball"
     folder.mkdir()

@@ -107,6 +107,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess
     return workdir / "results" / "my vines (1)", done
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_last_line_says_where_the_report_is(campaign: tuple) -> None:
     results, done = campaign
@@ -114,6 +115,7 @@ def test_last_line_says_where_the_report_is(campaign: tuple) -> None:
     assert (results / "report.html").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_headers_are_exactly_those_people_rely_on(campaign: tuple) -> None:
     results, _ = campaign
@@ -122,6 +124,7 @@ def test_headers_are_exactly_those_people_rely_on(campaign: tuple) -> None:
     assert (results / "kinematics" / "d12_0.csv").read_text().splitlines()[0] == KINEMATICS_HEADER
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_every_trial_of_the_sheet_is_listed_in_its_order_with_its_status(campaign: tuple) -> None:
     rows = read_rows(campaign[0] / "trials.csv")
@@ -131,6 +134,7 @@ def test_every_trial_of_the_sheet_is_listed_in_its_order_with_its_status(campaig
     assert (rows["torn"]["status"], rows["aside"]["status"]) == ("failed", "left_out")
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_steady_speeds_are_those_the_tracks_were_written_with(campaign: tuple) -> None:
     rows = read_rows(campaign[0] / "trials.csv")
@@ -140,6 +144,7 @@ def test_steady_speeds_are_those_the_tracks_were_written_with(campaign: tuple) -
             assert float(rows[f"d{diameter_mm}_{i}"]["x_ss_m_s"]) == pytest.approx(truth, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 @pytest.mark.parametrize("method", ["log_log", "both_axes"])
 def test_the_damping_law_is_the_one_the_tracks_were_written_with(campaign: tuple, method: str) -> None:
@@ -152,6 +157,7 @@ def test_the_damping_law_is_the_one_the_tracks_were_written_with(campaign: tuple
     assert low < fit["n"] < high
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_every_figure_with_content_is_there_as_png_and_svg_and_no_other(campaign: tuple) -> None:
     figures = campaign[0] / "figures"
@@ -164,6 +170,7 @@ def test_every_figure_with_content_is_there_as_png_and_svg_and_no_other(campaign
     assert written == set(drawn)
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_provenance_names_version_settings_and_the_hash_of_every_input(campaign: tuple) -> None:
     import hashlib
@@ -223,6 +230,7 @@ def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
     return read_rows(results / "trials.csv")
 
 
+@pytest.mark.slow
 def test_one_trial_gives_everything_but_a_law_and_says_why(tmp_path: Path) -> None:
     folder = tmp_path / "one"
     write_track(folder / "a.csv", 12, 20, 7)
@@ -277,6 +285,7 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
     assert all(row["reason"] for row in rows.values())
 
 
+@pytest.mark.slow
 def test_the_same_experiment_gives_the_same_bytes(tmp_path: Path) -> None:
     folder = tmp_path / "same"
     write_track(folder / "a.csv", 24, 26, 3)

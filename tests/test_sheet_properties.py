@@ -123,6 +123,7 @@ PLAIN = {
 }
 
 
+@pytest.mark.slow
 @settings(REPEATABLE, max_examples=120)
 @given(rows=SHEET, dialect=DIALECT)
 def test_a_sheet_reads_the_same_in_every_dialect(rows: list[dict[str, Any]], dialect: dict[str, Any]) -> None:
@@ -160,6 +161,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.slow
 @settings(REPEATABLE, max_examples=150)
 @given(rows=SHEET, data=st.data())
 def test_a_single_broken_cell_is_one_problem_that_names_it(rows: list[dict[str, Any]], data: st.DataObject) -> None:
@@ -213,6 +215,7 @@ FRAGMENTS = st.lists(st.sampled_from(PIECES) | st.binary(max_size=8), max_size=3
 BOMB = b"a0: &a0 [1]\n" + b"".join(b"a%d: &a%d [*a%d, *a%d]\n" % (i, i, i - 1, i - 1) for i in range(1, 60))
 
 
+@pytest.mark.slow
 @settings(REPEATABLE, max_examples=250)
 @given(name=NAMED_FILES, content=st.binary(max_size=300) | FRAGMENTS)
 @example(name="experiment.yaml", content=b"[" * 5000)

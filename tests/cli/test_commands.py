@@ -156,6 +156,7 @@ def results(experiment_commands: Path, tmp_path_factory: pytest.TempPathFactory)
     return folder
 
 
+@pytest.mark.slow
 def test_straight_from_a_folder_of_tracks_to_one_file_and_no_other(experiment_commands: Path, tmp_path: Path) -> None:
     before = sorted(experiment_commands.rglob("*"))
     code, output = run_commands("diagnose", experiment_commands, "--json", tmp_path / "answer.json")
@@ -168,6 +169,7 @@ def test_straight_from_a_folder_of_tracks_to_one_file_and_no_other(experiment_co
     assert sorted(experiment_commands.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_the_stage_writes_the_contract(results: Path) -> None:
     answer = json.loads((results / "diagnosis.json").read_text())
     assert answer["verdict"] == "missing"
@@ -182,12 +184,14 @@ def test_the_stage_writes_the_contract(results: Path) -> None:
     assert float(rows[1]["rms_left_out_m"]) < 0.5 * float(rows[0]["rms_left_out_m"])
 
 
+@pytest.mark.slow
 def test_every_trial_has_what_both_models_say_of_it(results: Path) -> None:
     paths = sorted((results / "diagnosis" / "predictions").glob("*.csv"))
     assert len(paths) == 6
     assert paths[0].read_text().splitlines()[0] == "time_s,lead_position_m,model_before_m,model_after_m"
 
 
+@pytest.mark.slow
 def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,6 +208,7 @@ def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
     assert len(list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))) == 3
 
 
+@pytest.mark.slow
 def test_saved_it_stands_in_the_model_of_the_experiment(results: Path, experiment_commands: Path) -> None:
     code, output = run_commands("add", "reservoir_depletion", results, "--save")
     assert code == 0, output
@@ -236,6 +241,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return experiment, results
 
 
+@pytest.mark.slow
 def test_a_law_is_written_beside_the_experiment_and_added(
     bench: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -263,6 +269,7 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     assert (settings.model[-1], settings.effects) == ("proposed_time", ("proposed_time.py",))
 
 
+@pytest.mark.slow
 def test_nothing_is_proposed_where_the_verdict_is_another(bench: tuple[Path, Path], tmp_path: Path) -> None:
     copy = shutil.copytree(bench[1], tmp_path / "results")
     diagnosis = json.loads((copy / "diagnosis.json").read_text())

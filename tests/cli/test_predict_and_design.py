@@ -87,6 +87,7 @@ def test_a_sheet_is_a_row_a_condition(tmp_path: Path) -> None:
     assert "uncertainties included" in output
 
 
+@pytest.mark.slow
 def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:
     vine = ("--diameter-mm", 24, "--thickness-um", 200, "--length-mm", 280, "--pressure-kPa", 25)
     output = run("predict", *vine, "--fit", fitted, *FEW).output
@@ -95,6 +96,7 @@ def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:
     assert "guess" not in output
 
 
+@pytest.mark.slow
 def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_path: Path) -> None:
     own = Path(__file__).parents[2] / "docs" / "own_effect.md"
     code = own.read_text().split("```python\n")[1].split("```")[0]
@@ -202,6 +204,7 @@ MISSING_OR_WRONG = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", MISSING_OR_WRONG)
 def test_design_refuses_with_exit_code_1(arguments: tuple[object, ...]) -> None:
     done = run_design(*arguments)

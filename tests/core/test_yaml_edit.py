@@ -105,6 +105,7 @@ words = st.lists(word, min_size=1, max_size=6, unique=True)
 comments = st.sampled_from(["", "  # why", " # [a, b]"])
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(old=words, new=words, comment=comments, block=st.booleans(), behind=st.booleans(), indent=st.integers(0, 3))
 def test_whatever_stood_there_only_the_list_changes(

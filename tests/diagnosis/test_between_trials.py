@@ -77,6 +77,7 @@ def worn(trials: list[Trial]) -> Pairs:
     return made(trials, range(len(trials)), lambda _, seen: 1 + 0.02 * seen, seed=1)
 
 
+@pytest.mark.slow
 def test_a_supply_that_empties_while_pressures_rise_is_named_with_its_rate(trials: list[Trial]) -> None:
     """Each trial has 0.15 % less than the one before of what the sheet says."""
     true = [replace(trial, pressure_Pa=trial.pressure_Pa * (1 - 0.0015 * i)) for i, trial in enumerate(trials)]
@@ -88,6 +89,7 @@ def test_a_supply_that_empties_while_pressures_rise_is_named_with_its_rate(trial
     assert abs(drift.value + 0.0015) < 3 * drift.sigma < 0.001
 
 
+@pytest.mark.slow
 def test_a_regulator_set_anew_in_mid_campaign_is_named_with_its_step_and_its_trial(trials: list[Trial]) -> None:
     """From the eleventh trial on the tube gets 4 % less than the sheet says, pressures rising."""
     true = [replace(trial, pressure_Pa=trial.pressure_Pa * (0.96 if i >= 10 else 1)) for i, trial in enumerate(trials)]
@@ -100,6 +102,7 @@ def test_a_regulator_set_anew_in_mid_campaign_is_named_with_its_step_and_its_tri
     assert step.vine == f"from {trials[10].name} on"
 
 
+@pytest.mark.slow
 def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials: list[Trial]) -> None:
     """Three days, pressures rising; the tube gets 5 % more on the second and 4 % less on the third."""
     count = len(trials)
@@ -125,6 +128,7 @@ def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> 
     assert drift.p > 0.003
 
 
+@pytest.mark.slow
 def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_model(trials: list[Trial]) -> None:
     """It decides nothing where the sheet states no order; but B and n hold it, and a reader must know."""
     pairs = made(trials, range(len(trials)), lambda _, seen: 1 + 0.01 * seen, seed=11)
@@ -143,6 +147,7 @@ def other_tube(trial: Trial) -> bool:
     return trial.pressure_Pa >= (38e3 if trial.diameter_m > 0.02 else 50e3)
 
 
+@pytest.mark.slow
 def test_another_tube_for_high_pressures_is_named(trials: list[Trial]) -> None:
     pairs = made(trials, range(len(trials)), lambda trial, _: 1.1 if other_tube(trial) else 1.0, seed=3)
     known = [(replace(trial, specimen="b" if other_tube(trial) else "a"), track) for trial, track in pairs]
@@ -151,6 +156,7 @@ def test_another_tube_for_high_pressures_is_named(trials: list[Trial]) -> None:
     assert "specimen" in result.answer_set
 
 
+@pytest.mark.slow
 def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
     values = damping_values(trials)
     n = "eversion_damping.n"
@@ -165,6 +171,7 @@ def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
         assert abs(number.value - exponent) < 4 * number.sigma
 
 
+@pytest.mark.slow
 def test_depletion_keeps_its_name_in_random_order(trials: list[Trial]) -> None:
     nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=5)
     pairs = pairs_of(grow(trials, nature))

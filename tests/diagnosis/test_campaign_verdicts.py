@@ -317,6 +317,7 @@ def test_a_chamber_that_was_misread_is_a_depletion(tmp_path, row, seed):
 # Payloads that weigh other than stated: one for each vine, of which one may be mistyped.
 
 
+@pytest.mark.slow
 def test_one_mistyped_payload_of_several_is_named_with_its_vine(tmp_path):
     """The payload of one of two vines weighs 15 % more than stated."""
     write_experiment(campaign("payload_mistyped", 912, (24, 40)), tmp_path / "e")
@@ -345,6 +346,7 @@ def clean_pairs(tmp_path_factory):
     return list(fit.pairs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("slip", "named", "size"),
     [
@@ -404,6 +406,7 @@ def without_noise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path
     return tmp_path / "simulated", float(shot.truth["truths"]["eversion_damping.n"])  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_nothing_is_missing_from_a_simulation_of_the_model_itself(without_noise: tuple[Path, float]) -> None:
     """What the integrator errs by, 1 µm in a metre, had passed for motion that is noisier than rest."""
     folder, n = without_noise
@@ -435,6 +438,7 @@ def asked_of_angle(pairs: Pairs) -> Diagnosis:
     return vt.diagnose(pairs, candidates=ANGLE_RIVALS, ladder=False, advice=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stated_deg", "true_deg"), [(90, 0), (0, 90)], ids=["level for down", "blank for level"])
 def test_a_loaded_vine_tells_that_its_angle_is_wrong(stated_deg: float, true_deg: float) -> None:
     told = asked_of_angle(filmed(Vine(24, 200, 280), (14, 28, 41), 35.6, stated_deg, true_deg))

@@ -41,6 +41,7 @@ HIDDEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HIDDEN)
 def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
     values, start = HIDDEN[name]
@@ -74,6 +75,7 @@ def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_foun
         assert begun[0][name] == pytest.approx(value)
 
 
+@pytest.mark.slow
 def test_an_effect_that_adds_nothing_makes_no_fit_worse():
     base = vt.fit(vt.base_model(), grown(seed=32), profile=False)
     for name in HIDDEN:
@@ -150,6 +152,7 @@ def test_a_threshold_is_begun_within_a_factor_of_two_of_any_plausible_size():
     assert all(after <= 2 * before for before, after in itertools.pairwise(sizes))
 
 
+@pytest.mark.slow
 def test_a_static_yield_far_above_the_yield_pressure_is_found():
     pairs = [interrupted(k, pressure_Pa) for k, pressure_Pa in enumerate((14e3, 14e3, 18e3, 18e3, 22e3, 22e3))]
     asked = ("static_yield", "tail_friction", "air_drag")
@@ -198,6 +201,7 @@ def grown_with_tail(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -
     return [(replace(one.stated, tail_slack="taut"), one.track) for one in grow(trials, nature)]
 
 
+@pytest.mark.slow
 def test_a_slack_tail_is_found_where_the_model_has_it_push():
     found = fit(vt.base_model(), grown_with_tail(60.0, "free"), profile=False)
     assert pushes(found)
@@ -215,6 +219,7 @@ def test_a_bare_vine_on_the_level_pulls_its_tail():
     assert slack_fit(found) is None
 
 
+@pytest.mark.slow
 def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_pushes(monkeypatch):
     found = fit(vt.base_model(), grown_with_tail(60.0, "free"), profile=False)
     # As a fit looks that has taken the slack for scatter: no tail pushes, and pressures deviate by their most.
@@ -225,6 +230,7 @@ def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_push
     assert slack.sigma > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suspect", [False, True])
 def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_better(
     monkeypatch: pytest.MonkeyPatch, *, suspect: bool

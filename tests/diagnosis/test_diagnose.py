@@ -126,6 +126,7 @@ def test_the_answer_can_be_written_as_json(depleted: Diagnosis, tmp_path: Path) 
     assert np.allclose(np.diag(matrix), 1)
 
 
+@pytest.mark.slow
 def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do() -> None:
     found = vt.diagnose(grown({"length_scale.eps": 0.06}, seed=7002, trials=sheet(35.6)[::2]), ladder=False)
     assert found.verdict == "artefact"
@@ -135,6 +136,7 @@ def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do() -> None:
     assert found.next_experiment["calibration"]
 
 
+@pytest.mark.slow
 def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
     once = depleted_pairs[::2]  # one trial of every condition
     trial, track = next((trial, track) for trial, track in once if trial.pressure_Pa == 40e3)
@@ -166,6 +168,7 @@ def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diag
     assert with_lost_frames(depleted, LostFrames()) is depleted
 
 
+@pytest.mark.slow
 def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
     own = own_effects([write_effect(tmp_path)])
     pairs = _with_own(own[NAME], "k", 1.5, seed=7003)
@@ -198,6 +201,7 @@ def _with_own(effect: vt.effects.Effect, symbol: str, size: float, *, seed: int)
     return pairs
 
 
+@pytest.mark.slow
 def test_what_no_effect_explains_is_unexplained_and_drawn() -> None:
     pairs = []
     for trial, track in grown(seed=7004, trials=sheet()[:6:2]):  # one vine
@@ -317,6 +321,7 @@ def balls() -> list[tuple[Trial, Track]]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [["gravity"], ["gravity", "payload_friction"]])
 def test_the_drag_of_falling_balls_is_named(balls: list[tuple[Trial, Track]], model: list[str]) -> None:
     found = vt.diagnose(balls, model=vt.make_model(model), ladder=False, advice=False)

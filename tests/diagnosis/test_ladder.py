@@ -68,6 +68,7 @@ def with_the_truth(pairs: Pairs) -> Fit:
     return vt.fit(truth, pairs, fixed=held, profile=False)
 
 
+@pytest.mark.slow
 def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(
     fits: tuple[Fit, Fit], pairs: Pairs
 ) -> None:
@@ -82,6 +83,7 @@ def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(
     assert table.attrs["notes"] == []
 
 
+@pytest.mark.slow
 def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs: Pairs) -> None:
     """By hand: the model fitted anew to all other conditions, and laid on the one that was left out."""
     one_vine = [pair for pair in pairs if pair[0].name.startswith("R2")]
@@ -109,6 +111,7 @@ def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vi
     assert sorted(trial.name for trial in highest_pressure(fits[1]).trials) == [name for name in names if "48" in name]
 
 
+@pytest.mark.slow
 def test_the_highest_pressure_is_that_of_each_vine(pairs: Pairs) -> None:
     lower = [pair for pair in pairs if "R4_48" not in pair[0].name and pair[0].name.endswith("_1")]
     found = vt.fit(vt.base_model(), lower, profile=False)
@@ -179,6 +182,7 @@ def test_b_and_n_come_home_along_the_ladder(fits: tuple[Fit, Fit]) -> None:
     assert len(table) == sum(len(one.numbers) for one in fits)
 
 
+@pytest.mark.slow
 def test_what_is_left_out_of_24_trials_is_fitted_from_near_its_end(
     fits: tuple[Fit, Fit], pairs: Pairs, monkeypatch: pytest.MonkeyPatch
 ) -> None:

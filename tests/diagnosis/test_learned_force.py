@@ -100,6 +100,7 @@ def proposal(tmp_path_factory: pytest.TempPathFactory) -> Proposal:
     return propose(vt.base_model(), pairs, lambda _: None)
 
 
+@pytest.mark.slow
 def test_a_force_without_a_formula_is_proposed_as_a_table_that_explains_the_misfit(proposal: Proposal) -> None:
     table = proposal.table
     assert table is not None
@@ -111,6 +112,7 @@ def test_a_force_without_a_formula_is_proposed_as_a_table_that_explains_the_misf
     assert math.isfinite(table.effect.functions["tail_force"](zero, None, 1.0))
 
 
+@pytest.mark.slow
 def test_waves_along_the_growth_are_learned_with_their_variable_and_their_size(proposal: Proposal) -> None:
     assert proposal.table is not None
     learned = proposal.table.learned
@@ -292,6 +294,7 @@ def test_the_force_curve_peaks_on_the_patch_in_every_condition(patch: MissingFor
         assert -0.7 < lowest["force_N"] - one["force_N"].median() < -0.2
 
 
+@pytest.mark.slow
 def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "ripple", -0.5, 92))
     assert found.laws["law"].iloc[0] == "periodic"
@@ -307,6 +310,7 @@ def test_a_friction_that_falls_with_speed_is_identified(tmp_path: Path) -> None:
     assert found.depends_on["speed"] > 0.9
 
 
+@pytest.mark.slow
 def test_a_force_that_grows_with_time_is_distinguished_from_one_that_grows_with_travel(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "growing", -0.3, 94))
     assert found.laws["law"].iloc[0] == "time"
@@ -428,6 +432,7 @@ def test_the_effect_file_of_a_law_reproduces_the_law(seen: DetectedLaw, tmp_path
     assert effect.worked[0].expected != 0
 
 
+@pytest.mark.slow
 def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path: Path) -> None:
     pairs = hidden_force(sheet((4,)), 101, "growing", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)

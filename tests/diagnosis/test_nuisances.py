@@ -93,6 +93,7 @@ def seen_crookedly() -> Pairs:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect(make):
     assert not asked(make()).rejects_model
@@ -116,6 +117,7 @@ def through_a_lens(allowance_m: float) -> Pairs:
     ]
 
 
+@pytest.mark.slow
 def test_a_lens_of_a_tenth_of_a_millimetre_is_no_physics_where_that_much_is_allowed_for():
     assert not asked(through_a_lens(1e-4)).rejects_model
     assert asked(through_a_lens(0.0)).rejects_model

@@ -86,6 +86,7 @@ def test_few_trials_say_nothing_and_many_odd_ones_are_no_slips(campaign):
     assert odd(stated(campaign, t0=12, t4=10, t6=13, t9=15)) == {}
 
 
+@pytest.mark.slow
 def test_a_diagnosis_without_a_cause_names_the_row(campaign):
     result = diagnose(stated(campaign, t2=12), candidates=["tail_friction"], ladder=False, advice=False)
     assert result.verdict == "unexplained"

@@ -171,6 +171,7 @@ def test_simulated_diagnoses_are_counted() -> None:
     assert rates.to_json()["rate"] == 0.5
 
 
+@pytest.mark.slow
 def test_a_simulated_campaign_is_diagnosed_with_its_effect() -> None:
     found = simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", 0.02, 3)
     assert found.failed == ""

@@ -257,6 +257,7 @@ def emptying() -> list[tuple[Trial, Track]]:
     return pairs
 
 
+@pytest.mark.slow
 def test_the_base_model_fails_on_a_chamber_that_empties(emptying: list[tuple[Trial, Track]]) -> None:
     assert compare(vt.fit(vt.base_model(), emptying, profile=False), emptying).table["ratio"].min() > 3
 

@@ -275,6 +275,7 @@ def test_shapes_that_are_the_same_curve_count_once(shapes: int) -> None:
     assert family.threshold("only") == pytest.approx(norm.isf(3e-3 / 2), abs=0.02)
 
 
+@pytest.mark.slow
 def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share() -> None:
     """Against two million draws from another generator."""
     cosines, level = alike_within(), 3e-3

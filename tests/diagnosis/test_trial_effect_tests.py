@@ -70,6 +70,7 @@ def test_replicates_that_deviate_together_are_seen() -> None:
     assert between_conditions_p(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
 
 
+@pytest.mark.slow
 def test_replicates_that_scatter_are_not() -> None:
     assert all(between_conditions_p(fitted(grown(seed=seed))) > 0.05 for seed in (32, 33, 34))
 
@@ -107,6 +108,7 @@ def test_what_is_louder_in_motion_than_at_rest_is_heard() -> None:
     assert noise_in_motion_p(fitted(wandering(at_rest=False))) < 1e-5
 
 
+@pytest.mark.slow
 def test_noise_that_is_the_same_at_rest_is_noise() -> None:
     assert noise_in_motion_p(fitted(wandering(at_rest=True))) > 1e-2
     assert all(noise_in_motion_p(fitted(grown(seed=seed))) > 1e-2 for seed in (35, 36))

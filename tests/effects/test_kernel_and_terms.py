@@ -53,6 +53,7 @@ def accelerations(
     return [acceleration(t, 2 * a, 2 * b, p, arrays) for t, a, b, p in zip(time, y, v, pressures, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])
 @pytest.mark.parametrize("name", catalogue())
 def test_each_effect(name: str, vine: Vine) -> None:

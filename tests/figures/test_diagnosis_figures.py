@@ -340,6 +340,7 @@ def test_final_speeds_stand_beside_eq2_where_payloads_differ() -> None:
     assert draw_paper_speeds(speeds().assign(pressure_kPa=range(6)), speeds()) is None
 
 
+@pytest.mark.slow
 def test_nothing_is_cut_off() -> None:
     assert_nothing_is_cut_off(draw_paper_position(motions(), means(), ERRORS))
     assert_nothing_is_cut_off(draw_paper_damping(points(), damping()))

@@ -165,6 +165,7 @@ def test_the_same_figure_gives_the_same_bytes() -> None:
     assert first == second
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY_FIGURE)
 def test_nothing_of_a_campaign_is_cut_off(name: str) -> None:
     assert_nothing_is_cut_off(EVERY_FIGURE[name]())
@@ -292,6 +293,7 @@ def campaign_comparison(n_conditions: int, n_trials: int = 2) -> tuple[pd.DataFr
     return table, {name: trajectory(n_trials) for name in names}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", DRAWINGS)
 @pytest.mark.parametrize("n_conditions", [1, 12, 40])
 def test_every_condition_has_a_panel_with_its_numbers(draw, n_conditions: int) -> None:  # type: ignore[no-untyped-def]

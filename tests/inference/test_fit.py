@@ -120,6 +120,7 @@ def test_whitened_residuals_are_white_and_of_size_one(campaign: Campaign) -> Non
     assert abs(neighbours) < 0.03
 
 
+@pytest.mark.slow
 def test_between_trial_standard_deviations_of_pressure_and_B_are_separated() -> None:
     pairs, _ = small_campaign(seed=11, damping=0.04, pressure=0.0, replicates=4)
     fit = vt.fit(vt.base_model(), pairs)
@@ -308,6 +309,7 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     assert done.stdout.strip() == ""
 
 
+@pytest.mark.slow
 def test_an_incomplete_model_gives_sensible_values_and_is_corrected_by_the_missing_effect() -> None:
     draw = np.random.default_rng(21)
     pairs = []
@@ -563,6 +565,7 @@ def refitted(pairs, vine):
     return vt.fit(vt.base_model(), heavier, profile=False)
 
 
+@pytest.mark.slow
 def test_film_influence_agrees_with_refits_with_heavier_film(film_pairs, film_fit):
     squares = np.zeros(len(film_fit.numbers))
     for vine in dict.fromkeys(trial.vine for trial, _ in film_pairs):

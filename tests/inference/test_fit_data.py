@@ -46,6 +46,7 @@ def test_a_rest_with_visible_noise_is_kept_despite_rounding():
     assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
 
 
+@pytest.mark.slow
 def test_origins_of_rounded_tracks_have_the_stated_errors():
     """Taken for independent values, twenty equal ones at rest gave origins that were off by five standard errors."""
     errors = []

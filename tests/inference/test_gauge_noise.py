@@ -92,6 +92,7 @@ def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset: float)
     assert np.std(off[others]) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exponent", [1.0, 1.4])
 def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent: float):
     """Twenty traces with 5 Pa of noise: their mean is off by no more than a fifth of a pascal."""
@@ -127,6 +128,7 @@ def test_a_corner_between_two_readings_is_where_the_growth_begins():
     assert np.max(np.abs(off_Pa)) < 0.5 * np.max(cut_Pa)
 
 
+@pytest.mark.slow
 def test_a_bend_that_few_of_many_steady_traces_show_by_chance_is_noise():
     draw = np.random.default_rng(8)
     noisy = [20e3 + 100.0 * draw.standard_normal(150) for _ in range(60)]
@@ -139,6 +141,7 @@ def test_a_bend_that_few_of_many_steady_traces_show_by_chance_is_noise():
     assert bent <= 2
 
 
+@pytest.mark.slow
 def test_stated_errors_cover_the_actual_errors():
     """Of chambers that empty: what is left of the noise, along each error, is as large as stated."""
     made = [emptied(seed) for seed in range(40)]
@@ -278,6 +281,7 @@ def test_noise_behind_a_filter_is_detected_as_correlated():
         assert np.mean(sigmas) == pytest.approx(100.0 * np.sqrt(1 - rho**2), rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("per_reading", [1, 6])
 def test_steady_pressures_stay_nearly_constant(per_reading: int):
     """By a gauge that is read at every frame, or at every sixth and joined by lines."""

@@ -73,6 +73,7 @@ def deviations(make: Callable[[int], Pairs], seeds: Iterable[int]) -> tuple[floa
     return tuple(float(np.sqrt(np.mean(np.square(z)))) for z in (by_noise, stated))  # type: ignore[return-value]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "seeds"), [(misread, range(60, 65)), (bent, range(60, 72))])
 def test_robust_errors_are_correct_where_model_errors_are_too_small(make: Callable[[int], Pairs], seeds: range) -> None:
     by_noise, stated = deviations(make, seeds)
@@ -111,6 +112,7 @@ def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials: int) -> None
     assert np.mean(found) == pytest.approx(plain[0, 0], rel=0.08)
 
 
+@pytest.mark.slow
 def test_trials_that_scatter_as_modelled_have_the_model_errors() -> None:
     ratios = []
     for seed in range(60, 64):
@@ -154,6 +156,7 @@ def test_drops_that_agree_are_weighted_by_their_noise() -> None:
     assert both.sigma == pytest.approx(first.sigma, rel=0.15)
 
 
+@pytest.mark.slow
 def test_intervals_from_few_drops_contain_the_true_drag() -> None:
     held = []
     for campaign in range(40):
@@ -253,6 +256,7 @@ def next_of(pairs: list, model: vt.Model, place: int) -> TrialFit:
     return vt.predict(vt.fit(model, [*pairs[:place], *pairs[place + 1 :]], profile=False), [pairs[place]])[0]
 
 
+@pytest.mark.slow
 def test_the_next_of_scattering_drops_is_within_its_band() -> None:
     held = []
     for campaign in range(30):

@@ -74,6 +74,7 @@ def test_an_error_of_a_trace_is_estimated(fit: vt.Fit):
     assert np.max(np.abs(after.trace[1] - pressure_Pa)) < 0.3 * np.max(np.abs(2.0 * errors_Pa[:, 0]))
 
 
+@pytest.mark.slow
 def test_a_poor_model_corrects_no_pressure(laboratory: tuple[Path, float]):
     held = vt.fit(vt.base_model(), laboratory[0], fixed=["n"], start={"eversion_damping.n": 0.9}, profile=False)
     assert held.chi2_per_dof > 3
@@ -176,11 +177,13 @@ def traced() -> Fit:
     return vt.fit(vt.base_model(), seen, profile=False)
 
 
+@pytest.mark.slow
 def test_the_tracks_are_explained_to_their_noise(traced: Fit) -> None:
     assert traced.chi2_per_dof < 1.15
     assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
 
 
+@pytest.mark.slow
 def test_pressure_deviations_are_limited_by_the_noise_of_the_gauge(traced: Fit) -> None:
     for trial, item in zip(traced.trials, traced.predictor.data, strict=True):
         samples = np.count_nonzero(item.time_s >= trial.release_s)
@@ -188,6 +191,7 @@ def test_pressure_deviations_are_limited_by_the_noise_of_the_gauge(traced: Fit) 
         assert abs(trial.pressure_deviation) < 4 * item.gauge_error
 
 
+@pytest.mark.slow
 def test_an_error_of_a_recorded_pressure_affects_its_own_trial_alone(traced: Fit) -> None:
     """The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds."""
     predictor = traced.predictor

@@ -53,6 +53,7 @@ def test_what_is_no_results_folder_is_said(tmp_path: Path) -> None:
         vt.load(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_story_of_the_readme_runs(small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pattern = r"\n((?:    [^\n]*\n|\n)*    import vinetrack as vt\n(?:    [^\n]*\n|\n)*)"
     story = re.search(pattern, README.read_text("utf-8"))

@@ -24,6 +24,7 @@ def test_there_are_twenty_of_them() -> None:
     assert len(FUNCTIONS) >= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(FUNCTIONS))
 def test_the_example_does_what_it_shows(name: str) -> None:
     function = FUNCTIONS[name]

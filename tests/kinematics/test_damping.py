@@ -261,6 +261,7 @@ def many() -> dict[str, dict[str, int]]:
     return counted
 
 
+@pytest.mark.slow
 @both_methods
 @pytest.mark.parametrize("quantity", ["n", *B])
 def test_95_per_cent_intervals_hold_the_truth_so_often(many: dict, method: str, quantity: str) -> None:
@@ -269,6 +270,7 @@ def test_95_per_cent_intervals_hold_the_truth_so_often(many: dict, method: str, 
     assert low <= many[method][quantity] <= high
 
 
+@pytest.mark.slow
 def test_where_yield_pressures_are_off_only_the_total_interval_covers() -> None:
     """By their stated 0.2 kPa, the same for all trials of a vine: resampling trials cannot see that."""
     inner = outer = 0

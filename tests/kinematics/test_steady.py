@@ -120,6 +120,7 @@ def test_a_plateau_declining_by_two_per_cent_is_accepted_and_its_drift_reported(
     assert window.drift_95[0] < window.drift < window.drift_95[1]
 
 
+@pytest.mark.slow
 def test_drift_interval_covers_the_truth():
     covered = 0
     for seed in range(1000, 1100):
@@ -249,6 +250,7 @@ def test_where_inertia_rules_there_is_no_window() -> None:
     assert not window.accepted
 
 
+@pytest.mark.slow
 def test_a_chamber_that_empties_gives_the_law_once_its_pressure_is_known() -> None:
     points = [analysed(vine(p), seed=1010 + i, traced=True).point for i, p in enumerate((12, 14, 16, 18, 20, 22, 24))]
     table = pd.DataFrame([dict(point) for point in points])

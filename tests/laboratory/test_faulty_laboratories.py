@@ -178,6 +178,7 @@ def test_a_fault_that_hardly_shows_need_not_be_named():
 # Visibility.
 
 
+@pytest.mark.slow
 def test_a_fault_is_as_visible_as_the_noise_lets_it_be():
     laboratory, draw = drawn()
     strong = faults.lens(2, 2)(laboratory, draw)

@@ -53,6 +53,7 @@ from vinetrack.video.axis import Axis
 GAMMA = "reservoir_depletion.gamma"
 
 
+@pytest.mark.slow
 def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> None:
     """No point of a doubtful rest is fitted, but it still determines the origin."""
     experiment = make_experiment(tmp_path / "vines", SMALL[:4])
@@ -139,6 +140,7 @@ def test_the_first_fit_is_that_of_the_workflow(campaign: Campaign, first: Fitted
         assert first.choice.numbers[name] == pytest.approx(value, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campaign: Campaign, first: Fitted) -> None:
     steps: list[Step] = []
     choice = first.choice.with_effect("reservoir_depletion")
@@ -339,6 +341,7 @@ async def _origin_of_elsewhere(address: str) -> str:
     return "let in"
 
 
+@pytest.mark.slow
 def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign: Campaign) -> None:
     with Served(campaign.folder, "--port", "0") as served:
         address = served.address

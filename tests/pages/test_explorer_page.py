@@ -113,6 +113,7 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) 
     browser.click("hold")
 
 
+@pytest.mark.slow
 def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_path: Path) -> None:
     experiment = tmp_path / "vines"
     shutil.copytree(campaign.experiment.folder, experiment)
@@ -130,6 +131,7 @@ def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_
     page.page.close()
 
 
+@pytest.mark.slow
 def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: BackgroundFit, tmp_path: Path) -> None:
     folder = tmp_path / "vines"
     shutil.copytree(campaign.folder, folder)
@@ -233,6 +235,7 @@ def of_fit(browser_numbers: Browser) -> pd.DataFrame:
     return compare(fitted, browser_numbers.page.campaign.pairs).table
 
 
+@pytest.mark.slow
 def test_every_step_of_a_user_shows_the_errors_of_a_comparison(browser_numbers: Browser, results: Path) -> None:
     opened = pd.read_csv(results / "comparison.csv")
     assert_shows(browser_numbers, opened, 1e-6)
@@ -264,6 +267,7 @@ def test_every_step_of_a_user_shows_the_errors_of_a_comparison(browser_numbers: 
     assert errors_mm(browser_numbers) == pytest.approx(compared_mm(opened, "rms_position_m"), rel=0.02)
 
 
+@pytest.mark.slow
 def test_add_finds_what_the_page_finds_and_until_the_next_run_the_page_says_which_model_it_shows(
     browser_numbers: Browser, results: Path
 ) -> None:
@@ -320,6 +324,7 @@ def searching(monkeypatch: pytest.MonkeyPatch, search: Callable[..., WrittenProp
     monkeypatch.setattr(controls, "propose_effect", search)
 
 
+@pytest.mark.slow
 def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     opened: tuple[Browser, list[BackgroundFit]], unexplained: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:

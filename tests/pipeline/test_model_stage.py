@@ -168,6 +168,7 @@ def test_where_all_trials_failed_the_run_goes_on_and_says_so(tmp_path: Path) -> 
     assert refused(experiment, results).startswith("No trial can be fitted")
 
 
+@pytest.mark.slow
 def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> None:
     """Three balls let go, filmed at 240 frames a second with 0.2 mm of noise; g = 9.80665."""
     experiment = tmp_path / "balls"

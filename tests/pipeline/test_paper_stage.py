@@ -57,12 +57,14 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return results, done.output
 
 
+@pytest.mark.slow
 def test_the_table_has_its_columns_and_the_command_counts_it(beside: tuple[Path, str]) -> None:
     results, said = beside
     assert (results / "paper.csv").read_text(encoding="utf-8").splitlines()[0] == HEADER
     assert "not checkable" in said
 
 
+@pytest.mark.slow
 def test_every_table_and_figure_is_there(beside: tuple[Path, str]) -> None:
     results, _ = beside
     for name in PAPER_TABLES:
@@ -71,6 +73,7 @@ def test_every_table_and_figure_is_there(beside: tuple[Path, str]) -> None:
         assert "<svg" in (results / "figures" / f"{name}.svg").read_text(encoding="utf-8"), name
 
 
+@pytest.mark.slow
 def test_what_was_grown_is_answered_and_what_was_not_is_blank(beside: tuple[Path, str]) -> None:
     rows = pd.read_csv(beside[0] / "paper.csv").set_index("row")
     assert rows.loc["n_both_axes", "ours"] == pytest.approx(0.37, abs=0.04)
@@ -83,6 +86,7 @@ def test_what_was_grown_is_answered_and_what_was_not_is_blank(beside: tuple[Path
     assert math.isnan(rows.loc["efficiency_power_of_wall", "ours"])
 
 
+@pytest.mark.slow
 def test_positions_are_compared_in_centimetres(beside: tuple[Path, str]) -> None:
     positions = pd.read_csv(beside[0] / "paper_positions.csv")
     assert positions["pressure_kPa"].tolist() == [28.0]

@@ -61,6 +61,7 @@ def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> No
     assert figure.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "trials.csv").write_text(SHEET)
     (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, new_vines: no}\n")
@@ -92,6 +93,7 @@ def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, mon
     assert (leak.detections.count, leak.value, leak.named) == (2, pytest.approx(0.01), (("leak", 2),))
 
 
+@pytest.mark.slow
 def test_the_trials_that_would_reveal_most_are_recommended(tmp_path: Path) -> None:
     (tmp_path / "trials.csv").write_text(SHEET)
     (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, trials: 2}\n")

@@ -99,6 +99,7 @@ def test_scale_is_that_of_the_settings_of_an_experiment(clip: Path, tmp_path: Pa
     assert json.loads(done.stdout)["mm_per_px"] == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_a_folder_of_pictures_is_one_recording(scene: Scene, tmp_path: Path) -> None:
     folder = write_images(tmp_path / "shots", scene.frames)
     done = track(folder, "--out", tmp_path / "out")

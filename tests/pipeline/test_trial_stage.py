@@ -116,6 +116,7 @@ def test_a_film_that_is_replaced_is_tracked_again(tracked: tuple[Path, Path], mo
     assert again(tracked, monkeypatch) == []
 
 
+@pytest.mark.slow
 def test_a_changed_scale_gives_the_metres_of_a_film_that_is_tracked_anew(
     tracked: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -140,6 +141,7 @@ def test_what_is_kept_is_every_bit_of_a_tracking(tracked: tuple[Path, Path]) -> 
     assert np.nanmax(in_metres(again, trial, 3e-4).track.lead_position_m) > 0.15
 
 
+@pytest.mark.slow
 def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked: tuple[Path, Path], tmp_path: Path) -> None:
     folder, results = tracked
     write_sheet(folder)

@@ -226,6 +226,7 @@ def test_a_sheet_of_errors_alone_stops_before_any_work(tmp_path: Path) -> None:
         check_before_run(RunPaths(experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3,\n"), tmp_path), print)
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path: Path) -> None:
     experiment(tmp_path / "vines: ü & 'q'")
     folder = experiment(tmp_path / "vines: ü & 'q' #2 $(x);")

@@ -137,6 +137,7 @@ def test_faults_in_clear_motion_are_found(vine, noise_m, rho, fault):
     assert right / tried >= 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_m", [3e-5, 1e-4, 3e-4])
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_nothing_is_found_in_clean_trials(noise_m, rho):
@@ -151,6 +152,7 @@ def test_nothing_is_found_in_clean_trials(noise_m, rho):
     assert alarms == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.5])
 def test_outliers_of_heavy_tails_change_no_times(rho):
     """Student's t with 3 degrees of freedom puts a point a whole step ahead or behind now and then."""

@@ -33,6 +33,7 @@ def tracks(seed: int, rho: float = 0.0, count: int = 8, smooth=lambda y: y) -> l
     return [(TRIAL, as_track(TIME_S, smooth(y))) for y in noisy]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.3, 0.6, 0.85])
 def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
     assert all(detect_smoothing(tracks(seed, rho)) is None for seed in range(351, 371))

@@ -210,6 +210,7 @@ def tracked(plan: Plan) -> tuple[Tracking, np.ndarray]:
     return pictures.tracked(luma, plan.exposure), luma
 
 
+@pytest.mark.slow
 def test_shake_added_to_a_position_is_where_the_edge_is_seen():
     """At rest the edge is where each picture has it: seen there, less the tracked one, is the shake, of rms 0.8 px."""
     found, luma = tracked(Plan(seed=41, shake=1.2, rest_frames=40))

@@ -40,6 +40,7 @@ def falling_disc(seed, body=150.0, back=70.0, marks=25.0, rest=8, n=185):
 BALL = Trial(name="ball", capture_fps=RATE, m_per_px=0.5e-3, travel_ratio=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("body", "back"), [(150.0, 70.0), (60.0, 55.0)], ids=["bright", "dark on dark"])
 def test_falling_disc(body, back):
     frames, row = falling_disc(301, body, back)
@@ -52,6 +53,7 @@ def test_falling_disc(body, back):
     assert 2 * fall[0] == pytest.approx(9.81, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_neighbour_in_a_wide_strip_is_not_followed():
     """Another disc, 60 px beside the first, falls later: the wide axis drawn by hand along the first holds both."""
     frames, row = falling_disc(305)
@@ -63,6 +65,7 @@ def test_a_neighbour_in_a_wide_strip_is_not_followed():
     assert (track.edge_px[used] - row[used]).std() < 0.15
 
 
+@pytest.mark.slow
 def test_a_bounce_ends_the_track():
     frames, row = falling_disc(307, n=185)
     impact = int(np.argmax(row > 340))
@@ -88,6 +91,7 @@ def test_places_that_hop_between_bodies_are_refused():
     assert not hops_between_bodies(180 - np.abs(9 * number - 180), seen)
 
 
+@pytest.mark.slow
 def test_a_body_that_disappears_is_lost():
     """Taken away in mid-fall: nothing that remains is followed in its place."""
     frames, _ = falling_disc(308, n=185)
@@ -98,6 +102,7 @@ def test_a_body_that_disappears_is_lost():
     assert not track.usable[151:].any()
 
 
+@pytest.mark.slow
 def test_body_that_leaves_the_picture_ends_the_track():
     frames, row = falling_disc(303, n=215)
     track = track_frames(in_memory(frames), BALL, RATE).track

@@ -79,6 +79,7 @@ def test_scale_of_a_random_pose_is_within_a_thousandth_and_its_stated_error(kind
     assert found.reprojection_px < 0.12
 
 
+@pytest.mark.slow
 def test_stated_errors_of_many_fits_are_neither_too_small_nor_too_large():
     """Corners with noise of a known size, 100 times: z-scores of the scale have a standard deviation of one."""
     rng = np.random.default_rng(2100)
@@ -170,6 +171,7 @@ def test_a_small_target_states_a_larger_error():
 # --- pictures, clips, the recording itself
 
 
+@pytest.mark.slow
 def test_moved_target_shows_the_plane_first_and_the_lens_throughout(tmp_path):
     moves = ({}, *({"centre_m": (x, 0.0), "tilt_y_deg": tilt} for x, tilt in ((0.03, 5), (-0.04, -10), (0.06, 3))))
     scene = replace(DEMO, camera=CAMERA)
@@ -181,6 +183,7 @@ def test_moved_target_shows_the_plane_first_and_the_lens_throughout(tmp_path):
     assert found.along(*AXIS).scale_rel_sigma < 1.2 * alone.along(*AXIS).scale_rel_sigma
 
 
+@pytest.mark.slow
 def test_target_hanging_in_the_trials_own_recording(tmp_path):
     target = Target(squares=(16, 3), square_m=0.016, marker_m=0.0115, centre_m=(0.02, 0.032))
     scene = replace(
@@ -216,6 +219,7 @@ def board_picture():
     return picture()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -231,6 +235,7 @@ def test_charuco_that_is_not_as_stated(board_picture, changes):
         calibrate_pictures([board_picture], charuco(**changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [charuco(), checkerboard()])
 def test_picture_without_a_target(board):
     empty = np.random.default_rng(2005).integers(60, 90, (320, 960)).astype(np.uint8)
@@ -330,6 +335,7 @@ def printed_charuco(squares: tuple[int, int], name: str, square_px: int = 80, ma
     return np.pad(picture, 60, constant_values=200)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("squares", "name"), [((14, 5), "DICT_4X4_50"), ((7, 9), "DICT_5X5_50"), ((12, 9), "DICT_6X6_100")]
 )

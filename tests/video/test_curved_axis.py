@@ -118,6 +118,7 @@ def followed(scene: BentScene, axis: Axis, **given) -> Tracking:
     return tracked(scene.frames, scene.plan.exposure, axis, **given)
 
 
+@pytest.mark.slow
 def test_the_edge_of_a_bent_tube_is_followed_to_a_fraction_of_a_pixel(bent: BentScene) -> None:
     tracking = followed(bent, drawn(bent))
     track = tracking.track
@@ -132,6 +133,7 @@ def test_the_edge_of_a_bent_tube_is_followed_to_a_fraction_of_a_pixel(bent: Bent
     assert tracking.tube_width_px == pytest.approx(2 * bent.plan.radius, rel=0.1)
 
 
+@pytest.mark.slow
 def test_metres_are_lengths_along_the_curve_in_the_tilted_plane(bent: BentScene) -> None:
     parameters = np.array([0.45, 0.02, 0.0, -0.01, 0.4, 0.0, 0.08, 0.05, -0.05, 0.0])
     covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
@@ -156,6 +158,7 @@ def test_metres_are_lengths_along_the_curve_in_the_tilted_plane(bent: BentScene)
     assert off == pytest.approx(math.hypot(scale.scale_rel_sigma, added))
 
 
+@pytest.mark.slow
 def test_camera_shake_is_removed_along_a_curve() -> None:
     plan = BentPlan(seed=2, speed=22.0, shake=1.2, width=560, height=480, **(BENDS["quarter"] | SHORT))
     shaken = bent_scene(plan)
@@ -176,6 +179,7 @@ def bent_found(request: pytest.FixtureRequest) -> BentScene:
     return bent_scene(BentPlan(seed=4, speed=22.0, **BENDS[request.param]))
 
 
+@pytest.mark.slow
 def test_a_bent_vine_is_followed_along_the_curve_that_is_found(bent_found: BentScene) -> None:
     tracking = tracked(bent_found.frames, bent_found.plan.exposure)
     assert isinstance(tracking.axis, CurvedAxis)
@@ -188,6 +192,7 @@ def test_a_bent_vine_is_followed_along_the_curve_that_is_found(bent_found: BentS
     assert away.max() < 2.5
 
 
+@pytest.mark.slow
 def test_its_curve_explains_nearly_all_that_changes_and_points_along_the_growth(bent_found: BentScene) -> None:
     small = SmallPictures(bent_found.frames)
     curve = find_curve(small)

@@ -241,6 +241,7 @@ def test_travel_is_compared_with_the_length(length_px: float, complete: bool) ->
 FPS = 1069.0
 
 
+@pytest.mark.slow
 def test_an_edge_is_followed_across_the_place_where_film_and_background_are_alike(tmp_path: Path) -> None:
     """Seed 341, which tuned nothing; without shading of the tip the edge is lost in some frames there."""
     time = np.linspace(0, 0.08, 800)
@@ -343,6 +344,7 @@ def test_a_tip_at_rest_in_sight_stays_ok(film):
     assert ok(tracked_scene(scene))[: MOUTH_PLAN.rest_frames].all()
 
 
+@pytest.mark.slow
 def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path: Path) -> None:
     """Rendered; what the door misplaces is the same in all bands of rows, so that they do not show it."""
     errors, stated = [], []

@@ -210,6 +210,7 @@ def jittered(sd_px, seed=311):
     return strip, EdgeState(edge, np.zeros(N), np.zeros(BAND_ROWS), BLUR, appearance, np.ones(3)), own
 
 
+@pytest.mark.slow
 def test_each_band_finds_its_own_edge():
     strip, state, own = jittered(0.4)
     edges, _ = band_fits(strip, state, state.edge)

@@ -57,6 +57,7 @@ def track(path: Path, **stated: object) -> Track:
     return track_recording(replace(Trial(name="t", video=path, capture_fps=1000.0, exposure_s=2e-4), **stated)).track
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bracketed")
 def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scene, long_frames: np.ndarray) -> None:
     frames = read_event(inspect_recording(film))
@@ -71,6 +72,7 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scen
     assert np.array_equal(frames.slot, whole.slot[same])
 
 
+@pytest.mark.slow
 def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = track(film)
     monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
@@ -88,6 +90,7 @@ def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypat
     assert np.std(off) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bracketed")
 def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scene: Scene) -> None:
     wanted = (BEFORE - 20, BEFORE + len(scene.frames) - 1)
@@ -98,6 +101,7 @@ def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scen
     assert not np.isfinite(made.edge_px[: wanted[0]]).any()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bracketed")
 def test_a_frame_without_a_time_is_left_out_of_the_event(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frames_of, without_time = decoding._frames_of, packet_index(film).pts[BEFORE + 20]
@@ -113,6 +117,7 @@ def test_a_frame_without_a_time_is_left_out_of_the_event(film: Path, monkeypatch
     assert frames.slot.tolist() == np.delete(whole.slot, np.flatnonzero(whole.slot == BEFORE + 20)).tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bracketed")
 def test_of_a_long_cine_the_event_is_read_and_no_more(scene: Scene, long_frames: np.ndarray, tmp_path: Path) -> None:
     missing = np.delete(np.arange(len(long_frames) + 1), BEFORE + 30) / 1000 + 0.2

@@ -296,6 +296,7 @@ def test_a_sheet_that_contradicts_the_recording_is_refused(tmp_path):
         capture_exposure(replace(trial, exposure_s=400e-6), recording)
 
 
+@pytest.mark.slow
 def test_a_packed_recording_is_tracked_as_well_as_it_is_filmed(tmp_path):
     """The square root of the packing, undone, leaves the edge where it was."""
     scene = plain_scene(Plan(seed=20941, width=480, height=120, from_px=(30.0, 60.0), end_px=400.0, radius=18.0))

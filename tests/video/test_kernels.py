@@ -197,6 +197,7 @@ def test_the_largest_step_is_where_means_differ_most():
 # ---- sloped strips cut by compiled loops are OpenCV's but for rounding ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.004, -0.03, 0.7])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_a_sloped_strip_is_that_of_opencv(slope, dtype):

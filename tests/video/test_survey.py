@@ -296,6 +296,7 @@ def test_check_reports_the_facts_of_a_correct_recording(clip: Path, tmp_path: Pa
     assert repr(facts) == repr(tracked)  # what the tracker says, to the last digit
 
 
+@pytest.mark.slow
 def test_a_trial_with_a_scale_of_its_own_is_looked_at_by_it_as_in_a_run(clip: Path, tmp_path: Path) -> None:
     folder = tmp_path / "v"
     surveyed(clip, folder, "a,a.mp4,12,100,140,36,3\n", SETTINGS)
@@ -324,6 +325,7 @@ def test_check_catches_a_mistake(clip: Path, tmp_path: Path, row: str, settings:
     assert surveyed(clip, tmp_path / "v", row, settings)[0] == expected
 
 
+@pytest.mark.slow
 def test_a_scale_a_fifth_off_is_kept_with_the_trial_for_the_verdict(clip: Path, tmp_path: Path) -> None:
     folder = tmp_path / "vines"
     folder.mkdir()

@@ -58,6 +58,7 @@ def test_a_failed_write_leaves_the_old_clip_and_no_other_file(tmp_path: Path, gi
     assert path.read_bytes() == b"the old one"
 
 
+@pytest.mark.slow
 def test_the_same_pictures_are_the_same_bytes_whatever_the_memory_held(tmp_path: Path) -> None:
     draw = np.random.default_rng(20701)
     noisy = [np.clip(p + draw.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in pictures(30, 198, 480)]
