@@ -23,7 +23,6 @@ Bools = NDArray[np.bool_]
 # Flags of a point of a track; several are joined by `;` in this order
 FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "corrected", "gap", "retimed", "after_end")
 
-_FORMER_RETIMED_FLAGS = "gap;corrected"  # Former spelling of `gap;retimed`, read for one more release
 
 # Flags of points that are not measurements of the leading edge
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
@@ -158,7 +157,8 @@ def join_flags(*flags: str) -> str:
 
 def split_flags(flag: str) -> list[str]:
     """Split the flags of one point."""
-    return [part for part in flag.replace(_FORMER_RETIMED_FLAGS, "gap;retimed").split(";") if part]
+    # "gap;corrected": former spelling of `gap;retimed`, read for one more release
+    return [part for part in flag.replace("gap;corrected", "gap;retimed").split(";") if part]
 
 
 def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:

@@ -94,12 +94,12 @@ def is_disk_full(error: BaseException) -> bool:
 
 PROVENANCE = "provenance.json"  # Its presence marks a results folder
 MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
-MAX_FOLDER_DEPTH = 4  # Levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
 
 
 def list_recordings(folder: Path) -> list[str]:
     """Return the recordings below a folder, as relative paths in natural order."""
-    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, MAX_FOLDER_DEPTH)]
+    # 4: levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
+    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, 4)]
     return sorted(names, key=natural_order)
 
 

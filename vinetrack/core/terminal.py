@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-PROGRESS_DELAY_S = 0.5  # Delay before a progress bar appears (chosen)
 
 SEVERITY_COLOURS = {"error": "31", "warning": "33"}  # Red and yellow, as codes of a terminal
 
@@ -100,7 +99,8 @@ class Progress(Generic[Item]):
         self._items = items
         self._bar = rich.Progress(*columns, console=Console(stderr=True), transient=True)
         self._task = self._bar.add_task(description, total=total)
-        self._timer = threading.Timer(PROGRESS_DELAY_S, self._bar.start)
+        # 0.5: delay before a progress bar appears (chosen)
+        self._timer = threading.Timer(0.5, self._bar.start)
         self._timer.daemon = True
         if sys.stderr.isatty():
             self._timer.start()

@@ -36,16 +36,14 @@ GAS_CONSTANT_AIR_J_KG_K = 287.0  # Derived: 8.314 J/(mol·K) over 0.02896 kg/mol
 
 _FIXED_EXPONENTS = (-4, 6)  # Decimal exponents written without "e" (convention)
 
-_MAX_FIXED_DECIMALS = 6  # Decimals beyond which value and error are written with a common power of ten (chosen)
 
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-_MAX_DECIMALS = 12  # Derived: an error below 1e-11 is the rounding of a double of order 1e5
 
 
 def decimals(sigma: float) -> int:
     """Return the number of decimals that shows two digits of an error, at most 12; 0 for an error of 0 or NaN."""
-    return min(max(1 - math.floor(math.log10(sigma)), 0), _MAX_DECIMALS) if 0 < sigma < math.inf else 0
+    # 12: derived: an error below 1e-11 is the rounding of a double of order 1e5
+    return min(max(1 - math.floor(math.log10(sigma)), 0), 12) if 0 < sigma < math.inf else 0
 
 
 def or_nan(value: Any) -> float:
@@ -72,7 +70,8 @@ def with_error(value: float | None, sigma: float | None) -> str:
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return number(value)
     places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 rounds to 0.010
-    if places > _MAX_FIXED_DECIMALS:
+    # 6: decimals beyond which value and error are written with a common power of ten (chosen)
+    if places > 6:
         power = 3 * ((places - 1) // 3)
         shown = max(places - power, 0)
         scaled = value * 10.0**power

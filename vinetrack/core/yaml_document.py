@@ -11,8 +11,6 @@ from typing import Any
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import TableError, read_text
 
-MAX_KEYS, MAX_DEPTH = 10_000, 20  # Largest document (chosen): nested aliases can expand beyond the memory
-
 
 @dataclass(frozen=True)
 class YamlDocument:
@@ -65,7 +63,8 @@ def _walk(
     """Record the line of every key below a node in `lines`, and every repeated key in `repeated`."""
     from ruamel.yaml.nodes import MappingNode, SequenceNode
 
-    if len(path) > MAX_DEPTH or len(lines) > MAX_KEYS:
+    # 10_000, 20: largest document (chosen): nested aliases can expand beyond the memory
+    if len(path) > 20 or len(lines) > 10_000:
         raise ValueError("too large")
     if isinstance(node, MappingNode):
         for key_node, value_node in node.value:

@@ -65,10 +65,6 @@ MIN_TRIALS_EACH_SIDE = 2  # Minimum number of trials before and after a change (
 
 FEWEST_TRIALS = 6  # Number of trials from which drifts and changes are tested (chosen)
 
-# A difference is confounded with the conditions if its variance within conditions is below this fraction of that in
-# random order (1 on average) (chosen)
-CONFOUNDED_VARIANCE_SHARE = 0.5
-
 
 def forms_of(fit: Fit, base: Solution) -> list[Difference]:
     """List every form of every hypothesis that these trials can test."""
@@ -226,7 +222,9 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
     in_vines, outer_degrees = _square_within(regressors, [trial.vine for trial in trials])
     if inner_degrees == 0 or in_vines == 0:
         return True
-    return in_conditions / inner_degrees < CONFOUNDED_VARIANCE_SHARE * in_vines / max(outer_degrees, 1)
+    # 0.5: A difference is confounded with the conditions if its variance within conditions is below this fraction
+    # of that in random order (1 on average) (chosen)
+    return in_conditions / inner_degrees < 0.5 * in_vines / max(outer_degrees, 1)
 
 
 def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
@@ -241,15 +239,11 @@ def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
 # Largest plausible drift of ln B and of ln P per trial, and step of ln P (chosen)
 PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01, "step": 0.05}
 
-# Predicted −2 ln L by which a difference may be behind the best hypothesis and still be fitted (chosen)
-MAX_GAIN_SHORTFALL = 40.0
 
 MIN_LINEAR_GAIN = 2.0  # Predicted fall of −2 ln L below which a difference is not fitted (chosen)
 
 # p-value below which a difference is also tested with shared systematic errors in the model (chosen)
 SYSTEMATICS_CHECK_P_VALUE = 0.01
-
-FIRST_ITERATIONS, MORE_ITERATIONS = 14, 30  # Iterations of the fit of a difference, at first and in all (chosen)
 
 
 @dataclass(frozen=True)
@@ -301,7 +295,8 @@ def between_fits(
     """Fit the differences whose predicted gain is near the best Δχ² of the effects."""
     fitted: list[LikelihoodRatio] = []
     for difference in estimated:
-        if difference.gain < MIN_LINEAR_GAIN or difference.gain < best - max(MAX_GAIN_SHORTFALL, 0.3 * best):
+        # 40.0: predicted −2 ln L by which a difference may be behind the best hypothesis and still be fitted (chosen)
+        if difference.gain < MIN_LINEAR_GAIN or difference.gain < best - max(40.0, 0.3 * best):
             continue
         report(f"fitting {difference.name}")
         fit = _fitted(before, difference)
@@ -365,8 +360,9 @@ def _fitted(before: Fit, difference: Difference) -> Fit | None:
     """Fit of the difference; None where the fit fails."""
     between = (*before.predictor.layout.between, *difference.terms)
     try:
-        fit = refit(before, between=between, shared=difference.shared, most_iterations=FIRST_ITERATIONS, thorough=False)
-        return fit if fit.converged else refit(fit, most_iterations=MORE_ITERATIONS, thorough=False)
+        # 14, 30: iterations of the fit of a difference, at first and in all (chosen)
+        fit = refit(before, between=between, shared=difference.shared, most_iterations=14, thorough=False)
+        return fit if fit.converged else refit(fit, most_iterations=30, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 

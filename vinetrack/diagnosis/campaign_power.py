@@ -31,8 +31,6 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
-NOISELESS = 1e-3  # Part of the stated noise that the noise-free campaign has (chosen)
-
 
 def fit_power(fitted: Fit, candidates: Sequence[str] | None = None, inputs: Sequence[PowerInput] = ()) -> Power:
     """Compute which effects outside its model the trials of a fit can detect."""
@@ -117,7 +115,8 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark
     """
     candidates_to_test = candidates_of(design.model, design.candidates, design.model.user_effects)
     host = host_for(design.model, candidates_to_test)
-    cameras = [replace(camera, noise_m=NOISELESS * camera.noise_m, noise_correlation=0.0) for camera in design.cameras]
+    # 1e-3: part of the stated noise that the noise-free campaign has (chosen)
+    cameras = [replace(camera, noise_m=1e-3 * camera.noise_m, noise_correlation=0.0) for camera in design.cameras]
     exact = [replace(trial, yield_pressure_sigma_Pa=0.0) for trial in design.trials]
     # Noise-free replicates have the same track, which is simulated once. They are compared by their text, because from
     # Python 3.13 on records that hold a NaN are not equal to themselves.

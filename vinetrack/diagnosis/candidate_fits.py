@@ -70,22 +70,12 @@ SUBSET_FIRST_ITERATIONS, SUBSET_FURTHER_ITERATIONS = 4, 10
 
 MAX_SUBSET_TRIALS = 14  # Trials of a subset fit: one of every condition, at most this many (chosen)
 
-# Iterations of a full fit at first and in all (chosen)
-FULL_FIT_FIRST_ITERATIONS, FULL_FIT_MAX_ITERATIONS, ABANDONED_BEHIND = 14, 40, 50.0
 
 # Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
 MIN_SHARE_OF_BEST_GAIN = 0.3
 
 # Fall of −2 ln L of a subset fit from which its start is worth a full fit (chosen)
 MIN_DEVIANCE_FALL, MIN_DEVIANCE_FALL_PER_POINT = 1.0, 0.02
-
-HOPELESS_RANGE_FACTOR = 6.0  # Multiple of its plausible range beyond which a size of a subset fit is hopeless (chosen)
-
-START_EXPONENTS = (0.2, 0.4, 0.7)  # Exponents from which a model is started (chosen)
-
-# −2 ln L per point by which a subset fit may stay behind the best so far after its first iterations and still be
-# continued (chosen)
-HOPELESS_DEVIANCE_PER_POINT = 0.5
 
 
 @dataclass(frozen=True)
@@ -109,8 +99,9 @@ class SubsetFit:
     @property
     def far_beyond_plausible(self) -> bool:
         """Whether a size is so far beyond its plausible range that a full fit will not bring it back."""
+        # 6.0: multiple of its plausible range beyond which a size of a subset fit is hopeless (chosen)
         return any(
-            not is_plausible(parameter, value, 0.0, widened=HOPELESS_RANGE_FACTOR)
+            not is_plausible(parameter, value, 0.0, widened=6.0)
             for effect in self.effects
             for parameter in effect.parameters
             if isinstance(value := self.values.get(f"{effect.name}.{parameter.name}"), float)
@@ -231,7 +222,9 @@ def best_subset_fit(
     if not first_fits:
         return None
     best = min(first_fits, key=lambda subset_fit: subset_fit.deviance)
-    if best.deviance - goal > HOPELESS_DEVIANCE_PER_POINT * fitter.n_points:
+    # 0.5: −2 ln L per point by which a subset fit may stay behind the best so far after its first iterations and
+    # still be continued (chosen)
+    if best.deviance - goal > 0.5 * fitter.n_points:
         return best
     for _ in range(3):
         further = fitter.fit_hypothesis(best.effects, best.values, iterations=SUBSET_FURTHER_ITERATIONS, search=search)
@@ -254,12 +247,13 @@ def full_fit(
         before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood) if start.effects else -math.inf
     )
     try:
+        # 14, 40, 50.0: iterations of a full fit at first and in all (chosen)
         fit = refit(
             before,
             model,
             start=start.values,
             yields_Pa=start.yields_Pa,
-            most_iterations=FULL_FIT_FIRST_ITERATIONS,
+            most_iterations=14,
             thorough=False,
             afresh=reset,
             led=rescue,
@@ -269,9 +263,9 @@ def full_fit(
         if fit.noise_correlation > SLOW_NOISE and poor:
             # Strongly correlated noise absorbs any misfit, and the likelihood says nothing.
             return None
-        if fit.converged or fit.log_likelihood < best - ABANDONED_BEHIND or poor:
+        if fit.converged or fit.log_likelihood < best - 50.0 or poor:
             return fit
-        return refit(fit, most_iterations=FULL_FIT_MAX_ITERATIONS, thorough=False)
+        return refit(fit, most_iterations=40, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 
@@ -289,7 +283,8 @@ def exponent_starts(fit: Fit) -> list[Start]:
     """Starts from several exponents n of the damping law; the fit's own values alone where n is not free."""
     if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
         return [((), {})]
-    return [((), {EXPONENT: n}) for n in START_EXPONENTS]
+    # (0.2, 0.4, 0.7): exponents from which a model is started (chosen)
+    return [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
 
 
 def restart_without(fit: Fit, larger: Fit) -> Fit:
@@ -347,7 +342,6 @@ def sheet_slip_starts(effect: Effect) -> list[Start]:
 # makes dozens of fits. Numbers, likelihood and state of a fit always stay; its curves are computed again from them
 # where a later step needs them.
 
-MANY_POINTS = 150_000  # Points of all trials from which curves are dropped (chosen)
 
 # Fits, the likeliest of a search, and misfit tests, the last made, that are kept whole (chosen)
 MAX_WHOLE_FITS, MAX_WHOLE_TESTS = 8, 1
@@ -357,7 +351,8 @@ Key = TypeVar("Key")
 
 def is_large(fit: Fit) -> bool:
     """Whether a fit has so many points that the fits of other hypotheses cannot all be kept whole."""
-    return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > MANY_POINTS
+    # 150_000: points of all trials from which curves are dropped (chosen)
+    return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > 150_000
 
 
 def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
@@ -392,20 +387,15 @@ def with_curves(fit: Fit) -> Fit:
 
 Report = Callable[[str], None]  # Called with a few words on what is being done
 
-# Largest predicted Δχ² at which linear predictions are still good to a per cent (measured)
-LINEAR_PREDICTION_LIMIT = 100.0
 
 MIN_SHARE_OF_SUBSET_GAIN = 0.1  # Share of the subset fit's gain that the fit to all trials must reach (chosen)
 
 FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
 
-SAME_MINIMUM_PER_POINT = 0.01  # Δχ² per point below which two fits that are far off count as the same minimum (derived)
 
 # Δχ² by which an effect's predicted gain may fall short of the best one's for it still to be fitted (chosen)
 LINEAR_REACH, LINEAR_REACH_SHARE, MAX_LINEAR_REACH_SHARE = 16.0, 0.4, 0.75
 
-# Share of its predicted gain that a fit to all trials must reach for no other shape of the effect to be tried (chosen)
-PREDICTED_GAIN_SHARE = 0.7
 
 ALIKE_COSINE = 0.95  # Cosine from which two effects count as alike (chosen)
 
@@ -419,10 +409,6 @@ SUBSET_REACH, SUBSET_REACH_SHARE, ALIKE_REACH_FACTOR = 40.0, 0.1, 5.0
 MAX_FULL_FITS = 7  # Candidates fitted to all trials after their subset fits, at most (chosen)
 
 STARTS_PER_EFFECT = 3  # Shapes of an effect from which it is fitted (chosen)
-
-# Share of the best gain below which a hypothesis that still misses a visible part of the growth is not fitted from its
-# other shapes, if subset fits tried them (chosen)
-HOPELESS_GAIN_SHARE = 0.5
 
 
 @dataclass
@@ -454,7 +440,8 @@ class CandidateFits:
     def linear_prediction_holds(self) -> bool:
         """Whether linear predictions are accurate enough to choose candidates by."""
         near = not self.tests.far_off and not self.tests.needs_search
-        return near and max(map(self.tests.predicted_gain, self.names), default=0.0) < LINEAR_PREDICTION_LIMIT
+        # 100.0: largest predicted Δχ² at which linear predictions are still good to a per cent (measured)
+        return near and max(map(self.tests.predicted_gain, self.names), default=0.0) < 100.0
 
     @property
     def names(self) -> list[str]:
@@ -618,7 +605,9 @@ class CandidateFits:
         for index in self.tests.ranked_shapes(name)[:STARTS_PER_EFFECT]:
             shape = self.tests.sensitivities.shapes[index]
             self._fit(SubsetFit((shape.effect,), math.nan, start_values(shape, float(sizes[index]))))
-            required = PREDICTED_GAIN_SHARE * self.tests.predicted_gain(name)
+            # 0.7: share of its predicted gain that a fit to all trials must reach for no other shape of
+            # the effect to be tried (chosen)
+            required = 0.7 * self.tests.predicted_gain(name)
             if name in self.fitted and self.fitted[name].delta_chi2 > required:
                 break
             if self._is_hopeless(name):
@@ -630,7 +619,9 @@ class CandidateFits:
         if hypothesis is None or name not in self.subset_fits:
             return False
         best = max(known.delta_chi2 for known in self.fitted.values())
-        small_gain = hypothesis.delta_chi2 < HOPELESS_GAIN_SHARE * best
+        # 0.5: share of the best gain below which a hypothesis that still misses a visible part of the growth
+        # is not fitted from its other shapes, if subset fits tried them (chosen)
+        small_gain = hypothesis.delta_chi2 < 0.5 * best
         return small_gain and is_poor_fit(hypothesis.fit.predictor, hypothesis.fit.solution)
 
     def _negligible_sizes(self, effects: Sequence[Effect]) -> dict[str, Value]:
@@ -713,4 +704,5 @@ def _same_minimum_tolerance(*fits: Fit) -> float:
     if not all(is_poor_fit(fit.predictor, fit.solution) for fit in fits):
         return -FAILED_FIT_DELTA_CHI2
     n_points = sum(trial.time_s.size for trial in fits[0].predictor.data)
-    return max(-FAILED_FIT_DELTA_CHI2, SAME_MINIMUM_PER_POINT * n_points)
+    # 0.01: δχ² per point below which two fits that are far off count as the same minimum (derived)
+    return max(-FAILED_FIT_DELTA_CHI2, 0.01 * n_points)

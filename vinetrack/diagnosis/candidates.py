@@ -19,14 +19,10 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import group_names
 from vinetrack.inference.sensitivity import position_change
 
-WIDE_RANGE = 10.0  # Ratio of the ends of a plausible range from which values are tried in geometric steps (chosen)
-
 # Where the ends of a plausible range differ by more than the first factor, a size may lie below it by the second
 # (chosen)
 NARROW_RANGE, BELOW_RANGE_FACTOR = 2.0, 3.0
 
-# Fractions of the plausible range at which an effect is tried that has no response to an infinitesimal size (chosen)
-AMPLITUDES = (0.03, 0.2, 0.7)
 
 # The same for an effect with a threshold (chosen)
 THRESHOLD_AMPLITUDES = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
@@ -121,7 +117,9 @@ def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = (()
     low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
     zero = effect.parameters[0].zero
-    fractions = THRESHOLD_AMPLITUDES if "rest_force" in effect.functions else AMPLITUDES
+    # (0.03, 0.2, 0.7): fractions of the plausible range at which an effect is tried that has no response to an
+    # infinitesimal size (chosen)
+    fractions = THRESHOLD_AMPLITUDES if "rest_force" in effect.functions else (0.03, 0.2, 0.7)
     return [
         CandidateShape(effect, values, fraction * (largest - zero), whole=True)
         for values in other_values
@@ -151,7 +149,8 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     if parameter.tried:
         return parameter.tried
     low, high = plausible_range(parameter)
-    if low > 0 and high / low > WIDE_RANGE:
+    # 10.0: ratio of the ends of a plausible range from which values are tried in geometric steps (chosen)
+    if low > 0 and high / low > 10.0:
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())
     if low > 0 and high / low < NARROW_RANGE:
         return ((low + high) / 2,)
@@ -197,10 +196,6 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
 # model and all other parameters held. Together with the fit's own sensitivities the columns give one set of cross
 # products, from which score tests, cosines and expected gains follow by linear algebra.
 
-# A finite-difference step should move a trajectory by the first of these parts of its travel (derived)
-TARGET_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
-
-LEAST_REMAINING_TRAVEL = 0.1  # Part of its travel that a vine must still make with a finite effect added (chosen)
 
 # Part of its travel by which a trajectory must change to count as responding, four times the integrator's error
 # (measured)
@@ -266,9 +261,11 @@ def _sensitivity(
             return (shape, [moved / shape.step for moved in change]) if usable else None
         if response <= LEAST_DETECTABLE_RESPONSE * 1e-3:
             return None
-        if not LEAST_RESPONSE < response < LARGEST_RESPONSE:
+        # 2e-3, 2e-2, 2e-4: A finite-difference step should move a trajectory by the first of these parts of
+        # its travel (derived)
+        if not 2e-4 < response < 2e-2:
             size = shape.size
-            step = shape.step * TARGET_RESPONSE / response
+            step = shape.step * 2e-3 / response
             available = size.bounds[1] - size.zero if shape.step > 0 else size.zero - size.bounds[0]
             shape = replace(shape, step=min(step, available) if available > 0 else step)
             change = _change(fit, shape, baseline)
@@ -280,9 +277,9 @@ def _sensitivity(
 
 def _prevents_growth(baseline: Sequence[Trajectory], change: Sequence[Floats]) -> bool:
     """Whether some vine that grew in the recording hardly starts with the effect: so large a size is excluded."""
+    # 0.1: part of its travel that a vine must still make with a finite effect added (chosen)
     return any(
-        float(np.max(before.observed_position_m + moved))
-        < LEAST_REMAINING_TRAVEL * float(np.max(before.observed_position_m))
+        float(np.max(before.observed_position_m + moved)) < 0.1 * float(np.max(before.observed_position_m))
         for before, moved in zip(baseline, change, strict=True)
     )
 

@@ -55,8 +55,6 @@ if TYPE_CHECKING:
 #
 # See `vinetrack.diagnosis.replicates`.
 
-MIN_FRAMES_PER_STRETCH = 2  # Least frames of a stretch: a shorter recording is cut into fewer (derived)
-
 
 @dataclass(frozen=True)
 class ResidualCourse:
@@ -116,7 +114,8 @@ def common_edges(members: Sequence[ResidualCourse]) -> Floats:
     start = max(float(member.time_s[0]) for member in members)
     end = min(float(member.time_s[-1]) for member in members)
     frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
-    count = max(min(MAX_STRETCHES, frames // MIN_FRAMES_PER_STRETCH), 1)
+    # 2: least frames of a stretch: a shorter recording is cut into fewer (derived)
+    count = max(min(MAX_STRETCHES, frames // 2), 1)
     return np.linspace(start, max(end, start), count + 1)
 
 
@@ -293,7 +292,6 @@ STEP = 1e-3  # Relative step of a finite difference (derived)
 
 DRIFT_ALONG_LEAST_SCATTER = 2e-3  # Lower limit of the standard deviation of the rise of ln B in single trials (chosen)
 
-LARGEST_STEP = 3.0  # Deviation of ln B of a half (chosen)
 
 HALVES = (0.25, 0.75)  # Midpoints of the halves, as fractions of the growth (defined)
 
@@ -312,7 +310,8 @@ def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates)
         return
     halves = _halves(fit, aligned, estimates.trial_effects)
     vines = np.array([trial.vine for trial in halves.trials])
-    usable = (np.abs(halves.deviation) <= LARGEST_STEP).all(axis=1)
+    # 3.0: deviation of ln B of a half (chosen)
+    usable = (np.abs(halves.deviation) <= 3.0).all(axis=1)
     names = list(dict.fromkeys(vines[usable]))
     for vine in [*names, *([""] if len(names) > 1 else [])]:
         chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))

@@ -287,9 +287,6 @@ def has_credible_sizes(hypothesis: LikelihoodRatio) -> bool:
 # Effects are considered one at a time and to first order. The interval stated is the hull of the fit's own and of the
 # one with the other effect left free: at least 95 %.
 
-MIN_SHIFT_SIGMAS = 1.0  # Shift, in standard errors of the size, from which a confounder is reported (chosen)
-
-MAX_LISTED = 3  # Confounders listed for each size (chosen)
 
 TWO_SIDED_95 = 1.959964  # Derived: quantile of the normal distribution
 
@@ -305,12 +302,14 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
     for k, number in enumerate(after.fit.numbers):
         if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
             relevant = [confounder for confounder in _of_number(after, number, levers[k]) if _is_relevant(confounder)]
-            chosen += sorted(relevant, key=lambda confounder: -abs(confounder.value - number.value))[:MAX_LISTED]
+            # 3: confounders listed for each size (chosen)
+            chosen += sorted(relevant, key=lambda confounder: -abs(confounder.value - number.value))[:3]
     return tuple(chosen)
 
 
 def _is_relevant(confounder: Confounder) -> bool:
-    return abs(confounder.value - confounder.number.value) > MIN_SHIFT_SIGMAS * confounder.number.sigma
+    # 1.0: shift, in standard errors of the size, from which a confounder is reported (chosen)
+    return abs(confounder.value - confounder.number.value) > 1.0 * confounder.number.sigma
 
 
 def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:

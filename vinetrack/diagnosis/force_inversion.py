@@ -139,7 +139,6 @@ N_STEPS = 400  # Steps of a motion, denser at its start (derived)
 # Diagonal coefficient of the two-stage, second-order, L-stable method of Alexander, SIAM J. Numer
 SDIRK_GAMMA = 1 - 1 / math.sqrt(2)
 
-EXTRA_FRAMES = 3.0  # Frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
 
 # Part of the highest speed below which a vine counts as standing still and does not respond to a small force (chosen)
 LEAST_RELATIVE_SPEED = 1e-3
@@ -186,8 +185,9 @@ def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> 
     predictor = fit.predictor
     jobs = predictor.jobs(fit.solution.state.theta if theta is None else theta, trial_effects)
     trials = [trial_of_job(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
+    # 3.0: frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
     grids = [
-        max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + EXTRA_FRAMES * trial_data.frame_s, 1e-6)
+        max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + 3.0 * trial_data.frame_s, 1e-6)
         * np.linspace(0, 1, N_STEPS + 1) ** 2
         for i, trial_data in enumerate(predictor.data)
     ]
@@ -352,7 +352,6 @@ def _responses(motions: Sequence[FittedMotion], acceleration: Floats) -> tuple[F
 
 INDEPENDENT_POINTS_PER_TRIAL = 10.0  # Effective number of independent residuals in one trial (chosen)
 
-MAX_TRIAL_EFFECT_ITERATIONS = 8  # Most iterations of the trial effects (chosen)
 
 # Part of the largest information below which a force amplitude is not estimable (chosen)
 LEAST_RELATIVE_INFORMATION = 1e-9
@@ -399,9 +398,8 @@ class LinearInversion:
         state = FitState(fitted.theta, trial_effects, spread, rho, np.maximum(noise, variance_floor(data)))
         parameters_held = replace(problem, free=np.zeros_like(problem.free))
         noise_held = FixedTerms(spread, (rho, state.variance))
-        solution = solve(
-            fit.predictor, parameters_held, state, noise_held, warm=True, most_iterations=MAX_TRIAL_EFFECT_ITERATIONS
-        )
+        # 8: most iterations of the trial effects (chosen)
+        solution = solve(fit.predictor, parameters_held, state, noise_held, warm=True, most_iterations=8)
         self.data, self.problem = data, problem
         self.state, self.columns = solution.state, solution.columns
         self.trial_effect_precision = trial_effect_prior(problem, self.state)[1]
@@ -598,13 +596,9 @@ def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.b
 # (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a large force the linearisation
 # would be poor.
 
-# Splines of an acceleration, even in the square root of time and so denser where a vine accelerates (chosen)
-N_SPLINES = 20
 
 # Penalties on second differences, relative to the information from positions (chosen)
 SMOOTHED_MOTIONS_SMOOTHING_PENALTIES = np.geomspace(1e-8, 1e2, 21)
-
-LAST_LENGTH_FRACTION = 0.96  # Part of the length up to which points are used (chosen)
 
 
 def on_tracks(inversion: LinearInversion, trial_effects: Floats, motions: Sequence[FittedMotion]) -> list[FittedMotion]:
@@ -617,12 +611,14 @@ def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> Fi
     observed_m = data.lead_position_m - trial_effects[ORIGIN]
     position_m = observed_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
     length_m = motion.trial.length_m
-    growing = (since_s > 0) & ~(position_m > LAST_LENGTH_FRACTION * length_m)
+    # 0.96: part of the length up to which points are used (chosen)
+    growing = (since_s > 0) & ~(position_m > 0.96 * length_m)
     if np.count_nonzero(growing) <= 2:
         return motion
     grid_s = motion.time_s
     last_s = float(since_s[growing].max())
-    accelerations = uniform_splines(np.sqrt(np.clip(grid_s / last_s, 0.0, 1.0)), N_SPLINES)
+    # 20: splines of an acceleration, even in the square root of time and so denser where a vine accelerates (chosen)
+    accelerations = uniform_splines(np.sqrt(np.clip(grid_s / last_s, 0.0, 1.0)), 20)
     velocities = _integrated(grid_s, accelerations)
     positions = _integrated(grid_s, velocities)
     k = np.clip(np.searchsorted(grid_s, since_s[growing]), 1, grid_s.size - 1)

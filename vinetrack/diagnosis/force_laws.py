@@ -38,26 +38,12 @@ from vinetrack.inference.whitening import whiten
 # Number of positions of a local force, and its widths as parts of the growth (chosen)
 PATCH_CENTRES, PATCH_WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
 
-N_PERIODS = 24  # Periods in the grid (chosen)
-
-LONGEST_PERIOD, SHORTEST_PERIOD = 0.6, 0.04  # As parts of the growth (derived)
-
-# Decay scales in the grid, as parts of the largest growth, speed or time (chosen)
-RELATIVE_SCALES = (0.04, 0.1, 0.2, 0.4)
-
-# Part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest (chosen)
-LEAST_RELATIVE_SPEED = 0.05
 
 EDGE_FRACTION = 0.1  # Part of a patch's width over which the force rises at each end (chosen)
 
-START_FRACTION = 0.05  # Part of the growth over which a vine accelerates (chosen)
-
-LEAST_PATCH_M = 1e-3  # Least width of a local force that is reported (chosen)
 
 # Positions and speeds in the grid above which a force may set in (chosen)
 N_THRESHOLD_POSITIONS, N_THRESHOLD_SPEEDS = 8, 8
-
-SAME_AREA_RATIO = 1.02  # Ratio of cross-sections up to which two vines count as equally wide (chosen)
 
 
 @dataclass(frozen=True)
@@ -96,7 +82,8 @@ class Law:
     @property
     def is_unresolved(self) -> bool:
         """Whether it acts over less than a millimetre, which no camera that films the whole growth resolves."""
-        return self.kind == "patch" and not self.high - max(self.low, 0.0) > LEAST_PATCH_M
+        # 1e-3: least width of a local force that is reported (chosen)
+        return self.kind == "patch" and not self.high - max(self.low, 0.0) > 1e-3
 
     @property
     def amplitude_precision(self) -> float:
@@ -173,8 +160,6 @@ VARIABLE_OF_KIND = {
     "pressure": "pressure",
 }
 
-# Kinds that peak at rest, where positions do not determine the speed: their size is stated at the lowest speed observed
-_LARGEST_AT_REST = ("inverse_speed", "falling_with_speed")
 
 # Products in the grid (chosen)
 _PRODUCTS = {
@@ -204,19 +189,24 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     for k in range(N_THRESHOLD_SPEEDS):
         threshold_m_s = (k + 0.5) / N_THRESHOLD_SPEEDS * visited.speed_m_s
         laws += [Law(kind, n_shapes=1, scale=threshold_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
-    laws.append(Law("inverse_speed", scale=LEAST_RELATIVE_SPEED * visited.speed_m_s))
-    for part in RELATIVE_SCALES:
+    # 0.05: part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest (chosen)
+    laws.append(Law("inverse_speed", scale=0.05 * visited.speed_m_s))
+    # (0.04, 0.1, 0.2, 0.4): decay scales in the grid, as parts of the largest growth, speed or time (chosen)
+    for part in (0.04, 0.1, 0.2, 0.4):
         laws.append(Law("falling_with_speed", n_shapes=1, scale=part * visited.speed_m_s))
         laws.append(Law("fading_in_time", n_shapes=1, scale=part * visited.time_s))
         laws.append(Law("fading_along", n_shapes=1, scale=part * visited.growth_m))
     for width in PATCH_WIDTHS:
         for centre in (np.arange(PATCH_CENTRES) + 0.5) / PATCH_CENTRES * visited.growth_m:
             laws.append(_patch_at(float(centre), width * visited.growth_m))
-    for period in np.geomspace(SHORTEST_PERIOD, LONGEST_PERIOD, N_PERIODS) * visited.growth_m:
+    # 24: periods in the grid (chosen)
+    # 0.6, 0.04: as parts of the growth (derived)
+    for period in np.geomspace(0.04, 0.6, 24) * visited.growth_m:
         laws.append(Law("periodic", n_amplitudes=2, n_shapes=1, scale=float(period)))
     laws += [replace(law, factor=factor) for law in laws for factor in _PRODUCTS.get(law.kind, ())]
     areas = [motion.trial.area_m2 for motion in motions]
-    if max(areas) > SAME_AREA_RATIO * min(areas):
+    # 1.02: ratio of cross-sections up to which two vines count as equally wide (chosen)
+    if max(areas) > 1.02 * min(areas):
         mean_m2 = float(np.mean(areas))
         laws += [replace(law, reference_area_m2=mean_m2) for law in laws if "pressure" not in law.variables]
     return _with_unit_peak(laws, motions)
@@ -262,7 +252,9 @@ def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> lis
         )
         if law.n_amplitudes > 1:
             peak = 1.0
-        elif law.kind in _LARGEST_AT_REST:
+        # ("inverse_speed", "falling_with_speed"): kinds that peak at rest, where positions do not determine
+        # the speed: their size is stated at the lowest speed observed
+        elif law.kind in ("inverse_speed", "falling_with_speed"):
             peak = peak_after_start
         elif law.kind == "patch" and peak_after_start < 0.5 * peak:
             continue
@@ -272,7 +264,8 @@ def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> lis
 
 def _after_start(motion: FittedMotion) -> NDArray[np.bool_]:
     """Where a vine has grown beyond its start: the size of a law at rest alone is not observed."""
-    return motion.lead_position_m >= START_FRACTION * motion.lead_position_m.max()
+    # 0.05: part of the growth over which a vine accelerates (chosen)
+    return motion.lead_position_m >= 0.05 * motion.lead_position_m.max()
 
 
 def _visited_range(motions: Sequence[FittedMotion]) -> _Range:
@@ -298,7 +291,6 @@ MAX_STEPS, MOTION_CORRECTIONS = 12, 2  # Most Gauss-Newton steps, and correction
 # The first steps are undamped Gauss-Newton steps, taken even where the cost rises (chosen)
 UNDAMPED_STEPS, STEPS_WITH_SHAPE_HELD = 5, 2
 
-MAX_STEPS_ON_TRACKS = 10  # Most steps on motions that lie on the tracks, before motions respond to the force (chosen)
 
 # Damping factors of Levenberg and Marquardt, for steps that must lower the cost (chosen)
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
@@ -308,13 +300,10 @@ UNDAMPED_SUCCESS = 0.5  # Part of χ² above which the undamped steps have faile
 # Step of finite differences, in the fit's scaling of parameters, and relative for shape parameters (derived)
 DIFFERENCE_STEP = 1e-3
 
-LAST_LENGTH_FRACTION = 0.96  # Part of the length up to which points are used (chosen)
 
 CONVERGENCE_TOLERANCE = 1e-3  # Relative fall of χ² below which the search ends (chosen)
 
 SHAPE_CUTOFF = 1e-12  # Relative eigenvalue of the scaled normal matrix below which a direction does not move (derived)
-
-MAX_RELATIVE_SHAPE_STEP = 0.2  # Part of its size by which a shape parameter may move in one step (chosen)
 
 
 @dataclass(frozen=True)
@@ -428,7 +417,8 @@ def _gauss_newton(
 def _settled_on_tracks(fit: Fit, inversion: LinearInversion, start: SearchPoint) -> SearchPoint:
     """All unknowns optimised with the motions held on the tracks, where only the parameters enter nonlinearly."""
     damping, best, point = FIRST_DAMPING, None, start
-    for _ in range(MAX_STEPS_ON_TRACKS):
+    # 10: most steps on motions that lie on the tracks, before motions respond to the force (chosen)
+    for _ in range(10):
         try:
             with np.errstate(all="raise", under="ignore"):
                 point = _with_updated_motions(fit, point)
@@ -501,7 +491,8 @@ def _step(
         matrix[held, :] = matrix[:, held] = 0.0
     step = scaled_pseudo_inverse(matrix, SHAPE_CUTOFF) @ normal.score
     for k, name in enumerate(law.shape_names):
-        limit = MAX_RELATIVE_SHAPE_STEP * law.size_of(name)
+        # 0.2: part of its size by which a shape parameter may move in one step (chosen)
+        limit = 0.2 * law.size_of(name)
         law = law.shifted(name, float(np.clip(step[p + q + k], -limit, limit)))
     law = law.within_growth(max(float(motion.lead_position_m.max()) for motion in point.motions))
     release_limit_s = 2 * np.array([trial_data.frame_s for trial_data in inversion.data])
@@ -538,7 +529,8 @@ def _force_along(point: SearchPoint, motion: FittedMotion) -> Floats:
 def _points_before_end(trial_data: FitTrial, trial_effects: Floats) -> slice:
     """The points before the end of growth, since a corrected motion does not end where its model would."""
     length_m = trial_data.trial.length_m if math.isfinite(trial_data.trial.length_m) else math.inf
-    after_end = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > LAST_LENGTH_FRACTION * length_m)
+    # 0.96: part of the length up to which points are used (chosen)
+    after_end = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > 0.96 * length_m)
     return slice(0, int(after_end[0]) if after_end.size else trial_data.time_s.size)
 
 

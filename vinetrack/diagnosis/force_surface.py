@@ -47,16 +47,6 @@ KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4  # Relative variances below which 
 # What a force may be where growth begins
 ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
 
-# Prior amplitude of the force where growth begins, as a multiple of that of the rest of the surface (chosen)
-START_FORCE_RATIO = 3.0
-
-LOGARITHMIC_VARIABLES = ("speed", "time")  # Variables on a logarithmic scale above their median (chosen)
-
-SPEED_QUANTILE = 0.98  # Quantile of a trial's speeds that counts as its highest (chosen)
-
-# Part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
-LEAST_PRESSURE_RANGE = 0.02
-
 
 PRESSURE_MARGIN = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
 
@@ -180,8 +170,10 @@ class Domain:
         if start_axis >= 0 and at_start == CONSTANT_AT_START:
             columns.append(np.ones((self.size, 1)))
         if start_axis >= 0 and at_start == FREE_AT_START:
+            # 3.0: prior amplitude of the force where growth begins, as a multiple of that of the rest of
+            # the surface (chosen)
             constant_along_start_axis = [
-                (np.ones((count, 1)), np.array([START_FORCE_RATIO**2])) if k == start_axis else modes
+                (np.ones((count, 1)), np.array([3.0**2])) if k == start_axis else modes
                 for k, (count, modes) in enumerate(zip(self.counts, by_axis, strict=True))
             ]
             columns.append(_product(constant_along_start_axis, least_variance))
@@ -250,15 +242,16 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
         by_trial = [
             np.asarray(getattr(motion, attribute))[motion.time_s <= motion.counts_until_s] for motion in motions
         ]
-        high = max(
-            float(np.quantile(values, SPEED_QUANTILE) if name == "speed" else values.max()) for values in by_trial
-        )
+        # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
+        high = max(float(np.quantile(values, 0.98) if name == "speed" else values.max()) for values in by_trial)
         low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
-        if high - low > LEAST_PRESSURE_RANGE * abs(high):
+        # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
+        if high - low > 0.02 * abs(high):
             if name == "pressure":
                 low, high = (1 - PRESSURE_MARGIN) * low, (1 + PRESSURE_MARGIN) * high
             typical = float(np.median([np.median(values) for values in by_trial]))
-            ranges[name] = low, high, typical if name in LOGARITHMIC_VARIABLES else math.inf
+            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
+            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
 
     def domain(names: tuple[str, ...], counts: dict[str, int]) -> Domain:
         lows, highs, log_scales = zip(*(ranges[name] for name in names), strict=True)

@@ -48,11 +48,6 @@ REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
 UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
 
-# Prior precision of parameters that no trial determines yet, such as B of a vine that has not been made (chosen)
-NOMINAL_PRECISION = 1e-6
-
-# Most passes of the exchange, and the ratio of worth from which a trial is exchanged (chosen)
-MAX_EXCHANGE_PASSES, LEAST_GAIN = 3, 1.002
 
 Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products, shape
 
@@ -97,11 +92,12 @@ class DesignInformation:
         """The same number of groups, each exchanged for a better one until none gains."""
         chosen = list(chosen)
         now = float(worth(self.total(chosen)[None])[0])
-        for _ in range(MAX_EXCHANGE_PASSES):
+        # 3, 1.002: most passes of the exchange, and the ratio of worth from which a trial is exchanged (chosen)
+        for _ in range(3):
             before = now
             for k in range(len(chosen)):
                 others = worth(self.total(chosen[:k] + chosen[k + 1 :]) + self.each[allowed])
-                if np.max(others) > LEAST_GAIN * now:
+                if np.max(others) > 1.002 * now:
                     chosen[k], now = int(allowed[int(np.argmax(others))]), float(np.max(others))
             if now <= before:
                 break
@@ -168,7 +164,9 @@ def _products_by_trial(tests: MisfitTests, indices: Sequence[int]) -> Floats:
 
 def _prior_precision(tests: MisfitTests, n_effects: int) -> Floats:
     """Prior precision of the same unknowns: systematic errors have standard deviation 1, sizes of effects none."""
-    free = np.maximum(tests.fit.solution.problem.prior_precision, NOMINAL_PRECISION)
+    # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
+    # (chosen)
+    free = np.maximum(tests.fit.solution.problem.prior_precision, 1e-6)
     return np.diag(np.concatenate([free, np.ones(tests.products.n_systematics), np.zeros(n_effects)]))
 
 
@@ -208,18 +206,11 @@ def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:
     return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))
 
 
-MAX_ADDED_TRIALS = 48  # Most further trials considered where `limits.trials` is not stated (chosen)
-
 PAIRS_PER_STEP = (1, 2)  # Pairs of one condition that are added at a time; the best gain a pair counts (chosen)
 
-TYPICAL_REQUIRED_SCORE = 4.7  # Score that a size needs where the trials so far have no information about it (derived)
 
 # What further trials need, in order of effort
 EFFORT_WORDS = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-
-SEARCH_ROUNDS = 3  # Searches, each with the required information corrected by the shortfall of the one before (chosen)
-
-MAX_VINES_TRIED = 2  # New vines that are tried, one at a time (chosen)
 
 
 def further_trials(
@@ -227,7 +218,8 @@ def further_trials(
 ) -> FurtherTrials:
     """Find the fewest further trials that give an effect of some size a target power."""
     limits = limits or Limits()
-    most = limits.trials if "trials" in limits.model_fields_set else MAX_ADDED_TRIALS
+    # 48: most further trials considered where `limits.trials` is not stated (chosen)
+    most = limits.trials if "trials" in limits.model_fields_set else 48
     before = now.probability_at(value)
     plan = FurtherTrials(now.effect, now.parameter, now.symbol, now.unit, value, target, before, power=now)
     feasible = feasible_conditions(design.trials, limits)
@@ -237,8 +229,10 @@ def further_trials(
     deviation = abs(value - now.zero)
     wanted = search.information(()) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
     if not math.isfinite(wanted):
-        wanted = (TYPICAL_REQUIRED_SCORE / deviation) ** 2
-    for _ in range(SEARCH_ROUNDS):
+        # 4.7: score that a size needs where the trials so far have no information about it (derived)
+        wanted = (4.7 / deviation) ** 2
+    # 3: searches, each with the required information corrected by the shortfall of the one before (chosen)
+    for _ in range(3):
         chosen, needed = search.fewest(wanted, most // REPLICATES)
         plan = _evaluated(design, search, replace(plan, n_conditions=len(search.conditions), needed=needed), chosen)
         assert plan.power is not None
@@ -290,7 +284,8 @@ class _Search(DesignInformation):
             return
         new = list(dict.fromkeys(self.vines[self.efforts == NEW_VINE]))
         unlimited = [self.so_far + UNLIMITED_TRIALS * self.each[self.vines == vine].sum(axis=0) for vine in new]
-        for k in np.argsort(-self.first_information(np.stack(unlimited)))[:MAX_VINES_TRIED]:
+        # 2: new vines that are tried, one at a time (chosen)
+        for k in np.argsort(-self.first_information(np.stack(unlimited)))[:2]:
             yield np.flatnonzero((self.efforts < NEW_VINE) | (self.vines == new[k]))
 
     def _design(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:

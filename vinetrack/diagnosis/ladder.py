@@ -109,12 +109,6 @@ TRAJECTORY_COLUMNS = (
 
 FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at which the final speed is taken (chosen)
 
-# Duration of the simulation, in durations of the recording, so that a slow model reaches the same position (chosen)
-MAX_DURATION_FACTOR = 3.0
-
-# Fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
-SMOOTHED_SHARE = 0.05
-
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
@@ -195,7 +189,8 @@ def _worst(together: Replicates) -> tuple[float, float]:
     if not moving.any():
         return math.nan, math.nan
     residual_m, time_s = together.mean_residual_m[moving], together.time_s[moving]
-    half = int(SMOOTHED_SHARE * residual_m.size / 2)
+    # 0.05: fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
+    half = int(0.05 * residual_m.size / 2)
     cumulative = np.concatenate([[0.0], np.cumsum(residual_m)])
     low = np.maximum(np.arange(residual_m.size) - half, 0)
     high = np.minimum(np.arange(residual_m.size) + half + 1, residual_m.size)
@@ -213,7 +208,9 @@ def _final_speed_errors(
     """Model minus measurement of the leading edge's final speed, m/s, by name of trial, both at the same position. A
     model that does not reach the position has stopped, and its speed there is 0. NaN where none was measured.
     """
-    times = [MAX_DURATION_FACTOR * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
+    # 3.0: duration of the simulation, in durations of the recording, so that a slow model reaches the same
+    # position (chosen)
+    times = [3.0 * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
     traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
     runs = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces)
     errors = {}

@@ -272,15 +272,6 @@ def variable_weights(choices: Sequence[VariableChoice], error: float) -> dict[st
 # be written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the
 # prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
 
-LEAST_WEIGHT_NAMED = 0.05  # Weight from which a choice of variables is reported with the best (chosen)
-
-CERTAIN_WEIGHT = 0.95  # Weight from which a choice counts as certain (chosen)
-
-# Part of a variable's variance left by smooth functions of others, up to which it counts as a function of them
-# (measured)
-LARGEST_FREE_VARIANCE = 0.1
-
-POINTS_PER_MOTION = 40  # Points of a motion at which one variable is regressed on others (chosen)
 
 _WORDS = {
     "growth": "the growth",
@@ -298,7 +289,8 @@ def variables_in_words(name: str) -> str:
 def dependent_variables(domain: Domain, singles: Sequence[Domain], motions: Sequence[FittedMotion]) -> list[str]:
     """Variables that are smooth functions of those of a domain, along all trials."""
     counts = [np.count_nonzero(motion.time_s <= motion.counts_until_s) for motion in motions]
-    points = [np.linspace(0, count - 1, POINTS_PER_MOTION).astype(int) for count in counts]
+    # 40: points of a motion at which one variable is regressed on others (chosen)
+    points = [np.linspace(0, count - 1, 40).astype(int) for count in counts]
 
     def visited(of: Domain) -> list[Floats]:
         by_motion = [np.array(of.values_along(motion))[:, at] for motion, at in zip(motions, points, strict=True)]
@@ -311,7 +303,9 @@ def dependent_variables(domain: Domain, singles: Sequence[Domain], motions: Sequ
             continue
         (value,) = single.normalised(visited(single))
         residual = value - basis @ np.linalg.lstsq(basis, value, rcond=1e-8)[0]
-        if float(np.var(residual)) < LARGEST_FREE_VARIANCE * float(np.var(value)):
+        # 0.1: part of a variable's variance left by smooth functions of others, up to which it counts as a
+        # function of them (measured)
+        if float(np.var(residual)) < 0.1 * float(np.var(value)):
             names.append(single.variables[0])
     return names
 
@@ -334,7 +328,8 @@ def not_excluded(
             continue
         no_larger = len(domain.variables) <= len(best.variables)
         if domain.name in weights:
-            possible = weights[domain.name] >= LEAST_WEIGHT_NAMED or (no_larger and losses[domain.name] < threshold)
+            # 0.05: weight from which a choice of variables is reported with the best (chosen)
+            possible = weights[domain.name] >= 0.05 or (no_larger and losses[domain.name] < threshold)
         else:
             implied = {*domain.variables, *dependent_variables(domain, singles, motions)} if no_larger else set()
             possible = len(domain.variables) == len(best.variables) > 1 and implied >= set(best.variables)
@@ -347,7 +342,8 @@ def dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[s
     """What the force depends on and how certain that is: a sentence without its full stop."""
     subject = "Learned as a smooth function inside the fit, the missing force"
     if not alternatives:
-        likely = "is described" if weights[name] >= CERTAIN_WEIGHT else "is most likely described"
+        # 0.95: weight from which a choice counts as certain (chosen)
+        likely = "is described" if weights[name] >= 0.95 else "is most likely described"
         return f"{subject} {likely} by {variables_in_words(name)} (posterior weight {weights[name]:.0%})"
     choices = [tuple(choice.split("+")) for choice in (name, *alternatives)]
     common = [variable for variable in choices[0] if all(variable in choice for choice in choices)]
@@ -428,21 +424,14 @@ def remarks(replicates: int, domains: Sequence[Domain], alternatives: Sequence[s
 
 LEARNED_COLUMNS = (*VARIABLES.values(), "force_N", "sigma_N", "trials", "condition")
 
-LEAST_LOG_BAYES_FACTOR = 18.0  # ln Z in excess of that of no force from which a force is reported (chosen)
 
 LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is estimated (chosen)
 
 CHOICES_REFINED = {1: 1, 2: 3}  # Choices of one variable and of two for which the nonlinear problem is solved (chosen)
 
-# Relative singular value below which a force along the motions does not determine a combination of splines (chosen)
-PROJECTION_CUTOFF = 1e-3
-
-# Effective number of independent residuals in a trial where a model leaves more than noise (chosen)
-INDEPENDENT_PARTS_PER_TRIAL = 20
 
 HYPERPARAMETER_UPDATES = 2  # Rounds of optimising the force and then its amplitude and length scales (chosen)
 
-LEAST_EXPLAINED = 0.95  # Part of the misfit that the refined force must take away to be reported (chosen)
 
 PLOT_POINTS, VISITED_DISTANCE = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
 
@@ -501,7 +490,8 @@ def learned_force(
         return None
     largest_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
     linear = _linear_choices(fit, inversion, largest_N)
-    if linear is None or linear.log_bayes_factor(linear.choices[0][0]) < LEAST_LOG_BAYES_FACTOR:
+    # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
+    if linear is None or linear.log_bayes_factor(linear.choices[0][0]) < 18.0:
         return None
     refined = _refined_choices(fit, inversion, linear, largest_N)
     if not refined:
@@ -511,7 +501,8 @@ def learned_force(
     choices = [marginal_likelihood(each.choice.domain, each.likelihood, inflation, largest_N) for each in refined]
     chi2 = min(choice.best().chi2 for choice in choices)
     noise_chi2 = inversion.n_points
-    if inversion.chi2_without_force - chi2 < LEAST_EXPLAINED * (inversion.chi2_without_force - noise_chi2):
+    # 0.95: part of the misfit that the refined force must take away to be reported (chosen)
+    if inversion.chi2_without_force - chi2 < 0.95 * (inversion.chi2_without_force - noise_chi2):
         return None
     correlation_error = _correlation_error(inversion, inflation)
     error = max(0.5 * CONVERGENCE_TOLERANCE * chi2 / inflation, correlation_error)
@@ -599,7 +590,8 @@ def _linear_choices(fit: Fit, inversion: LinearInversion, largest_N: float) -> _
 
 def _correlation_error(inversion: LinearInversion, inflation: float) -> float:
     """Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer."""
-    points_per_part = max(inversion.n_points / (INDEPENDENT_PARTS_PER_TRIAL * len(inversion.data)), 1.0)
+    # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
+    points_per_part = max(inversion.n_points / (20 * len(inversion.data)), 1.0)
     return (1 + (inflation - 1) * points_per_part) / inflation
 
 
@@ -646,7 +638,9 @@ def _restarted_from_best(
         if choice.domain == domain or len(choice.domain.variables) < 2 or excess < CONVERGENCE_TOLERANCE * least_chi2:
             continue
         basis = np.concatenate([choice.domain.basis(choice.domain.values_along(motion)) for motion in motions])
-        amplitude = np.asarray(np.linalg.lstsq(basis, force_N, rcond=PROJECTION_CUTOFF)[0])
+        # 1e-3: relative singular value below which a force along the motions does not determine a combination
+        # of splines (chosen)
+        amplitude = np.asarray(np.linalg.lstsq(basis, force_N, rcond=1e-3)[0])
         start = replace(best.point, law=SmoothForce(choice.domain, np.eye(choice.domain.size)), amplitude=amplitude)
         again = _refined(fit, inversion, start, choice, inflation, largest_N)
         if again is not None and again[1].least_chi2 < each.likelihood.least_chi2:

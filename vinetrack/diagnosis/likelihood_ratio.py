@@ -113,9 +113,6 @@ CREDIBLE_RANGE_FACTOR = 3.0  # Multiple of its plausible range within which a si
 
 MIN_SIZE_SIGMAS = 1.0  # A size below this many of its standard errors is compatible with zero (chosen)
 
-# Squared distance of two predictions, in units of the noise, below which they count as the same curve (derived)
-SAME_CURVE_DISTANCE = 4.0
-
 
 @dataclass(frozen=True)
 class LikelihoodRatio:
@@ -336,15 +333,14 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     }
     members = []
     for ratio in plausible:
+        # 4.0: squared distance of two predictions, in units of the noise, below which they count as the same
+        # curve (derived)
         simpler = [
             other
             for other in plausible
             if 2 * (ratio.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET_DELTA_CHI2
             and _complexity(other) < _complexity(ratio)
-            and (
-                _contains(ratio, other)
-                or (_comparable(ratio, other) and _distance(other.fit, ratio.fit) < SAME_CURVE_DISTANCE)
-            )
+            and (_contains(ratio, other) or (_comparable(ratio, other) and _distance(other.fit, ratio.fit) < 4.0))
         ]
         if simpler:
             rejected[ratio.label] = remark(CONTAINS_AND_FITS_NO_BETTER, name=simpler[0].names[-1])
@@ -389,9 +385,6 @@ def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
 # ------------------------------------------------------------------------------
 # Simpler forms of an effect that contains another as a special case, refitted from where the larger one ended.
 
-# Standard errors by which an additional parameter must differ from zero for the simpler form to be ruled out without a
-# fit
-CERTAIN_SIGMAS = 6.0
 
 # A hypothesis and its ln L, one of its effects, and the simpler form of that effect
 NestedForm = tuple[str, float, str, str]
@@ -423,7 +416,6 @@ def _needs_larger_form(fit: Fit, larger: Effect, simpler: Effect) -> bool:
     """Whether a parameter that only the larger form has differs from zero beyond doubt."""
     additional = {p.name for p in larger.parameters} - {p.name for p in simpler.parameters}
     numbers = [n for n in fit.numbers if n.key.split(".")[0] == larger.name and n.key.split(".")[1] in additional]
-    return any(
-        math.isfinite(n.sigma) and not math.isfinite(n.bound) and abs(n.value) > CERTAIN_SIGMAS * n.sigma
-        for n in numbers
-    )
+    # 6.0: standard errors by which an additional parameter must differ from zero for the simpler form to be ruled
+    # out without a fit
+    return any(math.isfinite(n.sigma) and not math.isfinite(n.bound) and abs(n.value) > 6.0 * n.sigma for n in numbers)

@@ -54,18 +54,9 @@ from vinetrack.inference.whitening import at_correlation
 # model without it is fitted to them with noise and between-trial standard deviations held, and the score is computed
 # there: the Asimov data set of Cowan, Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011.
 
-# Most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
-MAX_ITERATIONS, CONVERGENCE_DECREASE = 20, 0.2
-
-
-LINEARITY_TOLERANCE = 0.02  # Relative deviation of an expected score from linear theory that is neglected (chosen)
 
 # Ratio of an expected score to that of linear theory from which neither is used, as below 0 (chosen)
 MAX_SCORE_RATIO = 2.0
-
-LARGEST_SCORE = 7.0  # Expected score from which no larger size is tried (chosen)
-
-LARGEST_MULTIPLE = 56.0  # Multiple of the size of one standard error beyond which no size is tried (chosen)
 
 
 @dataclass(frozen=True)
@@ -104,12 +95,15 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Noise
     (n_sizes,).
     """
     large = score_ratio(tests, shape_index, 7 * unit, start)
-    if 0 < abs(large - 1) < LINEARITY_TOLERANCE:
+    # 0.02: relative deviation of an expected score from linear theory that is neglected (chosen)
+    if 0 < abs(large - 1) < 0.02:
         return np.array([7 * unit]), np.array([large])
     multiples, ratios = [4.0, 7.0], [score_ratio(tests, shape_index, 4 * unit, start), large]
     if not all(0 < ratio < MAX_SCORE_RATIO for ratio in ratios):
         return unit * np.array(multiples), np.ones(2)
-    while ratios[-1] * multiples[-1] < LARGEST_SCORE and multiples[-1] < LARGEST_MULTIPLE:
+    # 7.0: expected score from which no larger size is tried (chosen)
+    # 56.0: multiple of the size of one standard error beyond which no size is tried (chosen)
+    while ratios[-1] * multiples[-1] < 7.0 and multiples[-1] < 56.0:
         ratio = score_ratio(tests, shape_index, 2 * multiples[-1] * unit, start)
         if ratio == 1 or not 0 < ratio < MAX_SCORE_RATIO:
             break
@@ -205,15 +199,16 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
         columns[:, -1] += trial_data.lead_position_m - before.lead_position_m[keep]
     predictor = _predictor_of(start.predictor, data)
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
+    # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
     solution = solve(
         predictor,
         fit.solution.problem,
         state,
         held,
         warm=True,
-        most_iterations=MAX_ITERATIONS,
+        most_iterations=20,
         columns=initial,
-        least_decrease=CONVERGENCE_DECREASE,
+        least_decrease=0.2,
     )
     trials = [
         replace(
@@ -265,8 +260,6 @@ SD_FACTORS = (1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0)
 
 # Scores at the true standard deviations for which the inflation is tabulated (chosen)
 SCORE_GRID = np.linspace(0.0, 40.0, 401)
-
-LEAST_TAKEN_FOR = 0.05  # Probability from which another candidate is listed (chosen)
 
 
 @dataclass(frozen=True)
@@ -532,7 +525,8 @@ def _confusion(
     highest = np.argmax(squares, axis=1)
     others = np.delete(squares, itself, axis=1).max(axis=1, initial=-math.inf)
     rates = {name: float(np.mean(highest == k)) for k, name in enumerate(names) if k != itself}
-    listed = sorted((name for name in rates if rates[name] >= LEAST_TAKEN_FOR), key=lambda name: -rates[name])
+    # 0.05: probability from which another candidate is listed (chosen)
+    listed = sorted((name for name in rates if rates[name] >= 0.05), key=lambda name: -rates[name])
     return {name: rates[name] for name in listed}, float(np.mean(squares[:, itself] - others > ANSWER_SET_DELTA_CHI2))
 
 

@@ -44,11 +44,6 @@ from vinetrack.inference.robust_covariance import Systematics, cluster_variance,
 #
 # Probes are bumps of force along the growth, over speed and over time.
 
-BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4  # Number of probe bumps along growth, speed and time (chosen)
-
-# Smallest eigenvalue of the probes' information, relative to the largest, that counts as a degree of freedom (chosen)
-MIN_INFORMATION_SHARE = 1e-4
-
 
 def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     """Bumps of force along the growth, over speed and over time, with and without a factor P."""
@@ -64,7 +59,8 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     )
     varied = len({round(trial.trial.pressure_Pa, 1) for trial in fit.trials}) > 1
     shapes = []
-    for kind, count, top in ((0, BUMPS_ALONG, reach), (1, BUMPS_SPEED, fastest), (2, BUMPS_TIME, longest_s)):
+    # 8, 4, 4: number of probe bumps along growth, speed and time (chosen)
+    for kind, count, top in ((0, 8, reach), (1, 4, fastest), (2, 4, longest_s)):
         centres = (np.arange(count) + 0.5) / count * top
         for centre in centres:
             for offset in (0, 3) if varied and kind == 0 else (0,):
@@ -106,7 +102,9 @@ def structure_from_scores(scores: Scores) -> Structure:
     information = (scores.information / root[:, None] / root)[np.ix_(informative, informative)]
     score = (scores.score / root)[informative]
     values, vectors = np.linalg.eigh(information)
-    keep = values > MIN_INFORMATION_SHARE * values.max(initial=0.0)
+    # 1e-4: smallest eigenvalue of the probes' information, relative to the largest, that counts as a degree of
+    # freedom (chosen)
+    keep = values > 1e-4 * values.max(initial=0.0)
     # In the principal directions the scores are uncorrelated and have variance 1 by the noise model.
     z = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
     directions = (vectors / root[informative][:, None])[:, keep] / np.sqrt(values[keep])
@@ -135,15 +133,12 @@ def structure_from_scores(scores: Scores) -> Structure:
 
 STRETCH_FRAMES = 8  # Frames over which residuals are summed (chosen)
 
-MIN_STRETCHES = 12  # Degrees of freedom of the stretches at rest below which the noise test is not made (chosen)
 
 MIN_REPLICATE_DEGREES = 4  # Degrees of freedom between replicates from which their scatter is estimated (chosen)
 
 STATED_ERROR_FACTOR, CAREFUL_DAMPING_SCATTER = 2.0, 0.04  # Root mean square by which conditions may differ (chosen)
 
 CAREFUL_PRESSURE_SCATTER = 0.02  # Relative standard deviation of pressure that is usual between trials (chosen)
-
-REPLICATE_LIKE_P_VALUE = 0.05  # p-value from which conditions count as differing no more than their replicates (chosen)
 
 
 def between_conditions_p(fit: Fit) -> float:
@@ -195,7 +190,8 @@ def _differ_like_replicates(values: Floats, groups: Sequence[str], fitted: int, 
     """
     inner, outer = values.size - len(set(groups)), len(set(groups)) - fitted
     testable = inner >= MIN_REPLICATE_DEGREES and outer > 0
-    return testable and _anova_p(values, groups, fitted, allowed) > REPLICATE_LIKE_P_VALUE
+    # 0.05: p-value from which conditions count as differing no more than their replicates (chosen)
+    return testable and _anova_p(values, groups, fitted, allowed) > 0.05
 
 
 def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
@@ -236,7 +232,8 @@ def noise_in_motion_p(fit: Fit) -> float:
         at_rest.append((standstill - standstill.mean()) * math.sqrt(standstill.size / (standstill.size - 1)))
         in_motion.append(_stretch_sums(trial.whitened[trial_data.n_rest :]))
         rest_degrees += standstill.size - 1
-    if rest_degrees < MIN_STRETCHES:
+    # 12: degrees of freedom of the stretches at rest below which the noise test is not made (chosen)
+    if rest_degrees < 12:
         return 1.0
     still, moving = np.concatenate(at_rest), np.concatenate(in_motion)
     ratio = float(np.mean(moving**2) / np.mean(still**2))

@@ -97,14 +97,6 @@ def _linearised(fit: Fit, inversion: LinearInversion) -> LinearMisfit:
 # ------------------------------------------------------------------------------
 # Simple laws ranked by how well they explain the misfit of a fit.
 
-DETECTION_SIGMAS = 5.0  # Standard errors that the amplitude of a law must differ from zero to be detected
-
-# Laws that are fitted by nonlinear least squares, if the best linear fit leaves more than this multiple of the noise;
-# otherwise the best alone (chosen)
-LAWS_REFINED, ROUGH_CHI2_PER_POINT = 3, 1.5
-
-# Part of χ² that a law must take away to be refined (chosen)
-LEAST_CHI2_FRACTION, MAX_CHI2_RATIO = 0.5, 1.5
 
 # Multiple of the largest drive, weight and inertia of the trials above which a force is not reported (chosen)
 MAX_DRIVE_RATIO = 10.0
@@ -124,7 +116,8 @@ class RankedLaw:
     def is_detected(self) -> bool:
         """Whether its amplitude differs significantly from zero, and is plausible for these motions."""
         size_N = math.hypot(*self.estimate.amplitude)
-        return DETECTION_SIGMAS * self.estimate.sigma < size_N < self.largest_N and not self.law.is_unresolved
+        # 5.0: standard errors that the amplitude of a law must differ from zero to be detected
+        return 5.0 * self.estimate.sigma < size_N < self.largest_N and not self.law.is_unresolved
 
     @property
     def words(self) -> str:
@@ -183,14 +176,17 @@ def _refined(
     Where the linear fit of the best law leaves only noise, the others keep their linear fits.
     """
     chi2 = inversion.chi2_without_force
-    rough = chi2 - laws[0].estimate.delta_chi2 > ROUGH_CHI2_PER_POINT * inversion.n_points
+    # 3, 1.5: laws that are fitted by nonlinear least squares, if the best linear fit leaves more than this
+    # multiple of the noise; otherwise the best alone (chosen)
+    rough = chi2 - laws[0].estimate.delta_chi2 > 1.5 * inversion.n_points
     estimates = [law.estimate for law in laws]
-    for k, ranked in enumerate(laws[: LAWS_REFINED if rough else 1]):
+    for k, ranked in enumerate(laws[: 3 if rough else 1]):
         linear = ranked.estimate
-        if not ranked.is_detected or linear.delta_chi2 < LEAST_CHI2_FRACTION * chi2:
+        # 0.5, 1.5: part of χ² that a law must take away to be refined (chosen)
+        if not ranked.is_detected or linear.delta_chi2 < 0.5 * chi2:
             continue
         full = refine_law(fit, inversion, motions, ranked.law, linear, thorough=k == 0)
-        if full is not None and full.chi2 < max(MAX_CHI2_RATIO * (chi2 - linear.delta_chi2), inversion.n_points):
+        if full is not None and full.chi2 < max(1.5 * (chi2 - linear.delta_chi2), inversion.n_points):
             estimates[k] = ForceEstimate(
                 chi2 - full.chi2, full.amplitude, full.sigma, full.parameter_shift, linear.degrees_of_freedom
             )
@@ -251,14 +247,9 @@ N_BINS = 10  # Bins along each axis in which the mean over all conditions is tak
 
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
 
-CURVE_POINTS = 24  # Points of a curve (chosen)
-
-MAX_RELATIVE_ERROR = 2.0  # Multiple of the median standard error above which a force is not drawn (chosen)
 
 # Part of the misfit that a smooth force in every condition must take away for the misfit to count as a force (chosen)
 LEAST_MISFIT_REDUCTION = 0.5
-
-EQUALLY_EXPLAINED = 0.05  # Difference of the explained parts within which other laws are named with the best (chosen)
 
 
 @dataclass(frozen=True)
@@ -375,10 +366,12 @@ def _force_table(
     rows = []
     for condition, (coefficients, covariance) in curves.items():
         motion = next(m for m in motions if m.trial.condition == condition)
-        position_m = np.linspace(0.04, 0.96, CURVE_POINTS) * motion.lead_position_m.max()
+        # 24: points of a curve (chosen)
+        position_m = np.linspace(0.04, 0.96, 24) * motion.lead_position_m.max()
         basis = growth_splines(position_m / longest[condition])
         sigma = standard_error(basis, covariance)
-        drawn = sigma < MAX_RELATIVE_ERROR * np.median(sigma)
+        # 2.0: multiple of the median standard error above which a force is not drawn (chosen)
+        drawn = sigma < 2.0 * np.median(sigma)
         position_m, force, sigma = position_m[drawn], (basis @ coefficients)[drawn], sigma[drawn]
         time_s = np.interp(position_m, motion.lead_position_m, motion.time_s)
         axes = {
@@ -454,7 +447,8 @@ def _sentence(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit
     if best.explained < LEAST_EXPLAINED_TO_NAME:
         return _no_law_sentence(best, depends_on)
     # Misfit that not even a free force takes away limits how well laws can be told apart.
-    margin = EQUALLY_EXPLAINED + float(np.nan_to_num(1 - misfit_reduction))
+    # 0.05: difference of the explained parts within which other laws are named with the best (chosen)
+    margin = 0.05 + float(np.nan_to_num(1 - misfit_reduction))
     others = [
         law
         for law in laws[1:]

@@ -53,18 +53,10 @@ LEAST_SEPARATION = 3.0  # Separation, in standard deviations, below which trials
 # Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended (chosen)
 SUFFICIENT_SEPARATION = 8.0
 
-MAX_HYPOTHESES = 5  # Most hypotheses that a design separates (chosen)
 
 NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
 
 CHECK_DRAWS = {2: 3, 3: 2}  # Draws of the check by number of hypotheses, otherwise one (chosen)
-
-CLEAR_SEPARATION = 20.0  # Separation, in standard deviations, beyond which the check takes one draw less (chosen)
-
-# Factor by which the worth of a design must exceed that with less effort for it to be considered (chosen)
-LEAST_GAIN = 1.01
-
-MAX_VINES_TRIED = 2  # New vines that are tried, at most (chosen)
 
 
 @dataclass(frozen=True)
@@ -138,7 +130,8 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     """Recommend trials that separate hypotheses which fit the same trials equally well."""
     limits = limits or Limits()
     _check_fits(tied)
-    tied = list(tied)[:MAX_HYPOTHESES]
+    # 5: most hypotheses that a design separates (chosen)
+    tied = list(tied)[:5]
     names = _hypothesis_names(tied)
     measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
     if _only_measurement(tied):
@@ -237,7 +230,9 @@ def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed
         if any(option.weakest >= SUFFICIENT_SEPARATION for option in options[:-1]):
             break
         design, predicted = best_design(terms, allowed, limits.trials)
-        if predicted > LEAST_GAIN * before:
+        # 1.01: factor by which the worth of a design must exceed that with less effort for it to be
+        # considered (chosen)
+        if predicted > 1.01 * before:
             before = predicted
             options.append(_Option(tuple(design.tolist()), simulated_rises(bench, design.tolist(), [0], seed)))
     return options
@@ -252,7 +247,8 @@ def _conditions_by_effort(bench: DesignProblem, terms: list[RefitTerms], trials:
     new = np.flatnonzero(efforts == NEW_VINE)
     if new.size:
         vines = np.array([condition.trial.vine for condition in bench.conditions])
-        most = MAX_VINES_TRIED if len(terms) == 2 else 1
+        # 2: new vines that are tried, at most (chosen)
+        most = 2 if len(terms) == 2 else 1
         for vine in best_new_vines(terms, bench.conditions, new, trials, most):
             yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
@@ -279,7 +275,8 @@ def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int)
     names = [hypothesis.name for hypothesis in bench.hypotheses]
     expected_sigma = _by_pair(best.separations)
     worth_it = max(expected_sigma.values()) >= LEAST_SEPARATION
-    draws = max(CHECK_DRAWS.get(len(names), 1) - (min(expected_sigma.values()) > CLEAR_SEPARATION), 1)
+    # 20.0: separation, in standard deviations, beyond which the check takes one draw less (chosen)
+    draws = max(CHECK_DRAWS.get(len(names), 1) - (min(expected_sigma.values()) > 20.0), 1)
     simulated = {}
     if worth_it:
         simulated = _simulated_separations(simulated_rises(bench, best.design, range(draws), seed, thorough=True))

@@ -34,15 +34,11 @@ Indices = NDArray[np.int_]
 
 USUAL_EXPONENT = 0.37  # Starting value of the exponent (PHYSICS)
 
-USUAL_SCATTER = 0.05  # Residual of ln F at which the robust fit halves the weight of a trial (chosen)
 
 LEAST_SCATTER = 0.02  # Lower limit of the scatter of ln F: the scatter of careful trials (chosen)
 
 CHANCE = 1e-4  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
 
-# Efficiency of a standard deviation from the median absolute deviation, relative to that from the mean square, and
-# degrees of freedom added to so many times those that the fitted curves leave (derived)
-EFFICIENCY, FEW_TRIALS_DOF = 0.37, 1.0
 
 # Slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
 CURVE_SHAPE_PARAMETERS = 2
@@ -110,7 +106,9 @@ def _limit(count: int, remaining: int) -> float:
     """
     from scipy.stats import t
 
-    return float(t.isf(CHANCE / (2 * count), max(EFFICIENCY * remaining + FEW_TRIALS_DOF, 3.0)))
+    # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
+    # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
+    return float(t.isf(CHANCE / (2 * count), max(0.37 * remaining + 1.0, 3.0)))
 
 
 def _stated_Pa(trial_data: FitTrial) -> float:
@@ -145,11 +143,12 @@ def _fit_curves(log_force: Floats, log_speed: Floats, vine_index: Indices) -> Ca
 
     straight = log_force - USUAL_EXPONENT * (log_speed - middle)
     levels = [float(np.median(straight[vine_index == vine])) for vine in range(n_vines)]
+    # 0.05: residual of ln F at which the robust fit halves the weight of a trial (chosen)
     fit = least_squares(
         lambda values: log_force - curve(values, log_speed, vine_index),
         [*levels, USUAL_EXPONENT, 0.0],
         loss="cauchy",
-        f_scale=USUAL_SCATTER,
+        f_scale=0.05,
     )
     return partial(curve, fit.x)
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from vinetrack.diagnosis.further_trials import InformativeTrials
 
-STATED_95 = 0.95  # Confidence of the intervals of rates; a convention
 
 # Probabilities at which detectable sizes are tabulated (chosen)
 PROBABILITIES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
@@ -152,7 +151,8 @@ class Rate:
 
         if not self.campaigns:
             return 0.0, 1.0
-        exact = binomtest(self.count, self.campaigns).proportion_ci(STATED_95, method="exact")
+        # 0.95: confidence of the intervals of rates; a convention
+        exact = binomtest(self.count, self.campaigns).proportion_ci(0.95, method="exact")
         return float(exact.low), float(exact.high)
 
 

@@ -131,7 +131,6 @@ def _fit_with(before: Fit, effect: Effect) -> Fit:
 # β the cubic B-spline of unit step (de Boor 2001, ch. IX). Its single parameter scales the table; 1 is the force as
 # learned.
 
-CHECKS_PER_SPLINE = 4  # Positions per spline at which the two sets of splines are matched by least squares (chosen)
 
 TABLE_DIGITS = 6  # Significant digits of a coefficient in the file (chosen)
 
@@ -221,7 +220,8 @@ def uniform_table(domain: Domain, coefficients: Floats) -> Floats:
     """
     table = coefficients.reshape(domain.counts)
     for axis, count in enumerate(domain.counts):
-        at = np.linspace(0.0, 1.0, CHECKS_PER_SPLINE * count)
+        # 4: positions per spline at which the two sets of splines are matched by least squares (chosen)
+        at = np.linspace(0.0, 1.0, 4 * count)
         conversion = np.linalg.lstsq(_even_splines(at, count), uniform_splines(at, count), rcond=None)[0]
         table = np.moveaxis(np.tensordot(conversion, table, axes=(1, axis)), 0, axis)
     return np.asarray(table)
@@ -283,9 +283,6 @@ def _worked_example(learned: LearnedForce) -> tuple[dict[str, float], float]:
 
 LEAST_SIGMAS = 6.0  # Standard deviations by which a law must improve the fit to be proposed
 
-# Part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
-LAW_REPRODUCES = 0.9
-
 
 @dataclass(frozen=True)
 class ProposedTable:
@@ -312,7 +309,8 @@ def proposed_table(
     """Estimate the missing force as a smooth function and fit it as a table."""
     misfit = before.chi2_per_dof - 1
     remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
-    if misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - LAW_REPRODUCES) * misfit:
+    # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
+    if misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - 0.9) * misfit:
         return None
     report("estimating the missing force as a table")
     learned = learn_missing_force(before)
@@ -334,11 +332,6 @@ def proposed_table(
             return None
         report("errors with the table")
         return ProposedTable(learned, effect, ratio, left_out(after).rms_m)
-
-
-MAX_LAWS_FITTED = 4  # Most laws that are fitted in the equation of motion (chosen)
-
-MAX_EXPLAINED_DEFICIT = 0.2  # Laws that explain less than the best by more than this part are not fitted (chosen)
 
 
 @dataclass(frozen=True)
@@ -477,8 +470,10 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         before = restart_exponents(before)
     report("estimating the missing force")
     detected = missing_force(before, learn=False).detected
-    best = [law for law in detected if law.explained > detected[0].explained - MAX_EXPLAINED_DEFICIT]
-    proposal = _fitted_laws(model, before, best[:MAX_LAWS_FITTED], report)
+    # 0.2: laws that explain less than the best by more than this part are not fitted (chosen)
+    best = [law for law in detected if law.explained > detected[0].explained - 0.2]
+    # 4: most laws that are fitted in the equation of motion (chosen)
+    proposal = _fitted_laws(model, before, best[:4], report)
     fits = [law.ratio.fit for law in proposal.tied]
     return replace(proposal, table=proposed_table(model, proposal.before, fits, report))
 

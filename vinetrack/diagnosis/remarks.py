@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
-# Room whose function `in_words(object)` makes sentences; it lies above, and is imported when words are requested
-NARRATIVE = "vinetrack.narrative"
-
 
 def in_words(told: Any) -> str:
     """Return a remark or a result in words."""
-    words: str = import_module(NARRATIVE).in_words(told)
+    # "vinetrack.narrative": room whose function `in_words(object)` makes sentences; it lies above, and is
+    # imported when words are requested
+    words: str = import_module("vinetrack.narrative").in_words(told)
     return words
 
 

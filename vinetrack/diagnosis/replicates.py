@@ -27,13 +27,10 @@ from vinetrack.tracks.position_noise import FEWEST_POINTS, local_fit, rest_point
 # ------------------------------------------------------------------------------
 # Best-fit value of one parameter for each trial, with all other parameters at their common values.
 
-NEWTON_STEPS = 5  # Gauss–Newton steps (chosen)
 
 LARGEST_STEP = 0.3  # Largest step of ln B, or of a parameter in units of its scale (chosen)
 
 MAX_DEVIATION_SCALES = 3.0  # Largest deviation from the common value, in scales (chosen)
-
-TYPICAL_SCATTER = (0.01, 0.03)  # Typical standard deviations of pressure and ln B between trials (chosen)
 
 
 @dataclass(frozen=True)
@@ -86,7 +83,8 @@ def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialE
     scale = np.ones_like(base) if logarithmic else np.full_like(base, _scale(parameter, base))
     scaled = np.zeros_like(base)
     projected = [np.zeros(0)] * base.size
-    for _ in range(NEWTON_STEPS):
+    # 5: gauss–Newton steps (chosen)
+    for _ in range(5):
         scaled, trial_effects, projected = _gauss_newton_step(
             predictor, trial_effects, column, base, scaled, scale, logarithmic
         )
@@ -189,7 +187,8 @@ def _variance(aligned: AlignedTrials, projected: list[Floats], scale: Floats) ->
         square = max(float(np.sum(sensitivity**2)), 1e-300)
         others = c[:, [RELEASE]] if origin_fixed[i] else c[:, [RELEASE, ORIGIN]]
         levers = [float(sensitivity @ orthogonal_part(c[:, k], others)) / square for k in (PRESSURE, DAMPING_DEVIATION)]
-        scatter = sum((sd * lever) ** 2 for sd, lever in zip(TYPICAL_SCATTER, levers, strict=True))
+        # (0.01, 0.03): typical standard deviations of pressure and ln B between trials (chosen)
+        scatter = sum((sd * lever) ** 2 for sd, lever in zip((0.01, 0.03), levers, strict=True))
         noise = aligned.predictor.data[i].mean_noise_m ** 2 / square
         variance[i] = (scatter + noise + 1e-12) * scale[i] ** 2
     return variance
@@ -210,8 +209,6 @@ LOWER_BOUNDS, UPPER_BOUNDS = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)  # Bounds of th
 
 # Lower limits of the standard deviations of pressure and B where both are needed (chosen)
 LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
-
-POSITION_FLOOR_M = 1e-6  # Lower limit of the error of a stretch mean, m (chosen)
 
 
 @dataclass(frozen=True)
@@ -305,7 +302,8 @@ def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
 def _covariance(group: Stretches, variances: Floats) -> Floats:
     shared = (group.sensitivities * variances[:2]) @ group.sensitivities.T
     residual = variances[2] * float(np.trace(shared)) / len(shared)
-    return np.asarray(shared + group.noise_m2 + (residual + POSITION_FLOOR_M**2) * np.eye(len(shared)))
+    # 1e-6: lower limit of the error of a stretch mean, m (chosen)
+    return np.asarray(shared + group.noise_m2 + (residual + 1e-6**2) * np.eye(len(shared)))
 
 
 def replicate_z(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) -> float:
@@ -324,19 +322,7 @@ def replicate_z(mean: Floats, covariance: Floats, trials: int, scatter: Scatter)
     return float(norm.isf(max(p, 1e-300)))
 
 
-# Smallest scaled singular value with which a shift in time and one in position are both fitted (chosen)
-MIN_SINGULAR_VALUE = 0.05
-
-MAX_ROUNDS = 200  # Maximum number of rounds, each of which shifts every replicate towards the mean (chosen)
-
-SETTLED_FRAMES = 1e-3  # Largest shift of a round, in frames, at which the alignment has converged (chosen)
-
 LARGEST_STEP_FRAMES = 2.0  # Largest shift of a round, in frames (chosen)
-
-# Fraction of the shorter motion that must overlap with the longer one where no standstill shows when it began (chosen)
-LEAST_OVERLAP = 0.8
-
-N_COARSE_SHIFTS = 201  # Number of shifts in time tried for a track that begins in motion (chosen)
 
 
 @dataclass(frozen=True)
@@ -424,7 +410,8 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
         [n >= FEWEST_AT_REST or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)]
     )
     earliest_s, latest_s = np.array([_release_range(trial, reference) for trial in trials]).T
-    for _ in range(MAX_ROUNDS):
+    # 200: maximum number of rounds, each of which shifts every replicate towards the mean (chosen)
+    for _ in range(200):
         deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
         time_shift_s, position_shift_m = _shifts(deviation_m, speed_m_s, origin_known)
         time_shift_s = np.clip(time_shift_s, -LARGEST_STEP_FRAMES * frame_s, LARGEST_STEP_FRAMES * frame_s)
@@ -433,7 +420,8 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
         shifted_s = release_s + time_shift_s
         shifted_s = np.where(rest_seen, shifted_s, np.clip(shifted_s, earliest_s, latest_s))
         time_shift_s, release_s, origin_m = shifted_s - release_s, shifted_s, origin_m + position_shift_m
-        if np.all(np.abs(time_shift_s) < SETTLED_FRAMES * frame_s):
+        # 1e-3: largest shift of a round, in frames, at which the alignment has converged (chosen)
+        if np.all(np.abs(time_shift_s) < 1e-3 * frame_s):
             break
     deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
     motion_begin_s = min(_begin(trial, n)[0] - at for trial, n, at in zip(trials, rests, release_s, strict=True))
@@ -470,13 +458,16 @@ def _release_range(trial: TrialFit, reference: _Reference) -> tuple[float, float
     """Earliest and latest release, s, with which a trial overlaps enough with the reference."""
     first_s, last_s = float(trial.time_s[0]), float(trial.time_s[-1])
     begin_s, end_s = float(reference.since_s[0]), float(reference.since_s[-1])
-    overlap_s = LEAST_OVERLAP * min(last_s - first_s, end_s - begin_s)
+    # 0.8: fraction of the shorter motion that must overlap with the longer one where no standstill shows when it
+    # began (chosen)
+    overlap_s = 0.8 * min(last_s - first_s, end_s - begin_s)
     return overlap_s + first_s - end_s, last_s - begin_s - overlap_s
 
 
 def _coarse_alignment(trial: TrialFit, reference: _Reference) -> tuple[float, float]:
     """Release and origin of a track that begins in motion, where it deviates least from the reference."""
-    tried_s = np.linspace(*_release_range(trial, reference), N_COARSE_SHIFTS)
+    # 201: number of shifts in time tried for a track that begins in motion (chosen)
+    tried_s = np.linspace(*_release_range(trial, reference), 201)
     differences_m = np.array([trial.lead_position_m - reference.at(trial.time_s - at) for at in tried_s])
     best = int(np.argmin(differences_m.std(axis=1)))
     return float(tried_s[best]), float(differences_m[best].mean())
@@ -511,7 +502,9 @@ def _shifts(deviation_m: Floats, speed_m_s: Floats, origin_known: Floats) -> tup
         if np.count_nonzero(use) > 2:
             free = 0.0 if origin_known[i] else 1.0
             design = np.column_stack([-speed_m_s[use], np.full(np.count_nonzero(use), free)])
-            shifts[:, i] = scaled_least_squares(design, trial_deviation_m[use], MIN_SINGULAR_VALUE)
+            # 0.05: smallest scaled singular value with which a shift in time and one in position are both
+            # fitted (chosen)
+            shifts[:, i] = scaled_least_squares(design, trial_deviation_m[use], 0.05)
     return shifts[0], shifts[1]
 
 

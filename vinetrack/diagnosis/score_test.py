@@ -160,11 +160,6 @@ def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[Mix
     )
 
 
-# Share of its information below which what remains of a shape is rounding, because other columns reproduce it exactly
-# (derived)
-ROUNDING_SHARE = 1e-9
-
-
 @dataclass(frozen=True)
 class Scores:
     """Score statistics of every shape given the fit, per unit of its size."""
@@ -368,7 +363,9 @@ def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDAr
     """Information with the rows of shapes that other columns reproduce set to zero, and which these are. What the
     projection leaves of such a shape is rounding. `before` is the information before the projection.
     """
-    empty = np.diag(information) < ROUNDING_SHARE * np.maximum(np.diag(before)[: len(information)], 1e-300)
+    # 1e-9: share of its information below which what remains of a shape is rounding, because other columns
+    # reproduce it exactly (derived)
+    empty = np.diag(information) < 1e-9 * np.maximum(np.diag(before)[: len(information)], 1e-300)
     cleaned = information.copy()
     cleaned[empty, :] = cleaned[:, empty] = 0.0
     return cleaned, empty
@@ -449,10 +446,6 @@ def _residual_sum(fit: Fit, projection: Projection, p: int, state: FitState) -> 
 
 DRAWS, SEED = 2000, 20  # Draws of the scores, and the seed (measured)
 
-NODES = 6  # Thresholds at which a candidate's exceedance probability p is computed (chosen)
-
-HALVINGS = 30  # Bisection steps for ln q (derived)
-
 
 @dataclass(frozen=True)
 class FamilyTest:
@@ -524,7 +517,8 @@ def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], l
         return {name: math.sqrt(square) for name, square in squares.items()}
 
     low, high = math.log(level / len(shapes)), math.log(level)
-    for _ in range(HALVINGS):
+    # 30: bisection steps for ln q (derived)
+    for _ in range(30):
         middle = (low + high) / 2
         by_name = thresholds(middle)
         by_shape = np.concatenate([np.full(indices.size, by_name[name]) for name, indices in shapes.items()])
@@ -537,6 +531,7 @@ def _exceedance_table(
 ) -> tuple[Floats, Floats]:
     """Squares of thresholds of a candidate, increasing, and ln of the probability that it exceeds each."""
     n_tests = 2.0 * len(indices) * candidates
-    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(max(level, 1e-290) / n_tests)), NODES)
+    # 6: thresholds at which a candidate's exceedance probability p is computed (chosen)
+    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(max(level, 1e-290) / n_tests)), 6)
     probabilities = [scores.exceedance(indices, np.full(indices.size, node)) for node in nodes]
     return nodes**2, np.log(np.maximum(probabilities, 1e-300))

@@ -150,10 +150,6 @@ TAIL_SLACK = Effect(
 # Compression of the tail, as a fraction of the drive ½PA, from which the rule is tried (chosen)
 MIN_PUSH_FRACTION = 0.02
 
-# Rise of −2 ln L per point, on one trial of every condition, from which the rule is refuted without a full fit where
-# trials scatter much (derived)
-REFUTED_DEVIANCE_PER_POINT = 1.0
-
 
 def pushes(fit: Fit) -> bool:
     """Whether the fitted model predicts compression in the tail of any trial that is not allowed to go slack."""
@@ -199,7 +195,9 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     if scattered:
         fitter = SubsetFitter(slack)
         subset_fit = best_subset_fit(fitter, exponent_starts(slack), math.inf)
-        allowed_rise = REFUTED_DEVIANCE_PER_POINT * fitter.n_points
+        # 1.0: rise of −2 ln L per point, on one trial of every condition, from which the rule is refuted
+        # without a full fit where trials scatter much (derived)
+        allowed_rise = 1.0 * fitter.n_points
         if subset_fit is not None and subset_fit.deviance > SubsetFitter(fit).null_deviance() + allowed_rise:
             return None
     fits = []
@@ -226,8 +224,6 @@ STALLED_CHI2_SHARE = 0.7
 # (chosen)
 PARTIAL_SHARE = 0.5
 
-# Effects that are the leading term of a series in the image position (derived)
-LEADING_TERMS, LEADING_TERM_SHARE = ("lens", "perspective"), 0.95
 
 NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)  # Kinds of hypotheses that are not physics
 
@@ -464,7 +460,8 @@ def _rounds_of_sets(
     gains = {single.names[0]: single.delta_chi2 for single in fitted if len(single.names) == 1}
     kinds = {effect.name: effect.kind for hypothesis in adequate for effect in hypothesis.effects}
     best = adequate[0]
-    leading = {name for name in LEADING_TERMS if gains.get(name, 0.0) > LEADING_TERM_SHARE * best.delta_chi2}
+    # ("lens", "perspective"), 0.95: effects that are the leading term of a series in the image position (derived)
+    leading = {name for name in ("lens", "perspective") if gains.get(name, 0.0) > 0.95 * best.delta_chi2}
 
     def order(name: str) -> tuple[bool, bool, float]:
         return name not in leading, kinds[name] == "measurement", -gains.get(name, 0.0)

@@ -17,8 +17,6 @@ from vinetrack.dynamics.kernel import RELATIVE_TOLERANCE, Batch, Trace, lay_out,
 from vinetrack.dynamics.model import Model, base_model, check_needs, host_for, trial_inputs
 from vinetrack.effects import Effect, TrialInputs, catalogue
 
-STATUS = ("running", "ended", "stalled", "too hard")  # In the order of the integrator's codes
-
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -109,6 +107,7 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
     """The trajectories of a batch that was run."""
     edges = batch.starts.tolist()
     motion = np.ascontiguousarray(out[:, :3].T) / np.repeat(ratios, np.diff(batch.starts))
+    # ("running", "ended", "stalled", "too hard"): in the order of the integrator's codes
     return [
         Trajectory(
             time_s=batch.stamps[a:b],
@@ -117,7 +116,7 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
             lead_acceleration_m_s2=motion[2, a:b],
             observed_position_m=out[a:b, 3],
             travel_ratio=ratio,
-            status=STATUS[int(status)],
+            status=("running", "ended", "stalled", "too hard")[int(status)],
             end_time_s=end_s,
             end_lead_velocity_m_s=end_speed / ratio,
             n_steps=int(n_steps),

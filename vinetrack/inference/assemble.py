@@ -40,18 +40,6 @@ from vinetrack.inference.whitening import at_correlation, whiten
 # ------------------------------------------------------------------------------
 # Messages of a fit: warnings on its numbers, and notes on what was done to its data.
 
-STRONG_CORRELATION = 0.98  # Correlation of two fitted numbers from which the fit warns (chosen)
-
-# Ratio of fitted to stated error of P_y from which the trajectories are said not to constrain it (chosen)
-UNCONSTRAINED_RATIO = 0.95
-
-# The same ratio from which the message explains why the fitted error exceeds the stated one (chosen)
-WIDENED_RATIO = 1.05
-
-MISFIT_CHI2 = 2.0  # χ² per degree of freedom from which the fit warns of misfit (chosen)
-
-# Standard deviation between trials, in errors of the shared number, from which the fit says that trials disagree
-DISAGREEMENT_SIGMAS = 1.0
 
 SPREAD_NAMES = ("pressure", "B")
 
@@ -91,8 +79,12 @@ def _messages(
             messages.append(
                 f"{number.title} ({number.key}) sits at its bound {number.bound:.4g}: the data favour values outside"
             )
-        elif math.isfinite(free.prior_sd) and number.sigma > UNCONSTRAINED_RATIO * free.prior_sd:
-            wider = number.sigma > WIDENED_RATIO * free.prior_sd
+        # 0.95: ratio of fitted to stated error of P_y from which the trajectories are said not to constrain
+        # it (chosen)
+        elif math.isfinite(free.prior_sd) and number.sigma > 0.95 * free.prior_sd:
+            # 1.05: the same ratio from which the message explains why the fitted error exceeds the stated
+            # one (chosen)
+            wider = number.sigma > 1.05 * free.prior_sd
             why = (
                 "; trials disagree by more than their noise, so its error is larger than in the sheet" if wider else ""
             )
@@ -108,7 +100,8 @@ def _messages(
             messages.append(
                 f"the between-trial standard deviation of {name} is taken as {100 * solution.state.spread[k]:.2g} %"
             )
-    if chi2 > MISFIT_CHI2:
+    # 2.0: χ² per degree of freedom from which the fit warns of misfit (chosen)
+    if chi2 > 2.0:
         messages.append(
             f"the residuals are {math.sqrt(chi2):.3g} times the noise of the tracks{_variation_allowed(solution)}:"
             " an effect is missing, or the tracks have slow errors larger than their noise"
@@ -128,7 +121,8 @@ def _correlation_messages(numbers: Sequence[Number], precision: Precision) -> li
     usable = np.flatnonzero(np.isfinite(variance) & (variance > 0))
     for i, j in itertools.combinations(usable.tolist(), 2):
         correlation = precision.covariance[i, j] / math.sqrt(variance[i] * variance[j])
-        if abs(correlation) > STRONG_CORRELATION:
+        # 0.98: correlation of two fitted numbers from which the fit warns (chosen)
+        if abs(correlation) > 0.98:
             first, second = numbers[i].title, numbers[j].title
             pairs.append(f"{first} and {second} are strongly correlated ({correlation:.3f})")
     return pairs
@@ -137,10 +131,12 @@ def _correlation_messages(numbers: Sequence[Number], precision: Precision) -> li
 def _disagreement_messages(numbers: Sequence[Number], between: Floats) -> list[str]:
     """A message naming the numbers on which trials disagree by more than the error of their mean."""
     sd = np.sqrt(np.diag(between))
+    # 1.0: standard deviation between trials, in errors of the shared number, from which the fit says that trials
+    # disagree
     disagreements = [
         f"{n.title} by ± {sd[k] * display_unit(n.unit)[1]:.2g} {display_unit(n.unit)[0]}".rstrip()
         for k, n in enumerate(numbers)
-        if sd[k] > DISAGREEMENT_SIGMAS * n.sigma and math.isfinite(n.sigma)
+        if sd[k] > 1.0 * n.sigma and math.isfinite(n.sigma)
     ]
     if not disagreements:
         return []

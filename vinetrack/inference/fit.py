@@ -142,7 +142,6 @@ def _fixed_terms_of(fit: Fit, rows: Indices) -> FixedTerms:
 # Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined (chosen)
 LEAST_EIGENVALUE = 1e-4
 MOST_STEPS = 20  # Maximum number of Gauss–Newton steps for release and origin (chosen)
-SETTLED_FRAMES = 1e-3  # Step of the release below which it has converged, frames (chosen)
 FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
 
 
@@ -269,7 +268,8 @@ def _fit_release_and_origin(
         largest_step = 2 * frames[active]
         step[:, RELEASE] = np.clip(step[:, RELEASE], -largest_step, largest_step)
         trial_effects[active, :2] += step
-        active = active[np.abs(step[:, RELEASE]) >= SETTLED_FRAMES * frames[active]]
+        # 1e-3: step of the release below which it has converged, frames (chosen)
+        active = active[np.abs(step[:, RELEASE]) >= 1e-3 * frames[active]]
         if not active.size:
             break
     return trial_effects, square
@@ -296,8 +296,6 @@ def _cross_products_of(predictor: Predictor, trial_effects: Floats, rows: NDArra
 
 
 __all__ = ["FitError", "fit", "predict", "refit"]
-
-STANDSTILL_M = 1e-9  # Travel below which a simulated trial counts as standing still (derived)
 
 
 @in_one_blas_thread
@@ -339,7 +337,8 @@ def fit(
 def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
     """Refuse a model in which no trial is driven: it has no trajectories to compare with the tracks."""
     trajectories = predictor.run(predictor.jobs(solution.state.theta, solution.state.trial_effects))
-    if any(float(np.ptp(trajectory.observed_position_m)) > STANDSTILL_M for trajectory in trajectories):
+    # 1e-9: travel below which a simulated trial counts as standing still (derived)
+    if any(float(np.ptp(trajectory.observed_position_m)) > 1e-9 for trajectory in trajectories):
         return
     model = " + ".join(predictor.layout.model.names)
     angles = sorted({round(math.degrees(trial_data.trial.growth_angle_rad)) for trial_data in predictor.data})

@@ -33,28 +33,10 @@ FEWEST_POINTS = 5  # A trial with fewer points is refused (derived)
 
 FEWEST_MOVING = 4  # A trial with fewer points in motion is refused (derived)
 
-# A point later than this many frames after the previous one begins a new stretch, whose noise is independent of the
-# previous one's (derived)
-GAP_FRAMES = 1.5
-
-MOVES_SIGMAS = 8.0  # Standard deviations by which the edge must move for a trial to be fitted
-
-
-# Where a trace begins below this part of its median, the tube was pressurised during the recording (chosen)
-SETTLED_PRESSURE_PART = 0.5
 
 END_FRACTION = 0.95  # The growth beyond this fraction of the length is left out (chosen)
 
 FRAMES_BEHIND_END = 2  # Frames left out after the end of growth (derived)
-
-
-# A point is left out if its stated error exceeds the median of the better half by this factor, provided that at least
-# the second fraction of points remains (chosen)
-IMPRECISE_FACTOR, LEAST_PRECISE_PART, REST_DISCARD_PART = 3.0, 0.3, 0.5
-
-
-# Range of rounded positions at rest, in rounding steps, up to which rounding hides their noise (derived)
-QUANTISED_REST_STEPS = 1.5
 
 
 class FitError(UserError, ValueError):
@@ -148,7 +130,9 @@ class FitTrial:
         """Whether the tube was pressurised during the recording; the trace then shows when the growth was started.
         Nothing else holds such a vine, and a free release would stand in for a threshold of the pressure.
         """
-        return self.trace is not None and bool(self.trace[1][0] < SETTLED_PRESSURE_PART * np.median(self.trace[1]))
+        # 0.5: where a trace begins below this part of its median, the tube was pressurised during the
+        # recording (chosen)
+        return self.trace is not None and bool(self.trace[1][0] < 0.5 * np.median(self.trace[1]))
 
 
 Pairs = Iterable[tuple[Trial, Track]]
@@ -191,7 +175,8 @@ def prepare_trial(
     if trial.payload_kg == 0 and not trial.linear_density_kg_m > 0:
         raise FitError("it has no mass: fill in payload_g, the mass of a body that moves as a whole")
     moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
-    if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
+    # 8.0: standard deviations by which the edge must move for a trial to be fitted
+    if not moved_m > 8.0 * noise_m or moved_m <= 0:
         raise FitError("its leading edge never moves forward beyond its noise")
     n_rest = 0 if imprecise_rest is not None else rest_points(position_m)
     moving = time_s.size - n_rest
@@ -204,11 +189,13 @@ def prepare_trial(
     extended = None if denoised is None else denoised.extended()
     stated_m = track.lead_position_sigma_m[usable]
     filmed = trial.video is not None
+    # 1.5: A point later than this many frames after the previous one begins a new stretch, whose noise is
+    # independent of the previous one's (derived)
     return FitTrial(
         trial=trial,
         time_s=time_s,
         lead_position_m=position_m,
-        first=np.concatenate([[True], steps > GAP_FRAMES * np.median(steps)]),
+        first=np.concatenate([[True], steps > 1.5 * np.median(steps)]),
         n_rest=n_rest if n_rest < position_m.size else 0,
         noise_m=noise_m,
         correlation=correlation,
@@ -264,11 +251,13 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
     if not stated.any():
         return np.zeros(usable.size, dtype=bool), None
     precise_half_m = sigma_m[stated & (sigma_m <= np.median(sigma_m[stated]))]
-    imprecise = stated & (sigma_m > IMPRECISE_FACTOR * np.median(precise_half_m))
+    # 3.0, 0.3, 0.5: A point is left out if its stated error exceeds the median of the better half by this factor,
+    # provided that at least the second fraction of points remains (chosen)
+    imprecise = stated & (sigma_m > 3.0 * np.median(precise_half_m))
     usable_points = np.flatnonzero(usable)
     at_rest = usable_points[: rest_points(track.lead_position_m[usable_points])]
     imprecise_rest = None
-    if 0 < at_rest.size < usable_points.size and np.mean(imprecise[at_rest]) > REST_DISCARD_PART:
+    if 0 < at_rest.size < usable_points.size and np.mean(imprecise[at_rest]) > 0.5:
         # The few remaining points of such a rest would determine the origin alone.
         imprecise[at_rest] = True
         imprecise_rest = ImpreciseRest(
@@ -276,9 +265,7 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
             origin_m=float(np.median(track.lead_position_m[at_rest])),
             sigma_m=float(np.median(sigma_m[at_rest])),
         )
-    enough_precise = np.count_nonzero(usable & ~imprecise) >= max(
-        FEWEST_POINTS, LEAST_PRECISE_PART * np.count_nonzero(usable)
-    )
+    enough_precise = np.count_nonzero(usable & ~imprecise) >= max(FEWEST_POINTS, 0.3 * np.count_nonzero(usable))
     return (imprecise, imprecise_rest) if enough_precise else (np.zeros(usable.size, dtype=bool), None)
 
 
@@ -293,7 +280,8 @@ def _quantised_points(
     y = track.lead_position_m[places]
     quantised = np.zeros(usable.size, dtype=bool)
     n_rest = rest_points(y)
-    if not 0 < n_rest < y.size or np.ptp(y[:n_rest]) > QUANTISED_REST_STEPS * math.sqrt(12) * rounding_m:
+    # 1.5: range of rounded positions at rest, in rounding steps, up to which rounding hides their noise (derived)
+    if not 0 < n_rest < y.size or np.ptp(y[:n_rest]) > 1.5 * math.sqrt(12) * rounding_m:
         return quantised, None
     quantised[places[:n_rest]] = True
     standstill_start = int(np.flatnonzero(y != y[-1])[-1]) + 1

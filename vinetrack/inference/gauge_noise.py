@@ -45,11 +45,9 @@ from vinetrack.inference.gauge_readings import (
 
 LARGEST_OFFSET_FRAMES = 60  # Largest clock offset, samples (chosen)
 
-ENOUGH_READINGS = 400  # Readings used to estimate an offset (chosen)
 
 EM_ITERATIONS = 30  # Iterations of the expectation–maximisation of frequencies (measured)
 
-PEAK_LOG_WIDTH = 4.5  # Log posterior below the maximum down to which an offset belongs to its peak (derived)
 
 # Degrees in time and in growth of the curve by which the offset is estimated (chosen)
 TIME_DEGREE, GROWTH_DEGREE = 1, 2
@@ -124,7 +122,8 @@ def gauge_clocks(
     for (i, log_likelihood), share in zip(logs.items(), shares, strict=True):
         posterior = log_likelihood + np.log(share)
         best = int(np.argmax(posterior))
-        in_peak = posterior > posterior[best] - PEAK_LOG_WIDTH
+        # 4.5: log posterior below the maximum down to which an offset belongs to its peak (derived)
+        in_peak = posterior > posterior[best] - 4.5
         # The peak is the contiguous range around the likeliest offset.
         gaps = np.flatnonzero(~in_peak)
         begin = int(max(gaps[gaps < best], default=-1)) + 1
@@ -150,7 +149,8 @@ def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise
     means = readings.edges is not None
     at = np.arange(growth.grown_m.size) if means else readings.places
     t, y = np.linspace(-1, 1, at.size), whitened(readings.values_Pa - np.mean(readings.values_Pa), noise.rho)
-    stride = max(size // ENOUGH_READINGS, 1)
+    # 400: readings used to estimate an offset (chosen)
+    stride = max(size // 400, 1)
     y = y[::stride]
     residual_squares = np.full(offsets.size, np.inf)
     for k in np.flatnonzero(np.abs(offsets) <= growth.grown_m.size // 4):
@@ -172,28 +172,18 @@ def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise
 # Half widths of the windows of local lines, samples (chosen)
 HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135, 200, 300, 450, 680, 1000)
 
-AGREE_SIGMAS = 4.0  # Half width, in standard deviations, of the intervals of local lines that must overlap (chosen)
-
-# Probability with which pure noise leaves a larger residual sum of squares than is accepted (chosen)
-RESIDUAL_FALSE_ALARM = 1e-5
 
 LARGEST_DEGREE, EXTRA_DEGREES, SLOW_SIGMAS = 6, 12, 4.0  # Largest degree of a polynomial in time (chosen)
 
-LOCAL_SIGMAS = 5.0  # Standard deviations from which a sum of neighbouring residuals is more than noise
 
 EXPONENTS = (1.0, 1.1, 1.2, 1.3, 1.4)  # Exponents γ with which a chamber may empty into the tube, (derived)
 
 # Degrees in time and in growth of the other kinds of curves (chosen)
 GROWTH_DEGREES = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
 
-# Probability, relative to the most probable kind of curve, from which a kind enters the average (chosen)
-LEAST_WEIGHT = 0.01
 
 # Last part of a trace whose line extrapolates it beyond its end (measured)
 END_PART, EXTRAPOLATED_PART = 0.1, 0.2
-
-# Part of the total error variance of a curve below which a principal direction is dropped (chosen)
-NEGLIGIBLE_VARIANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -376,7 +366,8 @@ class _Recorded:
 def _principal_errors(errors_Pa: Floats) -> Floats:
     """The same error covariance in as few columns as possible, by principal components."""
     directions, sizes_Pa, _ = np.linalg.svd(errors_Pa, full_matrices=False)
-    kept = sizes_Pa**2 > NEGLIGIBLE_VARIANCE * np.sum(sizes_Pa**2)
+    # 1e-3: part of the total error variance of a curve below which a principal direction is dropped (chosen)
+    kept = sizes_Pa**2 > 1e-3 * np.sum(sizes_Pa**2)
     return np.asarray((directions * sizes_Pa)[:, kept])
 
 
@@ -463,7 +454,8 @@ def _weights(criteria: Floats) -> Floats:
     totals = criteria - 2 * np.log(frequencies_in_other_trials(np.exp(-0.5 * (criteria - lowest[:, None]))))
     least = np.where(possible, totals.min(axis=1), 0.0)
     weights = np.where(possible[:, None], np.exp(-0.5 * (totals - least[:, None])), 0.0)
-    return np.where(weights >= LEAST_WEIGHT, weights, 0.0)
+    # 0.01: probability, relative to the most probable kind of curve, from which a kind enters the average (chosen)
+    return np.where(weights >= 0.01, weights, 0.0)
 
 
 def _polynomials(count: int, degree: int) -> Floats:
@@ -477,7 +469,8 @@ def _is_noise(residual_Pa: Floats, noise: GaugeNoise, fitted: int, slow: Floats)
         return False
     # A corner that is cut leaves residuals only in the samples around it.
     total = np.concatenate([[0.0], np.cumsum(residual_Pa)])
-    local = _quantile_Pa(LOCAL_SIGMAS, noise)
+    # 5.0: standard deviations from which a sum of neighbouring residuals is more than noise
+    local = _quantile_Pa(5.0, noise)
     for width in (2 * half + 1 for half in HALF_WIDTHS if 2 * half < residual_Pa.size):
         if np.max(np.abs(total[width:] - total[:-width])) > local * np.sqrt(width):
             return False
@@ -495,7 +488,8 @@ def _largest_residual_squares(noise: GaugeNoise, degrees: Floats | int) -> Any:
     """Largest accepted residual sum of squares with so many degrees of freedom, Pa² (F test)."""
     from scipy.special import fdtri
 
-    return noise.sigma_Pa**2 * degrees * fdtri(degrees, noise.degrees, 1 - RESIDUAL_FALSE_ALARM)
+    # 1e-5: probability with which pure noise leaves a larger residual sum of squares than is accepted (chosen)
+    return noise.sigma_Pa**2 * degrees * fdtri(degrees, noise.degrees, 1 - 1e-5)
 
 
 def _local_lines(pressure_Pa: Floats, noise: GaugeNoise) -> Floats:
@@ -505,7 +499,8 @@ def _local_lines(pressure_Pa: Floats, noise: GaugeNoise) -> Floats:
     agrees = np.ones(smooth.size, dtype=bool)
     for half in HALF_WIDTHS:
         value, part, residual_squares, degrees = _local_line(pressure_Pa, half)
-        half_width = AGREE_SIGMAS * noise.sigma_Pa * part
+        # 4.0: half width, in standard deviations, of the intervals of local lines that must overlap (chosen)
+        half_width = 4.0 * noise.sigma_Pa * part
         low, high = np.maximum(low, value - half_width), np.minimum(high, value + half_width)
         agrees &= (low <= high) & (residual_squares < _largest_residual_squares(noise, degrees))
         if not agrees.any():

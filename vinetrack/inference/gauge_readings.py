@@ -27,13 +27,10 @@ EXACT_TOLERANCE = 1e-9
 # Fraction of samples on a line through two others above which a trace counts as interpolated (chosen)
 INTERPOLATED_PART = 0.25
 
-LEAST_SCATTER_DIGITS = 2.0  # Least median scatter, in last digits, of the readings found in traces (measured)
 
 # Samples by which a change may deviate from the even sampling period of a gauge (derived)
 PERIOD_TOLERANCE, PERIOD_FALSE_ALARM = 0.75, 1e-4
 
-# Fraction of a line that must be visible at an end of a trace to determine the reading that it leads to (chosen)
-LEAST_LINE_PART = 0.25
 
 NEGLIGIBLE_NOISE = 1e-4  # Noise below this fraction of the median pressure is rounding, and is not removed (chosen)
 
@@ -42,10 +39,6 @@ FEWEST_SAMPLES = 9  # Samples below which a trace does not determine its noise (
 # Least number of blocks into which a trace in coarse steps is divided, and least number of samples in each (chosen)
 FEWEST_BLOCKS = 4
 
-DERIVED_DEGREES = 1e6  # Degrees of freedom of a noise that is derived instead of estimated
-
-# Samples below which a trace is left unchanged although other traces determine the noise (derived)
-FEWEST_WITH_OTHERS = 3
 
 # Standard deviations at which differences are clipped in the noise estimate, the part of the variance of normal noise
 # that remains (derived: 0.9707 + 9 · 0.0027), and iterations, of which the last changes it by 1e-4
@@ -53,8 +46,6 @@ CLIP_SIGMAS, VARIANCE_KEPT, CLIP_ROUNDS = 3.0, 0.9950, 3
 
 NOISE_DEGREES = 2 / 4.62  # Degrees of freedom of the noise variance per sample (derived)
 
-# Degrees of freedom that the other traces of a campaign add to the noise of a trace (chosen)
-DEGREES_FROM_OTHERS = 20.0
 
 # Lag at which noise is compared with that of neighbouring readings, standard deviations from which it counts as
 # correlated, and the largest correlation (chosen)
@@ -100,7 +91,8 @@ def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
     candidates = [_interpolated_readings(pressure_Pa) for pressure_Pa in traces]
     scatter_digits = [digits for _, digits in filter(None, candidates)]
     # Samples rounded to steps coarser than their noise lie on lines for that reason alone.
-    interpolated = bool(scatter_digits) and float(np.median(scatter_digits)) >= LEAST_SCATTER_DIGITS
+    # 2.0: least median scatter, in last digits, of the readings found in traces (measured)
+    interpolated = bool(scatter_digits) and float(np.median(scatter_digits)) >= 2.0
     return [
         candidate[0] if interpolated and candidate is not None else _samples_as_readings(pressure_Pa)
         for candidate, pressure_Pa in zip(candidates, traces, strict=True)
@@ -269,9 +261,9 @@ def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[
         shown_length = abs(end - inner)
         # A line longer than the typical spacing contains a further reading.
         place = inner + math.copysign(max(spacing, shown_length), end - inner)
-        ends.append(
-            [(place, slope * place + at_0)] if shown_length >= LEAST_LINE_PART * spacing and shown_length > 0 else []
-        )
+        # 0.25: fraction of a line that must be visible at an end of a trace to determine the reading that it
+        # leads to (chosen)
+        ends.append([(place, slope * place + at_0)] if shown_length >= 0.25 * spacing and shown_length > 0 else [])
     readings = np.array([*ends[0], *zip(places, values, strict=True), *ends[1]])
     return readings[:, 0], readings[:, 1]
 
@@ -298,10 +290,13 @@ def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise
     noises = []
     for sigma, each in zip(own_sigma, readings, strict=True):
         if each.all_noise:
-            noises.append(GaugeNoise(each.rounding_Pa, DERIVED_DEGREES, 0.0))
+            # 1e6: degrees of freedom of a noise that is derived instead of estimated
+            noises.append(GaugeNoise(each.rounding_Pa, 1e6, 0.0))
             continue
         own_degrees = NOISE_DEGREES * each.values_Pa.size if math.isfinite(sigma) else 0.0
-        degrees_of_others = DEGREES_FROM_OTHERS if typical > 0 and each.values_Pa.size >= FEWEST_WITH_OTHERS else 0.0
+        # 3: samples below which a trace is left unchanged although other traces determine the noise (derived)
+        # 20.0: degrees of freedom that the other traces of a campaign add to the noise of a trace (chosen)
+        degrees_of_others = 20.0 if typical > 0 and each.values_Pa.size >= 3 else 0.0
         degrees = own_degrees + degrees_of_others
         squares = degrees_of_others * typical**2 + (own_degrees * sigma**2 if own_degrees else 0.0)
         pooled_sigma = max(math.sqrt(squares / degrees), each.rounding_Pa) if degrees else 0.0

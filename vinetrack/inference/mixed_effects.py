@@ -30,9 +30,6 @@ from vinetrack.inference.whitening import at_correlation
 
 RIDGE = 1e-13  # Added to the diagonal of systems with a unit diagonal before they are solved (derived)
 
-# Least pivot of a factorised system of unit diagonal, the part of its information that a parameter keeps once the
-# previous ones are eliminated; below it the system is left to least squares, which drop what is singular (derived)
-LEAST_PIVOT = 1e-9
 
 LEAST_RELEASE_DECREASE = 1e-6  # Decrease of −2 ln L, by leaving its bound, from which a parameter is released (derived)
 
@@ -75,7 +72,10 @@ def decrease_within_bounds(
             remaining[i] = scale[i] * remaining_slope
         _factor(scaled, 0.0, lower)
         for i in range(count):
-            if not lower[i, i] > LEAST_PIVOT:
+            # 1e-9: least pivot of a factorised system of unit diagonal, the part of its information that
+            # a parameter keeps once the previous ones are eliminated; below it the system is left to
+            # least squares, which drop what is singular (derived)
+            if not lower[i, i] > 1e-9:
                 return False, 0.0, 0.0
             log_det += math.log(lower[i, i]) - 2 * math.log(scale[i])
         _solve(lower, remaining)

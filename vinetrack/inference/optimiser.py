@@ -38,19 +38,6 @@ from vinetrack.inference.whitening import at_correlation
 
 FIRST_SPREADS = (0.01, 0.03)  # Initial between-trial standard deviations of pressure (relative) and ln B (chosen)
 
-# Least noise, relative to a trial's travel, because the integrator is not more accurate (measured)
-INTEGRATOR_ERROR = 2e-6
-
-# Prior standard deviations of release, frames, and of origin, in standard deviations of the noise (chosen)
-RELEASE_PRIOR_FRAMES, ORIGIN_PRIOR_SIGMAS = 10.0, 10.0
-
-# Prior standard deviation of the release of a vine that was pressurised during the recording: it is known (chosen)
-KNOWN_RELEASE_S = 1e-6
-
-# A between-trial standard deviation is estimated where it applies to this many more trials than there are parameters
-# without a prior (chosen)
-FEWEST_TO_SPARE = 3
-
 
 def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     """The constant part of a fit. Shapes: trial_effects (n_trials, 4)."""
@@ -64,10 +51,14 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     rest_sigma_m = np.array(
         [0.0 if trial_data.imprecise_rest is None else trial_data.imprecise_rest.sigma_m for trial_data in data]
     )
-    release_sd = np.where(rests, RELEASE_PRIOR_FRAMES * frames, 3 * durations)
-    release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = KNOWN_RELEASE_S
+    # 10.0, 10.0: prior standard deviations of release, frames, and of origin, in standard deviations of the noise
+    # (chosen)
+    release_sd = np.where(rests, 10.0 * frames, 3 * durations)
+    # 1e-6: prior standard deviation of the release of a vine that was pressurised during the recording: it is
+    # known (chosen)
+    release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = 1e-6
     noise = np.array([trial_data.noise_m for trial_data in data])
-    origin_room_m = np.maximum(ORIGIN_PRIOR_SIGMAS * np.maximum(noise, rest_sigma_m), 1e-4 * spans)
+    origin_room_m = np.maximum(10.0 * np.maximum(noise, rest_sigma_m), 1e-4 * spans)
     origin_sd = np.where(rests, origin_room_m, 3 * spans)
     return MixedProblem(
         index=layout.index,
@@ -120,14 +111,17 @@ def _stated_between_trial_sd(data: Sequence[FitTrial]) -> tuple[float, float]:
 
 def variance_floor(data: Sequence[FitTrial]) -> Floats:
     """Least variance of the noise of each trial, given the accuracy of the integrator. Shape (n_trials,)."""
-    return np.array([(INTEGRATOR_ERROR * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
+    # 2e-6: least noise, relative to a trial's travel, because the integrator is not more accurate (measured)
+    return np.array([(2e-6 * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
 
 
 def estimable(problem: MixedProblem) -> tuple[bool, bool]:
     """Whether there are enough trials to estimate the between-trial standard deviations of pressure and of ln B.
     Returns (bool, bool).
     """
-    needed = np.count_nonzero(problem.prior_precision == 0) + FEWEST_TO_SPARE
+    # 3: A between-trial standard deviation is estimated where it applies to this many more trials than there are
+    # parameters without a prior (chosen)
+    needed = np.count_nonzero(problem.prior_precision == 0) + 3
     has_estimated_sd = problem.has_deviation & np.column_stack(
         [problem.gauge_error == 0, np.ones(problem.gauge_error.size, dtype=bool)]
     )
@@ -140,9 +134,6 @@ def estimable(problem: MixedProblem) -> tuple[bool, bool]:
 
 # χ² per degree of freedom above which a fit may be at a local minimum, and other starts are tried (chosen)
 POOR_FIT = 3.0
-
-# Residual of the median trial, relative to its growth, above which a fit is poor (chosen)
-POOR_RELATIVE_RESIDUAL = 3e-3
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
@@ -164,9 +155,8 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
     are needed: a tracker whose frames agree to a hundredth of a millimetre may have slow errors of a few tenths. That
     is far above its noise, but no reason to try other starts.
     """
-    return bool(
-        chi2_per_dof(predictor, solution) > POOR_FIT and relative_residual(predictor, solution) > POOR_RELATIVE_RESIDUAL
-    )
+    # 3e-3: residual of the median trial, relative to its growth, above which a fit is poor (chosen)
+    return bool(chi2_per_dof(predictor, solution) > POOR_FIT and relative_residual(predictor, solution) > 3e-3)
 
 
 def relative_residual(predictor: Predictor, solution: Solution) -> float:
@@ -185,10 +175,6 @@ CONVERGED_DECREASE = 1e-2  # Predicted decrease of −2 ln L per step below whic
 # Relative change of noise and between-trial standard deviations that counts as converged (chosen)
 CONVERGED_VARIANCES = 0.02
 
-# Releases that no frame at rest determines are searched globally once the predicted decrease of a step falls below the
-# first number, or after this many steps (along the valley between two releases Gauss–Newton steps become tiny); and how
-# many of these searches may move a release (chosen)
-NEARLY_CONVERGED, RELEASE_SEARCH_INTERVAL, MOST_RELEASE_SEARCHES = 3.0, 4, 8
 
 # Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
 FIRST_ITERATIONS, MOST_FIRST_ITERATIONS, FAR_FROM_OPTIMUM = 3, 9, 1e3
@@ -197,9 +183,6 @@ PROGRESS_STEPS = 4  # Steps over which progress is measured before a fit is stop
 
 # Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped (derived)
 STAGNATION_DECREASE = 2e-3
-
-# Fractions of a step that a line search tries, and how many times the damping is then increased (chosen)
-STEP_FRACTIONS, MOST_DAMPING_INCREASES = (1.0, 0.4, 0.15), 11
 
 
 @dataclass(frozen=True)
@@ -272,7 +255,10 @@ def solve(
     columns, cross_products = (
         _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
     )
-    searches_left, last_search, searched_in_vain = MOST_RELEASE_SEARCHES, 0, False
+    # 3.0, 4, 8: releases that no frame at rest determines are searched globally once the predicted decrease of a
+    # step falls below the first number, or after this many steps (along the valley between two releases
+    # Gauss–Newton steps become tiny); and how many of these searches may move a release (chosen)
+    searches_left, last_search, searched_in_vain = 8, 0, False
     deviances: list[float] = []
     releases, at_corner = ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
@@ -295,9 +281,7 @@ def solve(
         at_corner = False
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
         if searches_left and (
-            small_step
-            or (predicted_decrease < NEARLY_CONVERGED and not searched_in_vain)
-            or iteration >= last_search + RELEASE_SEARCH_INTERVAL
+            small_step or (predicted_decrease < 3.0 and not searched_in_vain) or iteration >= last_search + 4
         ):
             last_search, searched_in_vain = iteration, True
             relocated = releases.likelier(state, residuals_in(columns))
@@ -455,7 +439,9 @@ def _accepted_step(
     first, then ever more damping: in a curved valley a step that is too long has the right direction, and damping would
     turn it across the valley. `penalised_squares` is that of the current state.
     """
-    for fraction in STEP_FRACTIONS:
+    # (1.0, 0.4, 0.15), 11: fractions of a step that a line search tries, and how many times the damping is then
+    # increased (chosen)
+    for fraction in (1.0, 0.4, 0.15):
         candidate = _candidate_state(
             predictor,
             problem,
@@ -467,7 +453,7 @@ def _accepted_step(
         )
         if candidate is not None:
             return candidate, damping * 0.1 if damping > 1e-6 else 0.0
-    for _ in range(MOST_DAMPING_INCREASES):
+    for _ in range(11):
         damping = max(10 * damping, 1e-4)
         step, effect_step, _ = levenberg_marquardt_step(cross_products, problem, state, damping)
         candidate = _candidate_state(predictor, problem, state, step, effect_step, penalised_squares)

@@ -23,7 +23,6 @@ from vinetrack.inference.fit_data import FitError, FitTrial
 YIELD_PRESSURE = "yield_pressure.P_y"
 DAMPING = "eversion_damping.B"
 EXPONENT = "eversion_damping.n"
-LEAST_DAMPING = 1e-6  # Least B, N·(s/m)ⁿ (chosen)
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,8 @@ class FreeParameter:
     def to_scaled(self, value: float) -> float:
         """The scaled value."""
         if self.logarithmic:
-            return math.log(max(value, LEAST_DAMPING))
+            # 1e-6: least B, N·(s/m)ⁿ (chosen)
+            return math.log(max(value, 1e-6))
         return value / self.scale
 
     def from_scaled(self, theta: float) -> float:

@@ -62,8 +62,6 @@ if TYPE_CHECKING:
 # Burns, Biometrics 41, 477, 1985). Near a bound, where a linear interval is invalid, the interval is that of the
 # profile likelihood: the values that a constrained fit does not reject.
 
-# Smallest eigenvalue of an information matrix of unit diagonal at which a direction still counts as determined
-SINGULAR_EIGENVALUE = 1e-10
 
 LEAST_INFORMATION = 1e-6  # Information below which a parameter has no influence on the trajectories (chosen)
 
@@ -115,7 +113,9 @@ def _covariance(
     if k.size:
         scale = 1 / np.sqrt(diagonal[k])
         values, vectors = np.linalg.eigh(information[np.ix_(k, k)] * scale[:, None] * scale)
-        singular = values < SINGULAR_EIGENVALUE
+        # 1e-10: smallest eigenvalue of an information matrix of unit diagonal at which a direction still
+        # counts as determined
+        singular = values < 1e-10
         for column in np.flatnonzero(singular):
             collinear[k] |= np.abs(vectors[:, column]) > 0.1
         inverse = (vectors[:, ~singular] / values[~singular]) @ vectors[:, ~singular].T
@@ -265,7 +265,6 @@ def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
 
 ORDERS = (1, 2, 3, 4)  # Legendre orders of the shapes
 
-NO_GROWTH_M = 1e-9  # Growth that counts as none (derived)
 
 # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
 # comparison, where differences count from 1; and the maximum number of steps (measured)
@@ -292,7 +291,8 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     if not (sigma_m > 0).any():
         return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
     # Without any growth the shapes are zero, since their value at rest is subtracted.
-    reach = max(NO_GROWTH_M, *(float(np.max(growth_m)) for growth_m in grown_m))
+    # 1e-9: growth that counts as none (derived)
+    reach = max(1e-9, *(float(np.max(growth_m)) for growth_m in grown_m))
     select = np.eye(max(ORDERS) + 1)[list(ORDERS)].T
     # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
     at_rest = (-1.0) ** np.array(ORDERS)
@@ -471,16 +471,6 @@ def with_smooth_errors(fit: Fit) -> Solution:
 # 1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too. 2. The parameters
 # θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M).
 
-# Maximum number of steps, and the length of a step in standard errors at which they have converged (chosen)
-POOLING_MOST_STEPS, CONVERGED_STEP_SIGMAS = 12, 0.05
-
-LARGEST_TAU2 = 1e6  # Largest τ², in variances of one trial by its noise (chosen)
-
-LONGEST_STEP = 3.0  # Longest step of a parameter, in units of √(its variance + the variance between trials) (chosen)
-
-# Least information of a trial on a direction that counts, relative to its largest (derived)
-LEAST_RELATIVE_INFORMATION = 1e-12
-
 
 @dataclass(frozen=True)
 class Pooled:
@@ -495,11 +485,6 @@ class Pooled:
     between: Floats
 
 
-# Deviation of a trial's ln B, or relative one of its pressure, at which a step has left the region in which the model
-# is nearly linear (chosen)
-FARTHEST_DEVIATION = 3.0
-
-
 def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
     """Estimate the shared parameters with trials weighted by noise and disagreement."""
     if len(predictor.data) < 2:
@@ -509,7 +494,9 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
     problem = with_shapes(solution.problem, count) if count else solution.problem
     state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
     columns: Sequence[Floats] = solution.columns
-    for _ in range(POOLING_MOST_STEPS):
+    # 12, 0.05: maximum number of steps, and the length of a step in standard errors at which they have converged
+    # (chosen)
+    for _ in range(12):
         extended = _with_shapes(columns, shapes, state.theta[shared:])
         cross_products = predictor.products(extended)
         rho, variance = estimate_noise(cross_products, problem, state, within=True)
@@ -522,11 +509,14 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
         longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
         errors = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
-        if float(np.max(np.abs(step) / errors, initial=0.0)) < CONVERGED_STEP_SIGMAS:
+        if float(np.max(np.abs(step) / errors, initial=0.0)) < 0.05:
             return pooled
-        step = step * min(1.0, LONGEST_STEP / longest)
+        # 3.0: longest step of a parameter, in units of √(its variance + the variance between trials) (chosen)
+        step = step * min(1.0, 3.0 / longest)
         state = _state_after_step(pooled.solution, state, step)
-        if np.max(np.abs(state.trial_effects[:, DEVIATION_COLUMNS])) > FARTHEST_DEVIATION:
+        # 3.0: deviation of a trial's ln B, or relative one of its pressure, at which a step has left the
+        # region in which the model is nearly linear (chosen)
+        if np.max(np.abs(state.trial_effects[:, DEVIATION_COLUMNS])) > 3.0:
             return None
         try:
             columns = predictor.linearise(state.theta[:shared], state.trial_effects)
@@ -583,7 +573,8 @@ def _with_weights(solution: Solution, shared: int) -> Pooled:
     # would lose all digits of a parameter on which trials disagree to cancellation.
     rotation, singular_values, _ = np.linalg.svd(np.swapaxes(information_roots, 1, 2) @ root)
     rotated_roots = information_roots @ rotation
-    determined = values > LEAST_RELATIVE_INFORMATION * values[:, -1:]
+    # 1e-12: least information of a trial on a direction that counts, relative to its largest (derived)
+    determined = values > 1e-12 * values[:, -1:]
     score_parts = np.where(determined, 1 / np.sqrt(np.where(determined, values, 1.0)), 0.0) * np.einsum(
         "nij,ni->nj", vectors, scores
     )
@@ -639,7 +630,8 @@ def _maximise_likelihood(deviance: Callable[[float], float]) -> float:
     """The τ² of lowest deviance: 0, or the lowest of a grid, refined."""
     from scipy.optimize import minimize_scalar
 
-    logs = np.linspace(math.log(1e-2), math.log(LARGEST_TAU2), 24)
+    # 1e6: largest τ², in variances of one trial by its noise (chosen)
+    logs = np.linspace(math.log(1e-2), math.log(1e6), 24)
     levels = [deviance(math.exp(log)) for log in logs]
     best = int(np.argmin(levels))
     low, high = logs[max(best - 1, 0)], logs[min(best + 1, logs.size - 1)]

@@ -35,15 +35,11 @@ from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA, matrix_root
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, Predictor
 from vinetrack.inference.whitening import whiten
 
-# Part of the information on a parameter that must come from other trials to predict a trial from them (chosen)
-LEAST_INFORMATION_OF_OTHERS = 1e-6
-
 # A trial counts as covered where this part of its positions is, and a band has to cover this part of trials (chosen)
 COVERED_POSITIONS, COVERAGE = 0.9, 0.95
 
 DRAWS = 1000  # Curves drawn for a simultaneous band (chosen)
 
-NORMAL_95 = 1.96  # Derived: standard normal quantile of 0.975
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit, TrialFit
@@ -125,7 +121,8 @@ def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
     pairs = [_leave_one_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
     predictable = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
     if not predictable:
-        return Calibration(0.0, NORMAL_95, math.inf, 0)
+        # 1.96: derived: standard normal quantile of 0.975
+        return Calibration(0.0, 1.96, math.inf, 0)
     square = np.array([np.mean(residual**2) for _, residual, _ in predictable])
     mean_variance = np.array([np.mean(variance) for *_, variance in predictable])
     travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in predictable])
@@ -168,7 +165,9 @@ def _leave_one_out(basis: _Basis, trial_data: FitTrial, i: int, fit_correlation:
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
     free = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
     needed = free[np.diag(basis.information[i])[free] > 0]
-    if len(basis.scores) < 2 or (np.diag(others)[needed] <= LEAST_INFORMATION_OF_OTHERS * np.diag(total)[needed]).any():
+    # 1e-6: part of the information on a parameter that must come from other trials to predict a trial from them
+    # (chosen)
+    if len(basis.scores) < 2 or (np.diag(others)[needed] <= 1e-6 * np.diag(total)[needed]).any():
         return None
     covariance = inverse_of_block(others, free)
     columns, deviations = solution.columns[i], [PRESSURE, DAMPING_DEVIATION]

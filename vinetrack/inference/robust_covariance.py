@@ -31,7 +31,6 @@ from vinetrack.inference.whitening import products
 # them. If neglected, they look like a small effect as soon as pressures and B vary little between trials. The error
 # that gauge noise leaves in a recorded pressure belongs to a single trial and bends its whole motion.
 
-PAYLOAD_ERROR = 0.005  # Standard deviation of a payload's mass in addition to that of the sheet, relative
 
 PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to that of the sheet
 
@@ -42,7 +41,6 @@ PAYLOAD_STEP = 1e-2  # Relative step of a payload's mass for its derivative (der
 # Largest number of half waves along the growth in the slow error of a tracker that all trials share (chosen)
 HALF_WAVES = 6
 
-START_FRACTION = 0.015  # Fraction of the growth over which a slow error that is larger at the start may decay (chosen)
 
 # Fractions of the growth before its end (measured)
 END_SHAPES = ((0.1, 2.0), (0.03, 4.0))
@@ -134,7 +132,8 @@ def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[T
         return no_errors
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
     for i, plain_trajectory, heavier_trajectory in zip(loaded, plain, heavier, strict=True):
-        columns[i][:, 0] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(plain_trajectory, heavier_trajectory)
+        # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
+        columns[i][:, 0] = 0.005 / PAYLOAD_STEP * position_change(plain_trajectory, heavier_trajectory)
     names = {i: round(trials[i].trial.payload_kg, 9) for i in loaded}
     return _one_per_group(columns, [names.get(i) for i in range(len(trials))])
 
@@ -248,7 +247,8 @@ def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
     usual = np.minimum(slow_m, np.median(slow_m))
     excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
     waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
-    start = np.exp(-np.maximum(part, 0.0) / START_FRACTION)
+    # 0.015: fraction of the growth over which a slow error that is larger at the start may decay (chosen)
+    start = np.exp(-np.maximum(part, 0.0) / 0.015)
     ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in END_SHAPES]
     return np.column_stack([waves, excess * start, excess * (1 - start), *ends])
 

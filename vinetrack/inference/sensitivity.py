@@ -200,10 +200,6 @@ class Motions:
 # ------------------------------------------------------------------------------
 # Finite differences of the observed positions of a trial, taken correctly across the end of growth.
 
-# Time over which the perturbed trajectory is extrapolated beyond its end, in units of the delay that the perturbation
-# causes (derived)
-LONGEST_EXTRAPOLATION = 3.0
-
 
 def clip_at_end(change: Floats, over: NDArray[np.bool_], *, moved_ends: bool) -> None:
     """Set the change of position after the end of growth: that of the end position, or 0 where only the time changes.
@@ -226,7 +222,9 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
         # A small perturbation ends growth earlier by displacement over speed. Where the unperturbed motion takes much
         # longer than that, the two motions differ in kind (one stops before the end), and nothing is extrapolated.
         speed_m_s = max(float(plain.lead_velocity_m_s[last]), 1e-9)
-        reach_s = plain.time_s[last] + LONGEST_EXTRAPOLATION * abs(float(change[last])) / speed_m_s
+        # 3.0: time over which the perturbed trajectory is extrapolated beyond its end, in units of the delay
+        # that the perturbation causes (derived)
+        reach_s = plain.time_s[last] + 3.0 * abs(float(change[last])) / speed_m_s
         early &= plain.time_s <= reach_s + 2 * (plain.time_s[1] - plain.time_s[0])
         if early.any():
             faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]
@@ -237,9 +235,6 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 N_TRIAL_EFFECTS = 4  # Trial effects of each trial: release, s; origin, m; relative deviation of pressure (defined)
 
-TARGET_RESPONSE = 2e-3  # Finite differences use steps that move a trajectory by this fraction of its travel (derived)
-
-SMALLEST_STEP, LARGEST_STEP = 1e-5, 0.1  # Least and largest relative step of a finite difference (derived)
 
 RELEASE_STEP_FRAMES = 0.1  # Step of the release (chosen)
 
@@ -536,7 +531,9 @@ def _adapted_step(response: float, previous: float) -> float:
     """Step that gives the target response, from the response to a unit step."""
     if not response > 0:
         return previous
-    return float(np.clip(TARGET_RESPONSE / response, SMALLEST_STEP, LARGEST_STEP))
+    # 2e-3: finite differences use steps that move a trajectory by this fraction of its travel (derived)
+    # 1e-5, 0.1: least and largest relative step of a finite difference (derived)
+    return float(np.clip(2e-3 / response, 1e-5, 0.1))
 
 
 # ------------------------------------------------------------------------------

@@ -44,12 +44,9 @@ from vinetrack.inference.robust_covariance import recorded_pressures
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor, align, candidates, initial_trial_effects
 from vinetrack.inference.trial_effects import trial_costs
 
-MOST_STARTS = 3  # Maximum number of starting values (chosen)
-
 # Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks (chosen)
 CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
 
-BAD_START_CHI2 = 1.5  # χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
 
 SLOW_NOISE = 0.99  # Noise correlation above which a fit has absorbed misfit as noise (chosen)
 
@@ -68,7 +65,8 @@ def solve_from_scratch(
     """
     solutions: list[Solution] = []
     reason = ""
-    starts = candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]
+    # 3: maximum number of starting values (chosen)
+    starts = candidates(predictor.layout, predictor.data, predictor)[:3]
     for _, theta, trial_effects in starts:
         try:
             most_iterations = MOST_ITERATIONS if thorough else CONTINUATION_ITERATIONS
@@ -307,9 +305,8 @@ def start_at_fixed_noise(
     """Starting values of a warm fit; where they are bad, the result of a descent with the noise fixed. With free noise,
     the misfit of bad starting values would be absorbed as noise and stall the optimiser.
     """
-    if fixed_terms.noise is not None or cost(predictor, problem, state) < BAD_START_CHI2 * float(
-        np.sum(problem.points)
-    ):
+    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
+    if fixed_terms.noise is not None or cost(predictor, problem, state) < 1.5 * float(np.sum(problem.points)):
         return state
     # An apparently late release may be the action of the new effect: each trial starts at the release that fits best.
     aligned, _ = align(predictor.data, predictor, state.theta, state.trial_effects)

@@ -154,8 +154,6 @@ LARGEST_DEVIATION_STEP = 0.3  # Largest step of a trial's deviations of pressure
 
 LARGEST_DEVIATION = 0.9  # Largest deviation of pressure and ln B (chosen)
 
-LARGEST_RELEASE_STEP_FRAMES = 2.0  # Largest step of a release, frames (chosen)
-
 
 def optimise_trial_effects(
     predictor: Predictor, problem: MixedProblem, state: FitState, largest_useful_cost: float = math.inf
@@ -201,7 +199,8 @@ def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> F
     """Trial effects after a step, within the trust region: two frames for the release, 0.3 for a deviation. Shapes:
     trial_effects, step (n_trials, 4) → (n_trials, 4).
     """
-    largest_release_step = LARGEST_RELEASE_STEP_FRAMES * np.array([trial_data.frame_s for trial_data in predictor.data])
+    # 2.0: largest step of a release, frames (chosen)
+    largest_release_step = 2.0 * np.array([trial_data.frame_s for trial_data in predictor.data])
     effects = trial_effects + step
     effects[:, RELEASE] = trial_effects[:, RELEASE] + np.clip(
         step[:, RELEASE], -largest_release_step, largest_release_step
@@ -233,30 +232,17 @@ def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
     return [np.ascontiguousarray(column[:, -1]) for column in columns]
 
 
-N_RELEASES = 60  # Candidate releases of a trial recorded only in motion (chosen)
-
 # Candidate releases of a trial recorded at rest, relative to the current one (chosen)
 NEARBY_RELEASES_FRAMES = np.concatenate([np.arange(-14.0, 15.0), [-0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6]])
 
-GRID_POINTS = 600  # Points of the time grid of a trajectory that is shifted (derived)
 
 LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release jumps to another minimum (derived)
 
-# Mean squared residual of a trial, in variances of its noise, up to which its release is searched (chosen)
-MOST_MISFIT = 30.0
-
-# Steps of the trial effects at another release before it is compared with the current one (chosen)
-TRIAL_EFFECT_STEPS = 3
 
 # Least and largest change of origin and deviations
 STEP_LIMITS = np.array([-np.inf, -0.3, -0.3]), np.array([np.inf, 0.3, 0.3])
 
 DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
-
-
-RETURNED_FRACTION = 0.25  # Part of a jump within which a release counts as returned to where the jump began (chosen)
-
-SAME_PARAMETERS = 1e-3  # Largest change of a shared parameter, scaled, that counts as no change (chosen)
 
 
 class ReleaseSearch:
@@ -277,11 +263,11 @@ class ReleaseSearch:
         another release would only compensate. Shapes: residuals (n_points,).
         """
         release_s = state.trial_effects[:, RELEASE]
-        came_back = np.abs(release_s - self.jumped_from) < RETURNED_FRACTION * np.abs(self.jumped_to - self.jumped_from)
+        # 0.25: part of a jump within which a release counts as returned to where the jump began (chosen)
+        came_back = np.abs(release_s - self.jumped_from) < 0.25 * np.abs(self.jumped_to - self.jumped_from)
         # Only if the shared parameters have not changed since the jump; otherwise they explain the return.
-        self.returned |= came_back & (
-            np.max(np.abs(state.theta - self.theta_at_jump), axis=1, initial=0.0) < SAME_PARAMETERS
-        )
+        # 1e-3: largest change of a shared parameter, scaled, that counts as no change (chosen)
+        self.returned |= came_back & (np.max(np.abs(state.theta - self.theta_at_jump), axis=1, initial=0.0) < 1e-3)
         proposed = self._by_linear_model(state, residuals)
         accepted = state if proposed is None else self._confirmed(state, proposed)
         jumped_s = accepted.trial_effects[:, RELEASE]
@@ -296,11 +282,13 @@ class ReleaseSearch:
         predictor, problem = self.predictor, self.problem
         misfit = trial_costs(predictor, problem, state, residuals) * state.variance
         misfit /= (1 - state.rho**2) * problem.points
+        # 30.0: mean squared residual of a trial, in variances of its noise, up to which its release is
+        # searched (chosen)
         places = [
             i
             for i, trial_data in enumerate(predictor.data)
             if not trial_data.pressurised_in_recording
-            and (not trial_data.shows_rest or misfit[i] < MOST_MISFIT * trial_data.noise_m**2)
+            and (not trial_data.shows_rest or misfit[i] < 30.0 * trial_data.noise_m**2)
         ]
         if not places:
             return None
@@ -332,7 +320,8 @@ class ReleaseSearch:
             current, proposed = (subset_state(each, rows, places) for each in (state, proposed))
         else:
             rows = np.arange(len(predictor.data))
-        for _ in range(TRIAL_EFFECT_STEPS):
+        # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
+        for _ in range(3):
             proposed = optimise_trial_effects(predictor, problem, proposed)[0]
         better = (
             _trial_deviances(predictor, problem, proposed)
@@ -400,7 +389,8 @@ def _candidate_releases(trial_data: FitTrial, release_s: float) -> Floats:
     if trial_data.shows_rest:
         return np.append(release_s + trial_data.frame_s * NEARBY_RELEASES_FRAMES, release_s)
     duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
-    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, N_RELEASES), release_s)
+    # 60: candidate releases of a trial recorded only in motion (chosen)
+    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, 60), release_s)
 
 
 def _release_sensitivities(
@@ -426,7 +416,8 @@ def _release_sensitivities(
         for perturbation, perturbed_job in variants:
             perturbations.append(perturbation)
             jobs.append(perturbed_job)
-            grids.append(longest_s * np.linspace(0.0, 1.0, GRID_POINTS) ** 1.5)
+            # 600: points of the time grid of a trajectory that is shifted (derived)
+            grids.append(longest_s * np.linspace(0.0, 1.0, 600) ** 1.5)
     results: list[tuple[Floats, Floats, Floats]] = []
     instants = [job.release_s + times for job, times in zip(jobs, grids, strict=True)]
     for (place, step), times, trajectory in zip(

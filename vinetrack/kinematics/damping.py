@@ -30,7 +30,6 @@ LEAST_FORCE_RATIO = 1.2  # Least ratio of largest to smallest force of a vine (d
 
 LEAST_STEADY_SHARE = 0.5  # Fraction of a condition's trials that must be steady for any of them to enter a fit (chosen)
 
-FEWEST_FOR_RESAMPLING = 10  # Fewest points for bootstrap intervals (chosen)
 
 NO_SLOPE = "its vine carries no slope: "  # Start of the reason of a point whose vine is left out of the law
 
@@ -225,7 +224,8 @@ def _fit(
     covariance = _covariance(data, n, speed_variance, force_variance, scatter, both_axes)
     draws = _resample(data, speed_variance, force_variance, resamples, seed, with_shared=False)
     total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
-    by_resampling = n_points >= FEWEST_FOR_RESAMPLING and dof > 0
+    # 10: fewest points for bootstrap intervals (chosen)
+    by_resampling = n_points >= 10 and dof > 0
     estimate = np.concatenate([[n], log_B])
     widening = _widening(data, dof)
     if by_resampling:

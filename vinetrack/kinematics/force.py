@@ -24,14 +24,6 @@ from vinetrack.tracks.position_noise import rest_points
 # ------------------------------------------------------------------------------
 # Release time and resting position of the leading edge: the zeros of time and position of a trial.
 
-FEWEST_REST_POINTS = 3  # Fewest points at rest that define a resting position (chosen)
-
-LIFTED_SIGMAS = 5.0  # Standard deviations of a position by which the track must leave its start to count as moving
-
-CLEAR_SIGMAS = 15.0  # Travel, in standard deviations of a position, at which motion is certain (chosen)
-
-LONGEST_EXTRAPOLATION_FRAMES = 20  # Frames by which an extrapolated release may precede the first frame (chosen)
-
 
 @dataclass(frozen=True)
 class Release:
@@ -55,7 +47,8 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
     if n_rest == position_m.size or not _ever_moves(kinematics):
         origin_m, sigma_m = _resting_level(position_m, kinematics)
         return Release(math.nan, origin_m, sigma_m, False, "the leading edge never moves forward beyond its noise")
-    if n_rest < FEWEST_REST_POINTS:
+    # 3: fewest points at rest that define a resting position (chosen)
+    if n_rest < 3:
         return _moving_from_start(time_s, kinematics)
     origin_m, sigma_m = _resting_level(position_m[: max(n_rest - 2, 1)], kinematics)
     onset_s = _onset(time_s, position_m, n_rest, origin_m, kinematics)
@@ -81,7 +74,8 @@ def flag_rest(track: Track, release: Release) -> Track:
 def _ever_moves(kinematics: Kinematics) -> bool:
     """Whether positions span more than noise can explain."""
     span_m = float(np.ptp(kinematics.lead_position_m))
-    return span_m > LIFTED_SIGMAS * kinematics.noise_m and span_m > 0
+    # 5.0: standard deviations of a position by which the track must leave its start to count as moving
+    return span_m > 5.0 * kinematics.noise_m and span_m > 0
 
 
 def _resting_level(position_m: Floats, kinematics: Kinematics) -> tuple[float, float]:
@@ -98,7 +92,8 @@ def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:
     step_s = float(np.median(np.diff(time_s)))
     first_m = float(kinematics.lead_position_m[0])
     back_s = velocity / acceleration if acceleration > 0 else math.inf
-    if -step_s / 2 <= back_s <= LONGEST_EXTRAPOLATION_FRAMES * step_s:
+    # 20: frames by which an extrapolated release may precede the first frame (chosen)
+    if -step_s / 2 <= back_s <= 20 * step_s:
         back_s = max(back_s, 0.0)
         origin_m = float(first_m - 0.5 * velocity * back_s)
         sigma_m = math.hypot(kinematics.noise_m, 0.5 * velocity * back_s)
@@ -120,7 +115,8 @@ def _onset(time_s: Floats, position_m: Floats, n_rest: int, origin_m: float, kin
     fit uses the points around the onset and on until the edge has clearly left its resting position, at least three.
     """
     travel = position_m - origin_m
-    clear = max(CLEAR_SIGMAS * kinematics.noise_m, 1e-9, 1e-6 * float(np.ptp(position_m)))
+    # 15.0: travel, in standard deviations of a position, at which motion is certain (chosen)
+    clear = max(15.0 * kinematics.noise_m, 1e-9, 1e-6 * float(np.ptp(position_m)))
     lifted = np.flatnonzero(travel[n_rest - 1 :] > clear)
     off = n_rest - 1 + (int(lifted[0]) if lifted.size else 0)
     take = slice(max(n_rest - 10, 0), min(off + 3, position_m.size))

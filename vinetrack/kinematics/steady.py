@@ -301,16 +301,11 @@ def _points_to_trim(
 
 __all__ = ["gated_window", "paper_window", "user_window"]
 
-GRID_POINTS = 56  # Starts and ends tried in the first pass; the best is then refined point by point (chosen)
 
 BAND = 0.5  # Half width of the band that contains every velocity, in drift limits (derived)
 
 SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (derived)
 
-SHORTEST_FALL, FALLING = 0.02, 1 / 3  # Shortest window where the speed falls by more than a third of the limit (chosen)
-
-# Deviation of the ends of a window from its speed line, in drift limits, above which they are trimmed (derived)
-TRIM_BAND = 1 / 6
 
 # Fraction of the growth after which no window lies, if the end was recorded or follows from the length of the vine: the
 # moving mass vanishes there, or the vine is stopped (chosen)
@@ -343,7 +338,9 @@ def gated_window(
     if steady is None:
         return Window("gated", False, nearest)
     untrimmed = (first + steady[0], first + steady[1])
-    trimmed = trim(time_s, position_m, kinematics, untrimmed, TRIM_BAND * drift_limit, drift_limit)
+    # 1 / 6: deviation of the ends of a window from its speed line, in drift limits, above which they are trimmed
+    # (derived)
+    trimmed = trim(time_s, position_m, kinematics, untrimmed, (1 / 6) * drift_limit, drift_limit)
     window = judge(time_s, position_m, kinematics, *trimmed, "gated")
     moving = last - first + 1
     reason = (
@@ -441,7 +438,8 @@ class _Search:
 
     def longest(self) -> tuple[tuple[int, int] | None, str]:
         """First and last point of the longest steady window, or the reason why there is none."""
-        stride = max(1, math.ceil(self.n / GRID_POINTS))
+        # 56: starts and ends tried in the first pass; the best is then refined point by point (chosen)
+        stride = max(1, math.ceil(self.n / 56))
         edges = np.arange(0, self.n, stride)
         best, score = self._best(edges, np.union1d(edges, [self.n - 1]))
         if best is None:
@@ -466,7 +464,8 @@ class _Search:
             return None, "fewer points move than one smoothing window holds"
         mean, drift, drift_sigma = self.moments.drift(first, last)
         worst = np.abs(drift) + 1.96 * drift_sigma
-        share = np.where(drift < -FALLING * self.limit, SHORTEST_FALL, SHORTEST_SHARE)
+        # 0.02, 1 / 3: shortest window where the speed falls by more than a third of the limit (chosen)
+        share = np.where(drift < -(1 / 3) * self.limit, 0.02, SHORTEST_SHARE)
         steady = (mean > 0) & (worst <= self.limit) & (points >= share * self.n)
         for bounds in (self._smooth, *self.chords):
             index = np.flatnonzero(steady)
@@ -594,18 +593,10 @@ def _near_quiet_blocks(velocity: Floats, block: int, cv_limit: float) -> NDArray
 # of the damping law as good as a steady one. If it is not known, the point would be wrong, and the rule is not
 # applied.
 
-INERTIA_LIMIT = 0.1  # Largest inertia as a fraction of the force, at the end of its 95 % interval (chosen)
-
-LARGEST_CHANGE = 0.3  # Largest relative change of speed across a window (derived)
-
-# Fraction of the length up to which the moving mass of a vine without payload is known well enough (chosen)
-LAST_FRACTION = 0.95
 
 PARTS = 3  # Parts of a window in which inertia is fitted separately (chosen)
 
 FEWEST_POINTS = 4 * PARTS  # Fewest points of a window (derived)
-
-SECTIONS = 6  # Sections between whose ends all windows are tried (chosen)
 
 
 def quasi_steady_window(
@@ -625,8 +616,10 @@ def quasi_steady_window(
     travel_m = position_m - release.lead_position_m
     velocity = kinematics.lead_velocity_m_s
     first = int(np.argmax(velocity))
-    lowest = max(start_fraction, 1 - LARGEST_CHANGE) * velocity[first]
-    beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > LAST_FRACTION * trial.length_m))
+    # 0.3: largest relative change of speed across a window (derived)
+    lowest = max(start_fraction, 1 - 0.3) * velocity[first]
+    # 0.95: fraction of the length up to which the moving mass of a vine without payload is known well enough (chosen)
+    beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > 0.95 * trial.length_m))
     last = first + int(beyond[0]) - 1 if beyond.size else velocity.size - 1
     if last - first + 1 < FEWEST_POINTS:
         points = max(last - first + 1, 0)
@@ -636,7 +629,8 @@ def quasi_steady_window(
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
     force_N = (pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N
     inertial_mass_kg = trial.travel_ratio**2 * mass_kg
-    ends = np.linspace(first, last, SECTIONS + 1).round().astype(int)
+    # 6: sections between whose ends all windows are tried (chosen)
+    ends = np.linspace(first, last, 6 + 1).round().astype(int)
     candidates = sorted(itertools.combinations(ends.tolist(), 2), key=lambda ends: ends[0] - ends[1])
     smallest = math.inf
     for a, b in candidates:
@@ -644,7 +638,8 @@ def quasi_steady_window(
             break
         inertia = _largest_inertia(time_s, position_m, kinematics, inertial_mass_kg, force_N, a, b)
         smallest = min(smallest, inertia)
-        if inertia <= INERTIA_LIMIT:
+        # 0.1: largest inertia as a fraction of the force, at the end of its 95 % interval (chosen)
+        if inertia <= 0.1:
             window = judge(time_s, position_m, kinematics, a, b, "quasi_steady")
             reason = (
                 f"follows a known pressure over {window.n_points} points: speed changes by"

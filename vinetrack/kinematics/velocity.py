@@ -23,10 +23,6 @@ from vinetrack.tracks.position_noise import track_noise
 # For even spacing the fit is a convolution (Savitzky and Golay 1964, Anal. Chem. 36:1627); windows with a gap or
 # uneven spacing are fitted individually by least squares of the same order.
 
-EVEN_TOLERANCE = 0.01  # Spacings within this fraction of their median count as even (chosen)
-
-MISFIT_TERMS = 4  # Orthogonal polynomials of the next higher orders that are tested in the residuals (chosen)
-
 
 @dataclass(frozen=True)
 class WindowFits:
@@ -120,7 +116,8 @@ def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
 def _uneven_windows(time_s: Floats, width: int) -> Bools:
     """Mask of windows that contain a spacing different from the median, shape (n − width + 1,)."""
     spacing = np.diff(time_s)
-    is_uneven = np.abs(spacing / np.median(spacing) - 1) > EVEN_TOLERANCE
+    # 0.01: spacings within this fraction of their median count as even (chosen)
+    is_uneven = np.abs(spacing / np.median(spacing) - 1) > 0.01
     count = np.concatenate([[0], np.cumsum(is_uneven)])
     return count[width - 1 :] > count[: count.size - width + 1]
 
@@ -141,7 +138,8 @@ def _even_design(width: int, order: int) -> tuple[Floats, int]:
 
 def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
     """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w), and terms."""
-    terms = min(MISFIT_TERMS, u.shape[1] - order - 1)
+    # 4: orthogonal polynomials of the next higher orders that are tested in the residuals (chosen)
+    terms = min(4, u.shape[1] - order - 1)
     q, _ = np.linalg.qr(np.polynomial.legendre.legvander(u, order + terms))
     q = q.transpose(0, 2, 1)
     inside = q[:, : order + 1]
@@ -170,8 +168,6 @@ SIDES = (0.0, -0.5, 0.5, -1.0, 1.0)  # Positions of the point in its window (cho
 MISFIT_LIMITS = {0: np.inf, 1: 12.0, 2: 15.3, 3: 18.0, 4: 20.5}
 
 KINK_GAIN = 2.5  # Factor on the misfit, taken as noise, for the error of the velocity where no window fits (derived)
-
-TRUSTED_GAIN = 0.5  # Least standard error of a one-sided window, relative to that of the centred ones (chosen)
 
 
 # Window, velocity and error for unit noise at every point, of centred windows of one width
@@ -235,7 +231,8 @@ def smooth(
     for k, fit in enumerate(fits):
         points = np.flatnonzero(fit_used == k)
         values[:, points] = fit.at(time_s[points], window_used[points])[0]
-    return values, np.maximum(sigma, TRUSTED_GAIN * centred_error), np.array(widths)[fit_used]
+    # 0.5: least standard error of a one-sided window, relative to that of the centred ones (chosen)
+    return values, np.maximum(sigma, 0.5 * centred_error), np.array(widths)[fit_used]
 
 
 def _narrowest(fit: WindowFits, centred: Centred, fits_points: Bools, noise_m: float) -> tuple[Floats, Indices, Floats]:

@@ -31,7 +31,6 @@ from vinetrack.laboratory.tracks import VirtualTrial
 Frame = NDArray[np.uint8 | np.uint16]
 
 GREY_FORMATS = {8: "gray", 12: "gray12le", 16: "gray16le"}
-CONTAINER_FPS = 60  # Frames per second that a file of a high-speed camera claims (chosen)
 
 
 def render_recording(
@@ -90,7 +89,8 @@ def _write_video(frame: Callable[..., Frame], n_frames: int, scene: Scene, path:
     chroma = _chroma(scene)
     options = {"movflags": "+faststart"} if path.suffix.lower() in (".mp4", ".mov") else {}
     with av.open(str(path), "w", options=options) as container:
-        stream: Any = container.add_stream("libx264" if is_h264 else encoding.codec, rate=Fraction(CONTAINER_FPS))
+        # 60: frames per second that a file of a high-speed camera claims (chosen)
+        stream: Any = container.add_stream("libx264" if is_h264 else encoding.codec, rate=Fraction(60))
         stream.width, stream.height, stream.pix_fmt = scene.camera.width_px, scene.camera.height_px, pixel_format
         stream.codec_context.thread_count = 1
         if is_h264:

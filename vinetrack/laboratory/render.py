@@ -318,7 +318,6 @@ def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> 
 Whole = NDArray[np.int64]
 
 NORMAL_BITS = 12  # Bits of a random number per normal deviate (chosen)
-TAIL_TAPER_PX = 30.0  # Length over which the end of the tail, a crumpled bunch of film, fades out (chosen)
 
 
 @njit(cache=True)
@@ -437,7 +436,8 @@ def shade_tube(
                 c = b - period if b >= period else b
                 ic = int(c)
                 high = tail[tail_row, ic] + (c - ic) * (tail[tail_row, ic + 1] - tail[tail_row, ic])
-                weight = tail_opacity * core[i] * min((u - tail_end) / TAIL_TAPER_PX, 1.0)
+                # 30.0: length over which the end of the tail, a crumpled bunch of film, fades out (chosen)
+                weight = tail_opacity * core[i] * min((u - tail_end) / 30.0, 1.0)
                 backdrop += weight * (tail_level * (1 + tail_contrast * (high - low) / (b - a)) - backdrop)
             fu, fv = min(max(u, 0.0), columns - 1.001), v + half_rows
             iu, iv = int(fu), int(fv)

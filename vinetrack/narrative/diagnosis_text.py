@@ -245,8 +245,6 @@ GO_ON = (
 
 CLEAR_GAIN = 9.0  # Δχ² above which an added effect is said to help (derived)
 
-_SHOWN_CANDIDATES = 8  # Candidates of a round that the terminal shows (chosen)
-
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
     """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors, next experiment."""
@@ -306,7 +304,8 @@ def _ranking(step: Round) -> list[str]:
 
     rows = []
     testable = [candidate for candidate in step.ranking if candidate.status != NOT_TESTABLE]
-    for candidate in testable[:_SHOWN_CANDIDATES]:
+    # 8: candidates of a round that the terminal shows (chosen)
+    for candidate in testable[:8]:
         rows.append(
             (
                 ("* " if candidate.in_answer_set else "  ") + candidate.effect,

@@ -289,8 +289,6 @@ COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_an
 # ------------------------------------------------------------------------------
 # The next experiment in sentences: trials to make, hypotheses that they separate, and what to measure instead.
 
-_MUCH_MORE = 1.5  # Ratio from which the larger of two expected significances is stated beside the smaller (chosen)
-
 
 def measurement_text(trace_decides: bool, effects: Sequence[Effect], faults_only: bool) -> str:
     """Return what to measure in order to exclude one of the hypotheses, as the files of their effects state."""
@@ -329,7 +327,8 @@ def separation_text(
     parts = []
     for pair, by_truth in if_true.items():
         least, most = sorted(by_truth, key=by_truth.__getitem__)
-        is_much_larger = by_truth[most] > _MUCH_MORE * max(by_truth[least], 1.0)
+        # 1.5: ratio from which the larger of two expected significances is stated beside the smaller (chosen)
+        is_much_larger = by_truth[most] > 1.5 * max(by_truth[least], 1.0)
         notes = [f"{by_truth[most]:.2g} σ if {most} is true"] if is_much_larger else []
         mean, sd = (simulated or {}).get(pair, (math.nan, math.nan))
         if math.isfinite(mean):
@@ -376,8 +375,6 @@ def measure_first_text(faults: Sequence[str], measurement: Remark) -> str:
 # ------------------------------------------------------------------------------
 # Trials that would reveal most, in words.
 
-LEAST_STATED_GAIN = 1.1  # Factor by which a detectable size must fall to be stated (chosen)
-
 
 def informative_text(plan: InformativeTrials) -> str:
     """Return recommended trials in words, and the detectable sizes that they lower most."""
@@ -387,7 +384,8 @@ def informative_text(plan: InformativeTrials) -> str:
         for entry in plan.then.effects
         if entry.effect in before and _is_plausible(entry)
     ]
-    gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > LEAST_STATED_GAIN][:MOST_NAMED]
+    # 1.1: factor by which a detectable size must fall to be stated (chosen)
+    gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > 1.1][:MOST_NAMED]
     lower = [
         f"{spaced_name(then.effect)} from {then.symbol or 'size'} = {size_text(now, now.size_at(0.9))} to "
         f"{size_text(then, then.size_at(0.9))}"

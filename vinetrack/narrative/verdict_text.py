@@ -163,10 +163,6 @@ THEREAFTER = {
     UNEXPLAINED: "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
 }
 
-MOST_UNDETECTABLE_LISTED = 6  # Undetectable effects listed on the first screen, at most (chosen)
-
-SIGNIFICANT_SIGMA = 2.0  # Standard errors below which a size is reported as not significant
-
 
 @dataclass(frozen=True)
 class Fact:
@@ -307,7 +303,8 @@ def quantity_text(entry: Number) -> str:
 def estimates_text(row: Candidate) -> str:
     """Return all fitted numbers of a candidate."""
     text = ", ".join(estimate_text(entry) for entry in row.numbers if is_finite(entry.value))
-    return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < SIGNIFICANT_SIGMA else text
+    # 2.0: standard errors below which a size is reported as not significant
+    return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < 2.0 else text
 
 
 def _sizes(diagnosis: Diagnosis) -> list[Fact]:
@@ -377,9 +374,8 @@ def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
     if power.wary or not power.effects:
         return [alarm, Fact("Detectable effects", "not computed", str(power.wary))]
     undetectable = unseen(power)
-    listing = (
-        f"; not even then: {listed_names(undetectable)}" if 0 < len(undetectable) <= MOST_UNDETECTABLE_LISTED else ""
-    )
+    # 6: undetectable effects listed on the first screen, at most (chosen)
+    listing = f"; not even then: {listed_names(undetectable)}" if 0 < len(undetectable) <= 6 else ""
     return [alarm, Fact("Detectable effects", detectable_count(power), f"{AT_LARGEST}{listing}")]
 
 
@@ -414,9 +410,6 @@ def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
 
 
 MOST_NAMED = 3  # Parameters or effects named in a sentence, at most (chosen)
-
-# Significance from which a fault of the measurement below its threshold is named as worth a check (chosen)
-WORTH_A_CHECK_SIGMA = 3.0
 
 
 def sizes_in_words(numbers: Sequence[Number]) -> str:
@@ -679,7 +672,9 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
             f"chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns{stricter}."
         )
         kind = next(effect.kind for effect in tests.effects if effect.name == names[best])
-        if kind == "measurement" and tests.one_sided_z[best] >= WORTH_A_CHECK_SIGMA:
+        # 3.0: significance from which a fault of the measurement below its threshold is named as worth a
+        # check (chosen)
+        if kind == "measurement" and tests.one_sided_z[best] >= 3.0:
             text += f" It is a fault of the measurement that is soon checked: see `vinetrack effects {names[best]}`."
     return f"{text}{_unstated(step)}"
 

@@ -28,7 +28,6 @@ from vinetrack.video.survey import Measurement, measure_recording, proposed_axis
 from vinetrack.video.target_corners import find_board
 from vinetrack.video.track import Tracking, track_recording
 
-PATH_STEP_PX = 4.0  # Spacing of the points of a curve sent to the page, px (chosen)
 STRIP_PX = 1600  # Longest side of a strip; chosen: twice the page's width on a common screen
 
 
@@ -120,7 +119,8 @@ def axis_json(axis: Axis) -> dict[str, Any]:
     ends: dict[str, Any] = {"from_px": [round(v, 2) for v in axis.from_px], "to_px": [round(v, 2) for v in axis.to_px]}
     if isinstance(axis, CurvedAxis):
         ends["via_px"] = [[round(v, 2) for v in point] for point in axis.via_px]
-        along = np.linspace(0.0, axis.length_px, max(2, round(axis.length_px / PATH_STEP_PX)))
+        # 4.0: spacing of the points of a curve sent to the page, px (chosen)
+        along = np.linspace(0.0, axis.length_px, max(2, round(axis.length_px / 4.0)))
         ends["path_px"] = axis.points(along).round(2).tolist()
     return {**ends, "width_px": width}
 

@@ -184,8 +184,6 @@ def pressure_table(instants: int = 60) -> pd.DataFrame:
 # ------------------------------------------------------------------------------
 # The fast vine, the example of air drag, and the published rule, by Eq. (2).
 
-SLOWEST_S = 10.0  # Duration of the simulated motions, s (chosen)
-
 
 def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
     """Compute the speed of the fast vine's leading edge by Eq. (2) with B from the scaling prior."""
@@ -216,7 +214,8 @@ def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[fl
     Returns n, B.
     """
     departure = Departure("", gamma=gamma)
-    time_s = np.arange(0, SLOWEST_S, 1 / published.CAPTURE_FPS)
+    # 10.0: duration of the simulated motions, s (chosen)
+    time_s = np.arange(0, 10.0, 1 / published.CAPTURE_FPS)
     rows = []
     for scale, B in published.DAMPING_B.items():
         of_scale = [

@@ -61,7 +61,6 @@ PREFERRED = "both_axes"  # The fit of the damping law that supplies our numbers
 
 FAST_AT = (0.90, 0.95, 0.98, 0.99)  # Fractions of the length at which the speed of the fast vine is evaluated (chosen)
 
-DRAG_AT = (0.50, 0.95, 0.99)  # Fractions of the length at which drag is evaluated (chosen)
 
 GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
 
@@ -451,7 +450,8 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
     printed = published.FAST_VINE_PREDICTED_M_S
     for fraction, speed in zip(FAST_AT, fast_vine_speeds(FAST_AT), strict=True):
         yield row_of("fast_vine_predicted_{percent:.0f}", speed, published_as=printed, percent=100 * fraction, B=B)
-    for fraction, share, by_print in drag_shares(DRAG_AT):
+    # (0.50, 0.95, 0.99): fractions of the length at which drag is evaluated (chosen)
+    for fraction, share, by_print in drag_shares((0.50, 0.95, 0.99)):
         facts: Row = {"percent": 100 * fraction, "by_print": 100 * by_print}
         printed = 100 * published.DRAG_SHARE
         yield row_of("drag_share_{percent:.0f}", 100 * share, published_as=printed, **facts)

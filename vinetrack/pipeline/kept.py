@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from vinetrack.video.track import Tracking
 
 PACKAGE = Path(__file__).parents[1]
-TRACKER = ("core", "tracks", "video")  # Rooms whose code a track in pixels depends on
-LONGEST_KEPT_S = 30 * 86400.0  # Time after which what nobody asks for is dropped (chosen)
 TRACKER_LIBRARIES = ("numpy", "scipy", "numba", "av", "opencv-python-headless", "scikit-image")
 SCALARS = (
     "blur_px", "exposure_frames", "tube_width_px", "tube_width_sigma_px", "seen_exposure_frames", "fast_px_per_frame",
@@ -65,7 +63,8 @@ class Kept:
         film, *others = inputs
         assert isinstance(film, Path)
         libraries = [version(name) for name in TRACKER_LIBRARIES]
-        self.tracked = _key(code_hash(*TRACKER), libraries, film.resolve(), identity(film), others)
+        # ("core", "tracks", "video"): rooms whose code a track in pixels depends on
+        self.tracked = _key(code_hash(*("core", "tracks", "video")), libraries, film.resolve(), identity(film), others)
         path = self.folder / f"{self.tracked}.npz"
         if not (data := _read(path)):
             data = packed(make())
@@ -96,7 +95,8 @@ class Kept:
     def forget(self) -> None:
         """Drop what no run has asked for in a long time."""
         for path in self.folder.glob("*"):
-            if path.stat().st_mtime < time.time() - LONGEST_KEPT_S:
+            # 30 * 86400.0: time after which what nobody asks for is dropped (chosen)
+            if path.stat().st_mtime < time.time() - (30 * 86400.0):
                 path.unlink(missing_ok=True)
 
 

@@ -245,8 +245,6 @@ def _first_moving_s(track: pd.DataFrame) -> float:
 # ------------------------------------------------------------------------------
 # The command `vinetrack track`: the leading edge of a single recording as a table, a strip figure and a clip.
 
-TABLE, STRIP, CLIP = "track.csv", "strip.png", "overlay.mp4"  # Names of the output files
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions:
@@ -431,7 +429,8 @@ def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: 
         raise UserError(f"{folder}: is a file; name a folder with --out")
     tracking, recording = measurement.tracking, measurement.recording
     name, settings = recording.path.name, OverlaySettings()
-    written = {"table": folder / TABLE, "strip": folder / STRIP, "clip": folder / CLIP}
+    # "track.csv", "strip.png", "overlay.mp4": names of the output files
+    written = {"table": folder / "track.csv", "strip": folder / "strip.png", "clip": folder / "overlay.mp4"}
     write_csv(written["table"], table)
     m_per_px = measurement.m_per_px if scaled else math.nan
     write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])

@@ -270,12 +270,6 @@ def check_figure(path: Path | None) -> None:
         raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])
 
 
-SMALL_FORCE_N = 0.01  # Forces are shown in mN if all are below this, N (chosen)
-
-# Smallest relative change of the final speed for which a neglected effect is listed (chosen)
-SMALLEST_LISTED_CHANGE = 0.005
-
-
 @dataclass(frozen=True)
 class ConditionPrediction:
     """Prediction of one condition, its design checks (`hazards`), and the influence of neglected effects."""
@@ -362,7 +356,8 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
     values, unit = (quantity.low, quantity.median, quantity.high), quantity.unit
     if unit == "Pa":
         texts, unit = [number(value / 1e6) for value in values], "MPa"
-    elif unit == "N" and max(abs(value) for value in values) < SMALL_FORCE_N:
+    # 0.01: forces are shown in mN if all are below this, N (chosen)
+    elif unit == "N" and max(abs(value) for value in values) < 0.01:
         texts, unit = [number(1e3 * value) for value in values], "mN"
     else:
         texts, unit = [display_value(value, unit) for value in values], display_unit_name(unit)
@@ -378,6 +373,7 @@ def _left_out(entry: ConditionPrediction) -> Iterator[str]:
     """Yield a table of neglected effects that every vine has, with their influence on the final speed."""
     from vinetrack.core.terminal import table
 
+    # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
     rows = [
         (
             omitted.effect,
@@ -386,7 +382,7 @@ def _left_out(entry: ConditionPrediction) -> Iterator[str]:
             f"{omitted.change:+.1%}",
         )
         for omitted in entry.neglected
-        if abs(omitted.change) >= SMALLEST_LISTED_CHANGE
+        if abs(omitted.change) >= 0.005
     ]
     if rows:
         yield ""

@@ -112,7 +112,6 @@ Say = Callable[[str], None]
 
 RUN = "VINETRACK_RUN"  # Variable that asks stages to say in a line what they have done
 _PROGRESS = re.compile(r"(\d+) of (\d+) \w+")  # What a stage says while it works
-EXPLANATION_LINES = 12  # Last lines of a run that failed which are printed (chosen)
 
 
 class RunError(UserError):
@@ -182,7 +181,8 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
             elif line in finished:
                 say(line)
     if process.returncode:
-        explanation = log.read_text(encoding="utf-8").splitlines()[-EXPLANATION_LINES:]
+        # 12: last lines of a run that failed which are printed (chosen)
+        explanation = log.read_text(encoding="utf-8").splitlines()[-12:]
         raise RunError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
 
 

@@ -137,7 +137,6 @@ def has_wildcard(path: Path) -> bool:
 # A run holds a lock of the operating system as long as its process lives. Snakemake's own locks are files, which stay
 # when a run is killed; the profile and `vinetrack run` do without them.
 
-MIN_UNFINISHED_AGE_S = 60.0  # Age from which an unfinished file counts as abandoned; others may be written now (chosen)
 RUN_LOCK = ".run.lock"
 
 # Temporary names of files that are being written
@@ -175,7 +174,8 @@ def begin_run(results: Path, experiment: Path) -> FileLock:
     claim_results(results, experiment)
     for path in [*results.rglob("*"), *experiment.glob("*")]:
         with contextlib.suppress(OSError):
-            if UNFINISHED_FILES.fullmatch(path.name) and time.time() - path.stat().st_mtime >= MIN_UNFINISHED_AGE_S:
+            # 60.0: age from which an unfinished file counts as abandoned; others may be written now (chosen)
+            if UNFINISHED_FILES.fullmatch(path.name) and time.time() - path.stat().st_mtime >= 60.0:
                 path.unlink()
     return lock
 

@@ -52,14 +52,8 @@ from vinetrack.tracks.position_noise import ar1_noise
 
 SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
 
-# Lowest candidate pressure of a vine without payload, as a multiple of the yield pressure (chosen)
-LOWEST_PRESSURE_RATIO = 1.15
 
 PRESSURE_STEP_PA = 100.0  # Resolution of set pressures, Pa (chosen)
-
-CANDIDATE_PRESSURES = 6  # Candidate pressures of a vine (chosen)
-
-MOST_NEW_VINES = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
 
 
 @dataclass(frozen=True)
@@ -199,10 +193,12 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
         bursts_Pa = 1e6 * limits.hoop_stress_MPa / stress_Pa
         high = min(high, max([PRESSURE_STEP_PA * math.floor(bursts_Pa / PRESSURE_STEP_PA), *held]))
     if payload_kg == 0 and math.isfinite(rig.yield_pressure_Pa):
-        low = max(low, LOWEST_PRESSURE_RATIO * rig.yield_pressure_Pa)
+        # 1.15: lowest candidate pressure of a vine without payload, as a multiple of the yield pressure (chosen)
+        low = max(low, 1.15 * rig.yield_pressure_Pa)
     if not low <= high:
         return []
-    steps = np.geomspace(low, high, CANDIDATE_PRESSURES) if high > 1.02 * low else np.array([high])
+    # 6: candidate pressures of a vine (chosen)
+    steps = np.geomspace(low, high, 6) if high > 1.02 * low else np.array([high])
     relative = [t.pressure_sigma_Pa / t.pressure_Pa for t in used if t.pressure_Pa > 0]
     share = float(np.nanmedian(relative)) if np.isfinite(relative).any() else math.nan
     steps = np.clip(PRESSURE_STEP_PA * np.round(steps / PRESSURE_STEP_PA), low, high)
@@ -232,7 +228,8 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
             )
             if not any(_alike(sized, vine) for vine in vines):
                 new_vines.append((with_names([sized])[0], like))
-    return _most_different(new_vines, MOST_NEW_VINES)
+    # 10: new vines considered, at most; those of the most different sizes are taken (chosen)
+    return _most_different(new_vines, 10)
 
 
 def _sizes(
@@ -279,8 +276,6 @@ def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Tri
 # The free parameters of the fit stay as they are. Every new vine adds its own: B from the scaling prior, multiplied
 # by the mean ratio of the measured vines to their prior, and the yield pressure with the error to which it will be
 # measured.
-
-NEW_VINE_SD = 1.0  # Prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
 
 
 # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
@@ -350,7 +345,8 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
                 row[column] = places[spot]
         index.append(row)
     added = numbers[len(old.free) :]
-    precision_of_new = np.array([1 / NEW_VINE_SD**2 + (number.scale / number.prior_sd) ** 2 for number in added])
+    # 1.0: prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
+    precision_of_new = np.array([1 / 1.0**2 + (number.scale / number.prior_sd) ** 2 for number in added])
     stated_sd = [number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0 for number in added]
     sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
     base = np.array([_base_row(fit, condition) for condition in conditions])
@@ -440,12 +436,6 @@ def _base_row(fit: Fit, condition: Condition) -> Floats:
 # ------------------------------------------------------------------------------
 # Simulated tracks of candidate trials, sampled as the camera of the experiment would.
 
-LEAST_GROWTH = 0.3  # Fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
-
-# Ratio of tail speed to steady speed at the same pressure above which the model predicts compression in the tail
-# (chosen)
-LARGEST_SPEED_RATIO = 1.05
-
 
 @dataclass(frozen=True)
 class TrackSampling:
@@ -522,7 +512,9 @@ def growth_courses(
         predictor = hypothesis.predictor(range(len(conditions)), items)
         jobs = predictor.jobs(hypothesis.theta, trial_effects)
         runs.append(_simulated(predictor, jobs))
-    largest_ratio = max(LARGEST_SPEED_RATIO, _largest_speed_ratio(hypotheses[-1].fit))
+    # 1.05: ratio of tail speed to steady speed at the same pressure above which the model predicts compression in
+    # the tail (chosen)
+    largest_ratio = max(1.05, _largest_speed_ratio(hypotheses[-1].fit))
     growth: list[GrowthCourse | None] = []
     for i, condition in enumerate(conditions):
         trajectories = [trajectory for trajectory in (run[i] for run in runs) if trajectory is not None]
@@ -533,7 +525,8 @@ def growth_courses(
         near_s = min(_time_at(moved, END_FRACTION * length_m, cameras[i].longest_s) for moved in trajectories)
         grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in trajectories)
         ratio = _speed_ratio(hypotheses[-1].fit, condition.trial, jobs[i], trajectories[-1].tail_velocity_m_s)
-        grows_enough = grown_m > LEAST_GROWTH * (length_m if math.isfinite(length_m) else 0.0)
+        # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
+        grows_enough = grown_m > 0.3 * (length_m if math.isfinite(length_m) else 0.0)
         is_compressed = condition.trial.tail_slack != "free" and ratio > largest_ratio
         ends = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
         growth.append(
@@ -632,9 +625,6 @@ def film_trials(
 
 
 POINTS = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
-
-# Separation, in standard deviations, at which a pair has half of its largest worth (chosen)
-WELL_SEPARATED = 5.0
 
 
 @dataclass(frozen=True)
@@ -812,7 +802,8 @@ def worth(between: Floats) -> Floats:
     n = between.shape[1]
     first, second = np.triu_indices(n, 1)
     square = np.minimum(between[:, first, second], between[:, second, first]) ** 2
-    return np.asarray(np.sum(square / (square + WELL_SEPARATED**2), axis=1))
+    # 5.0: separation, in standard deviations, at which a pair has half of its largest worth (chosen)
+    return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
 
 
 def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.int_], trials: int) -> tuple[NDArray[np.int_], float]:

@@ -40,7 +40,6 @@ from vinetrack.planning.predictive_inputs import (
 
 GRID = (17, 9)  # Numbers of diameters and lengths in each round (chosen)
 
-ROUNDS = 3  # Rounds of the search, each a finer grid around the optimum of the one before (chosen)
 
 BOUND_TOLERANCE = 0.005  # Relative distance from a bound below which a vine counts as limited by it (chosen)
 
@@ -126,7 +125,8 @@ def _best(
     limits = list(spans)
     others = np.empty((0, 2))
     inputs: PredictiveInputs | None = None
-    for round_number in range(ROUNDS):
+    # 3: rounds of the search, each a finer grid around the optimum of the one before (chosen)
+    for round_number in range(3):
         axes = [np.unique(np.geomspace(*span, count)) for span, count in zip(spans, GRID, strict=True)]
         vine_inputs = [predictive_inputs(room.trial(D, film_m, L), stated, fit) for D in axes[0] for L in axes[1]]
         rows = np.array([inputs.model.parameters_of(inputs.trial) for inputs in vine_inputs])

@@ -33,11 +33,6 @@ LONGEST_S = 600.0  # Duration of a simulation, s (chosen)
 
 POINTS = 400  # Times at which each draw is evaluated (derived)
 
-MOST_TENSIONS = 300  # Draws whose forces are evaluated, a third of a millisecond each (chosen)
-
-# Compression of the tail from which the model is said to be in doubt, as a fraction of the drive ½PA (chosen)
-COMPRESSION_FRACTION = 0.01
-
 
 @dataclass(frozen=True)
 class Runs:
@@ -76,7 +71,8 @@ def run(
         velocity_m_s[i, reached] = np.interp(
             places_m[reached], trajectory.lead_position_m, trajectory.lead_velocity_m_s
         )
-    with_forces = min(samples, MOST_TENSIONS) if with_tension else 0
+    # 300: draws whose forces are evaluated, a third of a millisecond each (chosen)
+    with_forces = min(samples, 300) if with_tension else 0
     tension_N, pressure_Pa, least_N, slack = _forces(inputs, trials[:with_forces], rows, moved, places_m)
     return Runs(
         places_m=places_m,
@@ -156,9 +152,9 @@ def _forces(
         if moving.any():
             least_N[i] = np.min(tension[moving])
         may_go_slack = trial.tail_slack == "free"
-        slack[i] = (
-            math.isfinite(trajectory.slack_from_s) if may_go_slack else least_N[i] < -COMPRESSION_FRACTION * drive_N
-        )
+        # 0.01: compression of the tail from which the model is said to be in doubt, as a fraction of the
+        # drive ½PA (chosen)
+        slack[i] = math.isfinite(trajectory.slack_from_s) if may_go_slack else least_N[i] < -0.01 * drive_N
     return tension_N, pressure_Pa, least_N, slack
 
 
@@ -175,7 +171,6 @@ def _steady(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> 
 
 SAMPLES = 1000  # Draws of a prediction (derived)
 
-CONTRIBUTION_SAMPLES = 400  # Draws for the band of one uncertainty alone (derived)
 
 # y/L of the curves, dense at the start
 ALONG = np.concatenate([[0.0, 0.0005, 0.001, 0.002, 0.004, 0.007], np.linspace(0.01, 0.99, 99)])
@@ -302,12 +297,13 @@ def predict_vine(
     along = np.union1d(ALONG, [at_fraction])
     runs = run(inputs, along * length_m, samples, seed)
     place = int(np.searchsorted(along, at_fraction))
+    # 400: draws for the band of one uncertainty alone (derived)
     return VinePrediction(
         inputs=inputs,
         at_fraction=at_fraction,
         quantities=tuple(_quantities(inputs, runs, along, place)),
         curve=_curve(inputs, runs, along),
-        shares=_contributions(inputs, at_fraction, min(samples, CONTRIBUTION_SAMPLES), seed),
+        shares=_contributions(inputs, at_fraction, min(samples, 400), seed),
         arrives=float(np.mean(np.isfinite(runs.end_s))),
         slack=float(np.mean(runs.slack)),
         samples=samples,
@@ -371,7 +367,6 @@ def _contributions(inputs: PredictiveInputs, at_fraction: float, samples: int, s
 
 WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
 
-FILM_MODULUS_PA = 25e6  # Young's modulus of the film, 10 to 50 MPa (chosen)
 
 # Effects that every vine has to some extent; the others of the catalogue may be absent
 UNIVERSAL_EFFECTS = (
@@ -487,7 +482,8 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
     """
     host, trial = host_for(inputs.model), inputs.trial
     # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
-    kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * FILM_MODULUS_PA * trial.thickness_m)
+    # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
+    kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * 25e6 * trial.thickness_m)
     without = final_m_s(inputs, inputs.model, host, at_fraction)
     neglected_effects = []
     for name in UNIVERSAL_EFFECTS:

@@ -144,8 +144,6 @@ MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single tria
 
 SPARK_PX = (132, 30)  # Width and height of the small curve of a trial (chosen)
 
-MAX_DATA_ROWS, MAX_DATA_ROWS_TOTAL = 240, 24_000  # Maximum rows of motion data in the page, per trial and in total
-
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
     """Return all trials for the template, and the number of trials whose figures were left out for size. Returns
@@ -177,7 +175,8 @@ def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
 
 def _thinned(curve: pd.DataFrame, n_trials: int) -> str:
     """Motion of a trial as CSV, with five digits, more than the accuracy of any value."""
-    most = max(min(MAX_DATA_ROWS_TOTAL // n_trials, MAX_DATA_ROWS), 2)
+    # 240, 24_000: maximum rows of motion data in the page, per trial and in total
+    most = max(min(24_000 // n_trials, 240), 2)
     shown = curve.iloc[:: -(-len(curve) // most)]
     return str(shown.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
 

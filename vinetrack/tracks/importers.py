@@ -33,7 +33,6 @@ FEWEST_POINTS = 5  # Fewest points of a track (derived)
 
 LARGEST_PRESSURE_KPA = 1000.0  # Largest gauge pressure in kPa that is accepted (chosen)
 
-VACUUM_KPA = -101.4  # Least gauge pressure that is accepted; sensors do read a little below zero (derived)
 LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
 
 
@@ -53,7 +52,8 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
     """Refuse pressures outside what the sheet allows; NaN passes. Shapes: pressure_kPa (n,)."""
-    wrong = np.flatnonzero((pressure_kPa > LARGEST_PRESSURE_KPA) | (pressure_kPa < VACUUM_KPA))
+    # -101.4: least gauge pressure that is accepted; sensors do read a little below zero (derived)
+    wrong = np.flatnonzero((pressure_kPa > LARGEST_PRESSURE_KPA) | (pressure_kPa < -101.4))
     if len(wrong):
         i = int(wrong[0])
         value = float(pressure_kPa[i])

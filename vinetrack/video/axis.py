@@ -27,9 +27,6 @@ LEAST_FRONT_SHARE = 0.45
 MOST_TURN_DEG = 8.0  # Largest angle by which a given axis is turned onto the motion (chosen)
 # Fractions of a recording, from its start, that may be orderly where the whole is not (chosen)
 BEGINNINGS = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-# Fewest and most times that a line is refined on the pixels that agree with it (chosen)
-FEWEST_REFINEMENTS, MOST_REFINEMENTS = 3, 20
-BAND_GROWTH = 1.05  # Growth of that band in one refinement above which another follows (chosen)
 
 
 @dataclass(frozen=True)
@@ -292,10 +289,12 @@ def pixels_on_front(
 
 def _refined_line(pixels: Pixels, angle: float, middle: Floats, band: float, most_band: float) -> _Line:
     """Refine a line until its band no longer widens; the band reaches at most `most_band` to either side."""
-    for round_ in range(1, MOST_REFINEMENTS + 1):
+    # 3, 20: fewest and most times that a line is refined on the pixels that agree with it (chosen)
+    for round_ in range(1, 20 + 1):
         angle, middle, half, ends, collected = _refine_once(*pixels, angle, middle, band)
         narrower, band = band, float(np.clip(1.2 * half, 2.0, most_band))
-        if round_ >= FEWEST_REFINEMENTS and band < BAND_GROWTH * narrower:
+        # 1.05: growth of that band in one refinement above which another follows (chosen)
+        if round_ >= 3 and band < 1.05 * narrower:
             break
     return _Line(angle, middle, half, ends, collected, collected / float(pixels[3].sum()))
 

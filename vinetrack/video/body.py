@@ -18,25 +18,12 @@ from vinetrack.core.records import Floats
 from vinetrack.video.strip import Strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
-SEARCH_ALONG_PX = 14  # Distance along the axis searched about the expected place (chosen)
 MOST_STEPS = 8  # Most Gauss-Newton steps of a registration (chosen)
 
-TEMPLATE_UPDATES = 3  # Times that the template is replaced by the median of the patches found (chosen)
 
-MISPLACED_PX = 0.5  # Misplacement that the weights of the template allow for (chosen)
 POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
-LOST_MATCH = 0.4  # Correlation below which the patch found is not the body (chosen)
-ABSENT_RATIO = 0.7  # Ratio of the background's residual to the template's below which the body is absent (chosen)
-# Distance behind its furthest place at which a body has turned back, in px and in standard errors (chosen)
-BACK_PX, BACK_SIGMA = 3.0, 6.0
 # Cost of a step back on the coarse path (chosen)
 BACK_COST_PER_PX = 0.05
-
-# Roughness, as the standard deviation of single places, in px and in steps of a frame, above which what is followed is
-# not one body; and the fewest fourth differences from which it is estimated (chosen)
-HOP_NOISE_PX, HOP_NOISE_STEPS, FEWEST_DIFFERENCES = 3.0, 0.5, 5
-
-MARGIN_PX = 2.0  # Distance beside the body's width at which a row counts half (chosen)
 
 
 @dataclass(frozen=True)
@@ -83,14 +70,16 @@ def track_body(strip: Strip) -> BodyFit:
     body_rows = _row_weights(template.shape[0], strip.axis.width_px)
     weight = np.ones_like(template) * body_rows
     place = np.column_stack([path, np.zeros(len(path))])
-    for turn in range(TEMPLATE_UPDATES):
+    # 3: times that the template is replaced by the median of the patches found (chosen)
+    for turn in range(3):
         place, error, match = _register_all(pictures, template, weight, place, half, first=turn == 0)
         template, weight = _median_template(pictures, place, match, half, strip.noise)
         weight = weight * body_rows
     place, error, match = _register_all(pictures, template, weight, place, half, first=False)
     inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
     off_axis = np.abs(place[:, 1]) > SEARCH_ACROSS_PX - 0.5
-    unseen = (match < LOST_MATCH) | off_axis | _is_absent(pictures, background, template, weight, place, half)
+    # 0.4: correlation below which the patch found is not the body (chosen)
+    unseen = (match < 0.4) | off_axis | _is_absent(pictures, background, template, weight, place, half)
     end = _body_end(place[:, 0], error, match, unseen)
     if end is not None:
         unseen |= np.arange(len(unseen)) > end.last_frame
@@ -110,11 +99,14 @@ def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
         return False
     windows = np.lib.stride_tricks.sliding_window_view
     complete = windows(seen & np.isfinite(along), 5).all(axis=1)
-    if complete.sum() < FEWEST_DIFFERENCES:
+    # 3.0, 0.5, 5: roughness, as the standard deviation of single places, in px and in steps of a frame, above
+    # which what is followed is not one body; and the fewest fourth differences from which it is estimated
+    # (chosen)
+    if complete.sum() < 5:
         return False
     stretches = windows(along, 5)[complete]
     noise = 1.4826 * float(np.median(np.abs(stretches @ np.array([1.0, -4.0, 6.0, -4.0, 1.0])))) / np.sqrt(70)
-    return bool(noise > max(HOP_NOISE_PX, HOP_NOISE_STEPS * float(np.median(np.abs(np.diff(stretches, axis=1))))))
+    return bool(noise > max(3.0, 0.5 * float(np.median(np.abs(np.diff(stretches, axis=1))))))
 
 
 def _is_absent(
@@ -133,7 +125,8 @@ def _is_absent(
         background_residual -= float(np.sum(share * background_residual))
         gain = float(np.clip(np.sum(share * patch * body_pattern) / power, 0.3, 3.0))
         body_residual = patch - gain * body_pattern
-        absent[t] = np.sum(share * background_residual**2) < ABSENT_RATIO * np.sum(share * body_residual**2)
+        # 0.7: ratio of the background's residual to the template's below which the body is absent (chosen)
+        absent[t] = np.sum(share * background_residual**2) < 0.7 * np.sum(share * body_residual**2)
     return absent
 
 
@@ -142,7 +135,8 @@ def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
     if not np.isfinite(width_px):
         return np.ones((rows, 1), dtype=np.float32)
     outside = np.abs(np.arange(rows) - (rows - 1) / 2) - width_px / 2
-    return (1 / (1 + (np.clip(outside, 0, None) / MARGIN_PX) ** 2)).astype(np.float32)[:, None]
+    # 2.0: distance beside the body's width at which a row counts half (chosen)
+    return (1 / (1 + (np.clip(outside, 0, None) / 2.0) ** 2)).astype(np.float32)[:, None]
 
 
 def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> BodyEnd | None:
@@ -154,7 +148,9 @@ def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bo
         return None
     position = along[recognised]
     behind = np.maximum.accumulate(position) - position
-    is_back = behind > np.maximum(BACK_PX, BACK_SIGMA * np.nan_to_num(sigma[recognised], nan=0.0))
+    # 3.0, 6.0: distance behind its furthest place at which a body has turned back, in px and in standard errors
+    # (chosen)
+    is_back = behind > np.maximum(3.0, 6.0 * np.nan_to_num(sigma[recognised], nan=0.0))
     turned = np.flatnonzero(is_back[:-1] & is_back[1:])
     if len(turned):
         return BodyEnd(int(recognised[int(np.argmax(position[: turned[0]]))]), turns_back=True)
@@ -262,7 +258,8 @@ def _by_correlation(picture: NDArray[np.float32], template: NDArray[np.float32],
     """Whole-pixel place of the best normalised correlation about `guess`."""
     import cv2
 
-    reach = SEARCH_ALONG_PX + half // 2
+    # 14: distance along the axis searched about the expected place (chosen)
+    reach = 14 + half // 2
     low = int(np.clip(guess[0] - half - reach, 0, max(picture.shape[1] - template.shape[1], 0)))
     high = int(np.clip(guess[0] + half + reach + 1, low + template.shape[1], picture.shape[1]))
     if high - low < template.shape[1]:
@@ -328,5 +325,6 @@ def _median_template(
     scatter = (1.4826 * np.median(np.abs(stack - template), axis=0)) ** 2
     # A glint varies by its slope times the misplacement: that is the signal of the registration, not noise.
     slope = np.sum(np.square(np.gradient(template)), axis=0)
-    variance = np.maximum(scatter - MISPLACED_PX**2 * slope, 0.0) + 2 * noise**2
+    # 0.5: misplacement that the weights of the template allow for (chosen)
+    variance = np.maximum(scatter - 0.5**2 * slope, 0.0) + 2 * noise**2
     return template, (1.0 / variance).astype(np.float32)

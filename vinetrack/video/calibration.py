@@ -39,11 +39,7 @@ from vinetrack.video.target_corners import CornersError, charuco_corners, checke
 # remaining uncertainty.
 
 PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)  # Prior standard deviations of the two perspective terms (chosen)
-MIN_NOISE_PX = 0.01  # Chosen: no corner is located better
 
-NOISE_ROUNDS = 3  # Iterations of fit and noise estimate (chosen)
-
-NEWTON_STEPS = 12  # Iterations of Newton's method (chosen)
 
 N_PLANE, N_LENS = 8, 2  # Parameters of a plane and of a lens (derived)
 
@@ -145,14 +141,16 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
     values = np.concatenate([*start, np.zeros(N_LENS)])
     unit_px = _half_diagonal_px(*size)
     noise_px = 0.1
-    for _ in range(NOISE_ROUNDS):
+    # 3: iterations of fit and noise estimate (chosen)
+    for _ in range(3):
         arguments = (corners, [board / reach_m for board in boards], noise_px / unit_px)
         fit = least_squares(_misfit, values, args=arguments, method="lm", xtol=1e-12, ftol=1e-12)
         values = fit.x
         residuals = _residuals(values, *arguments[:2])
         n_degrees = 2 * sum(len(view) for view in corners) - N_PLANE * len(views) - N_LENS
         sum_of_squares = sum(float((view**2).sum()) for view in residuals)
-        noise_px = max(unit_px * np.sqrt(sum_of_squares / max(n_degrees, 1)), MIN_NOISE_PX)
+        # 0.01: chosen: no corner is located better
+        noise_px = max(unit_px * np.sqrt(sum_of_squares / max(n_degrees, 1)), 0.01)
     covariance = np.linalg.inv(fit.jac.T @ fit.jac)
     maps = []
     for k in range(len(views)):
@@ -172,7 +170,8 @@ def _undistorted(distorted: Floats, lens: Floats) -> Floats:
     """Solve q(1 + κ₁q² + κ₂q⁴) = q_d by Newton's method; where a strong lens folds over, steps are limited."""
     distorted_radius = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
     radius = distorted_radius.copy()
-    for _ in range(NEWTON_STEPS):
+    # 12: iterations of Newton's method (chosen)
+    for _ in range(12):
         excess = radius * (1 + lens[0] * radius**2 + lens[1] * radius**4) - distorted_radius
         slope = 1 + 3 * lens[0] * radius**2 + 5 * lens[1] * radius**4
         radius = radius - excess / np.maximum(slope, 0.2)
@@ -220,8 +219,6 @@ def _misfit(values: Floats, corners: list[Floats], boards: list[Floats], noise: 
 
 
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
-CORNER_BIAS_PX = 0.02  # Bias that the corners at one end of a target may share (chosen)
-STATIONARY_PX = 0.5  # Motion of the corners over a clip above which the target was moved (chosen)
 # Root mean square distance of the corners from the model above which the board is another one (chosen)
 LARGEST_REPROJECTION_PX = 2.0
 
@@ -229,9 +226,6 @@ MOST_PICTURES_READ = 10  # Most pictures of a clip that are read (chosen)
 
 # First frames of a recording in which a target is looked for, while nothing hides it yet (chosen)
 SEARCHED_FRAMES = 300
-
-
-CHORD_PX = 4.0  # Length of the chords over which a curve is summed in the plane (derived)
 
 
 class CalibrationError(ValueError):
@@ -298,7 +292,8 @@ class PlaneCalibration:
         """Return the scale along an axis that may be a curve: of the arc length in the plane, not of its chord."""
         if not isinstance(axis, CurvedAxis):
             return self.along(axis.from_px, axis.to_px)
-        along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / CHORD_PX) + 2)
+        # 4.0: length of the chords over which a curve is summed in the plane (derived)
+        along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / 4.0) + 2)
         places_px = axis.points(along_px)
         path_m = length_along(self.plane.plane_m(places_px))
         rel_sigma = math.hypot(self.plane.path_rel_sigma(places_px), self.own_rel_sigma)
@@ -353,7 +348,8 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     height, width = pictures[0].shape
     notes = [f"{board.image}: the target is read in {len(views)} of {len(pictures)} pictures"] if complaints else []
     moved_px = _target_motion_px(views)
-    stationary = moved_px < STATIONARY_PX
+    # 0.5: motion of the corners over a clip above which the target was moved (chosen)
+    stationary = moved_px < 0.5
     if not stationary:
         notes.append(
             f"{board.image}: the target moves by {moved_px:.1f} px; its first picture is taken for the plane of growth"
@@ -366,7 +362,8 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
         )
     corners_px = _median_corners(views)[0] if stationary else views[0][0]
     notes += _coverage_note(corners_px, width, height, board.image)
-    bias_rel = CORNER_BIAS_PX * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
+    # 0.02: bias that the corners at one end of a target may share (chosen)
+    bias_rel = 0.02 * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
     covered = (*corners_px.min(axis=0), *corners_px.max(axis=0))
     return PlaneCalibration(
         board.kind, fit.maps[0], fit.reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)

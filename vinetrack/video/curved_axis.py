@@ -45,9 +45,6 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float]
 
-SAMPLES_PER_PX = 8  # Samples per pixel over which the arc length is summed (derived)
-LARGEST_HALF_PER_RADIUS = 0.9  # Largest half width of a strip, as a part of the least radius (derived)
-
 
 @dataclass(frozen=True)
 class CurvedAxis(Axis):
@@ -85,7 +82,8 @@ class CurvedAxis(Axis):
         spacing = np.hypot(*np.diff(points, axis=0).T)
         knots = np.concatenate([[0.0], np.cumsum(np.sqrt(spacing))])
         spline = CubicSpline(knots, points, bc_type="natural")
-        counts = np.ceil(SAMPLES_PER_PX * spacing).astype(int) + 1
+        # 8: samples per pixel over which the arc length is summed (derived)
+        counts = np.ceil(8 * spacing).astype(int) + 1
         parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], counts, strict=True)]
         parameter = np.concatenate([*parts, knots[-1:]])
         steps = np.hypot(*np.diff(spline(parameter), axis=0).T)
@@ -108,7 +106,8 @@ class CurvedAxis(Axis):
     @property
     def largest_half_px(self) -> float:
         """Half the width of the widest strip along the curve whose normals do not cross."""
-        return LARGEST_HALF_PER_RADIUS * self.least_radius_px
+        # 0.9: largest half width of a strip, as a part of the least radius (derived)
+        return 0.9 * self.least_radius_px
 
     @cached_property
     def _angles_rad(self) -> Floats:
@@ -223,8 +222,6 @@ def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple
 # A shift of the picture is along the curve in one place and across it in another. It is therefore measured in the
 # picture, before anything is straightened, by the same robust least squares as the bands beside a straight strip.
 
-GROUND_PX = 120  # Distance from the tube within which background counts (chosen)
-
 
 def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Floats | None:
     """Measure how far each picture moved against the others. Shapes: luma (n_frames, height, width) → (n_frames, 2)."""
@@ -232,7 +229,8 @@ def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Float
     level = Axis((0.0, 0.0), (float(max(width - 1, 10)), 0.0))
     y, x = (values.ravel() for values in np.mgrid[2 : height - 2 : 2, 2 : width - 2 : 2])
     across = np.abs(axis.along_and_across(np.column_stack([x, y]).astype(float))[1])
-    still = (across > half_px + BAND_GAP_PX) & (across < half_px + GROUND_PX)
+    # 120: distance from the tube within which background counts (chosen)
+    still = (across > half_px + BAND_GAP_PX) & (across < half_px + 120)
     if np.count_nonzero(still) < SHIFT_PIXELS // 10:
         return None
     every = max(1, np.count_nonzero(still) // SHIFT_PIXELS)
@@ -286,11 +284,8 @@ def _moved_back(luma: NDArray[Any], shift_px: Floats) -> NDArray[np.float32]:
 # length apart, and everything that works on straight strips works on it. The curve is then moved onto the middle of
 # the tube that grew.
 
-KNOT_PX = 40.0  # Distance of the knots of a curve that is moved onto the middle of a tube (chosen)
 STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
-AVERAGING_STRETCHES = 1.0  # Standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
 CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
-SLOW_PX_PER_RAD = 0.04  # Slow error of a position along a curve, for each radian by which the curve turns (measured)
 
 
 @dataclass(frozen=True)
@@ -336,7 +331,8 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
 
 def path_error_px(axis: Axis) -> float:
     """Return the slow error of positions along an axis that comes from its curvature."""
-    return SLOW_PX_PER_RAD * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
+    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
+    return 0.04 * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
 
 
 def curve_note(axis: CurvedAxis) -> str:
@@ -388,7 +384,8 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
     """Move a curve onto the middle of the tube, and measure how far that lies from it. Returns curve, with the tube's
     width; the given one where the tube's middle makes none that a strip can be cut along., distance.
     """
-    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / KNOT_PX) + 1))
+    # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
+    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
     offsets = _local_lines(sides.places_px, sides.middles_px, knots)
     through = axis.points(knots, offsets)
     separate = [
@@ -410,7 +407,8 @@ def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
     queries = np.clip(queries, places[0], places[-1])
     out = np.empty(len(queries))
     for k, place in enumerate(queries):
-        offset = (places - place) / (AVERAGING_STRETCHES * spacing)
+        # 1.0: standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
+        offset = (places - place) / (1.0 * spacing)
         weight = np.exp(-0.5 * offset**2)
         design = np.column_stack([np.ones(len(places)), offset])
         moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
@@ -442,9 +440,6 @@ CURVE_GAIN = 1.35
 # A curve is also used where the straight line needs a band this many times wider and the curve explains at least
 # EQUAL_SHARE of what the line does (measured)
 BAND_RATIO, EQUAL_SHARE = 1.25, 0.98
-LEAST_LENGTH = 3.0  # Least length of the band, in its widths, that has a path (chosen)
-CENTRING_POWER = 3.0  # How strongly the path through the band keeps to its middle: a step costs 1 / depth³ (chosen)
-KNOT_WIDTHS = 1.5  # Distance of the curve's knots in widths of the band (chosen)
 
 
 def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
@@ -495,9 +490,11 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | N
     """Find the smoothed middle of the band that changed, from its first change to its last."""
     band = band or _changed_band(small)
     path = None if band is None else _centreline(band)
-    if band is None or path is None or len(path) < LEAST_LENGTH * band.width:
+    # 3.0: least length of the band, in its widths, that has a path (chosen)
+    if band is None or path is None or len(path) < 3.0 * band.width:
         return None
-    middle = _smoothed_knots(_in_order_of_time(path, band), max(KNOT_WIDTHS * band.width, 6.0))
+    # 1.5: distance of the curve's knots in widths of the band (chosen)
+    middle = _smoothed_knots(_in_order_of_time(path, band), max(1.5 * band.width, 6.0))
     if middle is None:
         return None
     size = small.shape[1], small.shape[0]
@@ -573,7 +570,8 @@ def _centreline(band: Band) -> Floats | None:
         costs = np.where(band.region, MCP_Geometric(unit_costs).find_costs([end])[0], -1.0)
         row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(costs), costs, -1.0))), costs.shape)
         start, end = end, (int(row), int(column))
-    paths = MCP_Geometric(np.where(band.region, 1 / np.maximum(band.depth, 0.5) ** CENTRING_POWER, blocked))
+    # 3.0: how strongly the path through the band keeps to its middle: a step costs 1 / depth³ (chosen)
+    paths = MCP_Geometric(np.where(band.region, 1 / np.maximum(band.depth, 0.5) ** 3.0, blocked))
     paths.find_costs([start], [end])
     return np.array(paths.traceback(end), dtype=float)[:, ::-1]
 

@@ -28,11 +28,6 @@ NON_MARKING_DECODERS = frozenset(
     | {"hevc", "vp8", "vp9", "libdav1d", "av1"}
 )
 
-PREDICTED_BOTH_WAYS = 3  # Code of a B frame (defined)
-
-MEMORY_PART = 0.4  # Fraction of the machine's memory that the pictures of one recording may take (derived)
-
-INITIAL_FRAMES = 256  # Frames for which memory is reserved if a film does not declare their number (chosen)
 
 HALF_TICK = 0.5  # Half a tick of a film's time base; times are whole ticks (derived)
 
@@ -126,7 +121,8 @@ def _enlarged(
 ) -> NDArray[Any]:
     """Return a larger buffer with the same frames; untouched memory takes no space."""
     if buffer is None:
-        count = expected if expected and expected * picture.nbytes <= available_bytes else INITIAL_FRAMES
+        # 256: frames for which memory is reserved if a film does not declare their number (chosen)
+        count = expected if expected and expected * picture.nbytes <= available_bytes else 256
         return np.empty((count, *picture.shape), picture.dtype)
     enlarged = np.empty((len(buffer) + len(buffer) // 2 + 1, *buffer.shape[1:]), buffer.dtype)
     enlarged[: len(buffer)] = buffer
@@ -205,7 +201,8 @@ def _record_frame(decoded: Decoded, frame: av.VideoFrame, base_s: float) -> None
     decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base_s)
     decoded.corrupt.append(bool(frame.is_corrupt))
     decoded.key.append(bool(frame.key_frame))
-    decoded.between.append(frame.pict_type == PREDICTED_BOTH_WAYS)
+    # 3: code of a B frame (defined)
+    decoded.between.append(frame.pict_type == 3)
 
 
 def _frames_of(packets: Iterator[av.Packet[Any]], messages: list[str]) -> Iterator[av.VideoFrame]:
@@ -244,7 +241,8 @@ def _times_of_faulty_packets(path: Path) -> set[float]:
 def memory_for_pictures() -> float:
     """Bytes that decoded pictures may take; infinity if the machine's memory is unknown."""
     try:
-        return MEMORY_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        # 0.4: fraction of the machine's memory that the pictures of one recording may take (derived)
+        return 0.4 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         return math.inf
 

@@ -70,7 +70,6 @@ from vinetrack.video.strip import Strip
 MIN_LOG_CHANGE = 5.0
 # Length of a run of columns, and the fraction of it that must have changed for a front to have passed (chosen)
 RUN_LENGTH_PX, RUN_CHANGED_PART = 9, 0.6
-MIN_FALL_PART, MIN_FALL_PX = 0.1, 0.2  # Minimum decrease from step to step of the run-up, going back in time (chosen)
 
 AVERAGED_FRAMES = 12  # Frames after and before the front over which film and background are averaged (derived)
 
@@ -158,7 +157,8 @@ def _run_up(path: Floats) -> Floats:
     later = path[onset + 1 :]
     if onset < 2 or len(later) < 5:
         return path
-    fall = max(float(np.median(np.diff(later[:5], 2))), MIN_FALL_PART * float(later[1] - later[0]), MIN_FALL_PX)
+    # 0.1, 0.2: minimum decrease from step to step of the run-up, going back in time (chosen)
+    fall = max(float(np.median(np.diff(later[:5], 2))), 0.1 * float(later[1] - later[0]), 0.2)
     out, step = path.copy(), float(np.median(np.diff(later[:4])))
     for t in range(onset, -1, -1):
         step = max(step - fall, 0.0)
@@ -167,23 +167,17 @@ def _run_up(path: Floats) -> Floats:
 
 
 START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
-START_ERROR_REACH_PX = 25.0  # Growth over which that error falls to 1/e (chosen)
 # Added to the error near the start if a door crosses the whole strip before growth and the frames do not fit the model
 # (chosen)
 DOOR_ERROR_PX = 0.5
-CONVERGED_PX = 0.2  # The iteration has converged once no edge of a moving frame changes by more than this (chosen)
-SAME_PATH_PX = 1.0  # Two paths are the same if they nowhere differ by more than this (derived)
 # Factor on the disagreement of the bands when the fitted blur is at its upper bound (chosen)
 OUT_OF_FOCUS_FACTOR = 3.0
-MAX_MISFIT_RATIO = 100.0  # Upper limit of a frame's misfit relative to the median (chosen)
 # Frames in which the error of the start is at least this part of its full value count as near the start (derived)
 NEAR_START_WEIGHT = 0.1
 # Excess of the mean misfit ratio near the start at which the error of a door is added in full (chosen)
 FULL_DOOR_EXCESS = 0.7
 # Error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
 WIDTH_ERROR_PX = 1.0
-# Contrast, in grey levels, below which the sides of a tube fade into the background (measured)
-LOW_CONTRAST, LOW_CONTRAST_WIDTH_ERROR = 25.0, 0.15
 MIN_FRAME_WEIGHT = 0.05  # Weight of a frame identical to the one before it (chosen)
 # Distance, in standard deviations, at which the difference of a pixel from film or background is clipped (chosen)
 EVIDENCE_CLIP = 2.5
@@ -221,7 +215,8 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
     change = _frame_changes(strip)
     for iteration in range(3):
         before, path = path, _path_from_appearance(strip, state, passed, change)
-        if iteration > 0 and np.abs(before - path).max() <= SAME_PATH_PX:
+        # 1.0: two paths are the same if they nowhere differ by more than this (derived)
+        if iteration > 0 and np.abs(before - path).max() <= 1.0:
             break
         state = estimate_appearance(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
     fit = _fit_frames(strip, state, informative_frames(state.edge))
@@ -236,10 +231,8 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
             state = find_shading(strip, state, fit)
         steps = FIT_ROUNDS if iteration >= rounds - 1 else EARLY_FIT_ROUNDS
         fit = repair_jumps(strip, state, _fit_frames(strip, state, informative, steps), informative)
-        if (
-            iteration >= rounds - 1
-            and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < CONVERGED_PX
-        ):
+        # 0.2: the iteration has converged once no edge of a moving frame changes by more than this (chosen)
+        if iteration >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < 0.2:
             break
     resting_fit = _fit_frames(strip, state, ~informative)
     fit = repair_jumps(strip, state, np.where(informative[:, None], fit, resting_fit), np.ones(len(fit), dtype=bool))
@@ -296,7 +289,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     slope, intercept = _robust_line(place, centre)
     median_width = float(np.median(width))
     width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
-    faint = LOW_CONTRAST_WIDTH_ERROR * median_width if float(np.median(contrasts)) < LOW_CONTRAST else 0.0
+    # 25.0, 0.15: contrast, in grey levels, below which the sides of a tube fade into the background (measured)
+    faint = 0.15 * median_width if float(np.median(contrasts)) < 25.0 else 0.0
     sigma = float(np.linalg.norm([width_error, WIDTH_ERROR_PX, faint]))
     return Outline(intercept, slope, median_width / 2 + 1.5, median_width, sigma, path, passed, place, centre)
 
@@ -381,7 +375,8 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     """Add to a converged fit the errors of bands, start, doors and leaps, and refer the edge to mid-exposure."""
     core = core_frames(state, fit)
     # Where a frame departs from the model (a door, a glint), the error exceeds that from the curvature of ln L.
-    misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, MAX_MISFIT_RATIO)
+    # 100.0: upper limit of a frame's misfit relative to the median (chosen)
+    misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0)
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
     edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * misfit_ratio, ASTRAY_PX)
     # The fitted box assumes constant speed: its centre is the mean position, which leads mid-exposure by aτ²/24.
@@ -390,7 +385,8 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     contrast = (state.appearance[0] - state.appearance[1]).mean(axis=0).astype(float)
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
-    near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_ERROR_REACH_PX)
+    # 25.0: growth over which that error falls to 1/e (chosen)
+    near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / 25.0)
     near = (near_start > NEAR_START_WEIGHT) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
     door_weight = float(np.clip((np.mean(misfit_ratio[near]) - 1) / FULL_DOOR_EXCESS, 0, 1)) if near.any() else 0.0
     door = DOOR_ERROR_PX * disturbed_start(strip, state) * door_weight

@@ -97,7 +97,6 @@ def subpixel_index(place: float) -> tuple[int, int, float, int]:
 COLUMNS_BEHIND = 25  # Columns behind the first passed one that are used (chosen)
 COLUMNS_AHEAD = 50  # Columns ahead of the last passed one that are used (chosen)
 FILM_CLIP_RATIO = 1.7  # Ratio of the clipped squared distance from film to that from background (chosen)
-FILM_BIAS = 0.1  # Evidence in favour of film in every pixel (chosen)
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -111,7 +110,8 @@ def film_evidence(
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
-    unit, film_bias, extra_variance = np.float32(1.0), np.float32(FILM_BIAS), np.float32(width * width)
+    # 0.1: evidence in favour of film in every pixel (chosen)
+    unit, film_bias, extra_variance = np.float32(1.0), np.float32(0.1), np.float32(width * width)
     background_clip, film_clip = np.float32(clip * clip), np.float32(FILM_CLIP_RATIO * clip * clip)
     weight = unit / (appearance[2:] + extra_variance)
     for t in range(n):
@@ -272,10 +272,8 @@ def _normal_sums(
 # `edge_kernels`.
 
 MEMORY_CUTOFF = 4.0  # Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 % (chosen)
-PARTIAL_WEIGHT = 0.05  # Weight of a half-covered pixel (chosen)
 # Coverage from which a pixel counts as film, and below 1 − COVERED_FRACTION as background (chosen)
 COVERED_FRACTION = 0.98
-MIXED_BLURS = 2.06  # Distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
 FAR_PX = 80  # Columns beyond the range of the edge that are gathered (chosen)
 ROWS_PER_BLOCK = 8  # Rows processed together, so that their sums stay in the cache (chosen)
 
@@ -386,7 +384,8 @@ def _gather_blocks(
             if last <= first:
                 continue
             middle = math.ceil(coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur)) + 1
-            mixed = min(math.ceil(0.5 * max(lengths[t], MIN_MOTION_BLUR_PX) + MIXED_BLURS * blur) + 1, middle)
+            # 2.06: distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
+            mixed = min(math.ceil(0.5 * max(lengths[t], MIN_MOTION_BLUR_PX) + 2.06 * blur) + 1, middle)
             table, bare_weight, film_weight = tables[table_index[t]], bare_weights[t], film_weights[t]
             gain, level = np.float32(scale[t]), np.float32(offset[t])
             _gather_rows(
@@ -433,7 +432,8 @@ def _gather_rows(
             elif p > 1 - COVERED_FRACTION:
                 if t < early[s] or t > late[s]:
                     continue
-                w *= np.float32(PARTIAL_WEIGHT)
+                # 0.05: weight of a half-covered pixel (chosen)
+                w *= np.float32(0.05)
             r = value - appearance[1, u, s] * q - appearance[0, u, s] * p
             w /= unit + r * r * clip_weight
             if q > COVERED_FRACTION:

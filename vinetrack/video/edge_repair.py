@@ -35,11 +35,7 @@ from vinetrack.video.strip import Strip
 # and where a shaken camera was stabilised the slow part of the shake stays.
 
 SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
-SLOW_GREY = 1.0  # Error of the pictures of film and background, in grey levels of 255 (measured)
-LEAST_CONTRAST_GREY = 1.0  # Least contrast, in grey levels (chosen)
-CONTRAST_COLUMNS = 21  # Columns over which the contrast at an edge is taken, px (chosen)
 LAGS = (1, 2)  # Lags, in frames, at which bands that still disagree alike share a cause (chosen)
-FEWEST_PRODUCTS = 4  # Fewest pairs of frames at a lag (chosen)
 START_RANDOM_PART = 0.4  # Part of the error near the start that differs from frame to frame (measured)
 GUESS_RANDOM_PART = math.sqrt(0.5)  # The same for an edge that is a guess, since a door or the mouth hides it (chosen)
 ARRIVAL_PX = 1.0  # Slow error of a tip that sweeps and bends, tracked by when the picture changes for good (measured)
@@ -56,11 +52,12 @@ def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats
     if not finite.any():
         return np.full(len(edge_px), everywhere_px)
     columns = np.arange(len(contrast))
-    smooth_contrast = median_filter(
-        np.interp(columns, columns[finite], np.abs(contrast[finite])), CONTRAST_COLUMNS, mode="nearest"
-    )
+    # 21: columns over which the contrast at an edge is taken, px (chosen)
+    smooth_contrast = median_filter(np.interp(columns, columns[finite], np.abs(contrast[finite])), 21, mode="nearest")
     local_contrast = np.interp(np.nan_to_num(edge_px), columns, smooth_contrast)
-    return np.asarray(np.hypot(everywhere_px, SLOW_GREY / np.maximum(local_contrast, LEAST_CONTRAST_GREY)))
+    # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
+    # 1.0: least contrast, in grey levels (chosen)
+    return np.asarray(np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0)))
 
 
 def shared_disagreement(lead_px: Floats) -> float:
@@ -76,7 +73,8 @@ def shared_disagreement(lead_px: Floats) -> float:
     deviation = deviation - np.median(deviation, axis=0)
     pairs = (deviation + deviation[:, ::-1])[:, : bands // 2] / 2
     pairs = pairs - pairs.mean(axis=1, keepdims=True)
-    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in LAGS if frames - lag >= FEWEST_PRODUCTS]
+    # 4: fewest pairs of frames at a lag (chosen)
+    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in LAGS if frames - lag >= 4]
     if not products:
         return 0.0
     # The mean of a pair has half the variance of a band.
@@ -197,12 +195,10 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
 
 
 BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
-FEWEST_ROWS = 4  # Fewest rows of a band (chosen)
 
 # Deviation of a band, in median absolute deviations of the bands of its frame, at which it is clipped (chosen)
 OUTLYING_BAND = 2.0
 BAND_OFFSET_PX = 50.0  # Growth over which the lead or lag of a band is taken as its usual offset (chosen)
-BAND_OFFSET_FRAMES = 7  # Fewest frames from which that offset is taken (chosen)
 
 NEIGHBOURS = 2  # Frames on each side over which the median disagreement is taken (chosen)
 MEDIAN_TO_MEAN = 1.27  # Ratio of mean to median of χ² with three degrees of freedom (derived)
@@ -264,7 +260,8 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
     limits = np.concatenate([[0], cuts, [rows]])
     edges, sigmas = [], []
     for low, high in pairwise(limits):
-        if high - low < FEWEST_ROWS:
+        # 4: fewest rows of a band (chosen)
+        if high - low < 4:
             continue
         fit = fit_edges(strip, replace(state, edge=edge), rows=(int(low), int(high)))
         edges.append(fit[:, 0])
@@ -274,7 +271,8 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
 
 def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
     """Median lead of each band over the core frames within BAND_OFFSET_PX, or the nearest few, (n_frames, n_bands)."""
-    fewest = min(BAND_OFFSET_FRAMES, len(core))
+    # 7: fewest frames from which that offset is taken (chosen)
+    fewest = min(7, len(core))
     # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
     places, frame_places = np.unique(np.rint(edge), return_inverse=True)
     out = np.empty((len(places), lead_px.shape[1]))
@@ -307,20 +305,14 @@ LEAST_AMPLITUDE, REDUCED_AMPLITUDE = 0.6, 0.75
 GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
 # First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
 DOOR_COLUMNS, DOOR_FRAMES = (6, 10), 15
-# A door changes a column where its brightness varies by this part of the film's contrast and by so many grey levels
-# (chosen)
-DOOR_PART, DOOR_GREY = 0.25, 4.0
 
 FEWEST_REST_FRAMES = 3  # Fewest frames of rest from which the resting place is known (chosen)
-MIDDLE_ROWS = 0.6  # Part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
 FILM_RANGE_PX = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
 SEARCH_PX = 3  # Distance from the resting place within which a border is looked for (chosen)
-STRAIGHT_PART = 0.95  # Part of the rows that must show the border with the same sign (measured)
 # Least ratio of the border to the largest step between neighbouring columns of film further on (measured)
 BORDER_TO_FILM = 2.0
-BORDER_TO_CONTRAST = 0.5  # Least ratio of the border to the film's contrast (measured)
 FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed and acceleration are estimated (chosen)
 # Ratio of a change of the step to the largest of the next four, above which the hidden frames do not belong to the
 # motion that follows (chosen)
@@ -365,8 +357,10 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     film_step = float(np.abs(np.median(borders[:, film_columns - beside], axis=0)).max())
     contrast = np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))[later]
     straight = float(np.mean(np.sign(border) == np.sign(border_step)))
-    least_step = max(BORDER_TO_FILM * film_step, BORDER_TO_CONTRAST * float(np.median(contrast)))
-    if straight < STRAIGHT_PART or abs(border_step) < least_step:
+    # 0.5: least ratio of the border to the film's contrast (measured)
+    least_step = max(BORDER_TO_FILM * film_step, 0.5 * float(np.median(contrast)))
+    # 0.95: part of the rows that must show the border with the same sign (measured)
+    if straight < 0.95 or abs(border_step) < least_step:
         return none
     clear_px = rest_px + 3 * state.blur + 1
     exit_frame = first + int(np.argmax(edge[first:] > clear_px))
@@ -390,7 +384,9 @@ def disturbed_start(strip: Strip, state: EdgeState) -> float:
         brightness = strip.values[first : max(arrival - 1, first + 1), :, column].mean(axis=1)
         frames = slice(first, first + len(brightness))
         change = np.ptp(brightness * strip.scale[frames] + strip.offset[frames])
-        changed += change > max(DOOR_PART * contrast, DOOR_GREY)
+        # 0.25, 4.0: A door changes a column where its brightness varies by this part of the film's contrast
+        # and by so many grey levels (chosen)
+        changed += change > max(0.25 * contrast, 4.0)
     return changed / len(column_range)
 
 
@@ -420,7 +416,8 @@ def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> N
     tail averages out.
     """
     rows = strip.values.shape[1]
-    edge_rows = round((1 - MIDDLE_ROWS) / 2 * rows)
+    # 0.6: part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
+    edge_rows = round((1 - 0.6) / 2 * rows)
     chosen = frames[np.unique(np.linspace(0, len(frames) - 1, 15).astype(int))]
     values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
     level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]

@@ -251,20 +251,15 @@ def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
 # ------------------------------------------------------------------------------
 # Estimate the tip's shape and shading, the optical blur and the exposure from the residuals of the edge fit.
 
-SHADING_KERNEL = (0.25, 0.5, 0.25)  # Smoothing kernel of the tip's shading (chosen)
 BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
 NEAR_BLURS = np.array([0.7, 0.85, 1, 1.2, 1.4])  # Blurs that are tried near the last estimate, as a part of it (chosen)
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 ASSUMED_EXPOSURE = 0.25  # Exposure over frame period until it is estimated (chosen)
-FEWEST_FAST_FRAMES = 6  # Fewest frames from which a blur is told from the shape of the tip (chosen)
 # Ratio of the misfit with the stated exposure to the least of any exposure, above which the stated one is contradicted
 # (measured)
 CONTRADICTION_RATIO = 1.01
 LARGEST_LAG_STEP_PX = 4.0  # Largest change of a row's lag in one round (chosen)
 
-DEEPEST_LAG_PX = 60.0  # Largest lag of a row behind the foremost point (chosen)
-
-BLUR_FRAMES = 16  # Frames from which the blur is estimated (chosen)
 
 OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel to a picture out of focus (chosen)
 
@@ -282,7 +277,8 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
         step = np.clip(step, -LARGEST_LAG_STEP_PX, LARGEST_LAG_STEP_PX)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
         state = replace(state, lag=lag, edge=state.edge - lead)
-    sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // BLUR_FRAMES)]
+    # 16: frames from which the blur is estimated (chosen)
+    sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // 16)]
     candidates = BLURS_PX if everywhere else state.blur * NEAR_BLURS
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
@@ -315,7 +311,8 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
         middle = len(by_place) // 2
         residual, weight = by_place[middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1].T
         step = residual / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
-        state = replace(state, shading=np.convolve(state.shading + step, SHADING_KERNEL, mode="same"))
+        # (0.25, 0.5, 0.25): smoothing kernel of the tip's shading (chosen)
+        state = replace(state, shading=np.convolve(state.shading + step, (0.25, 0.5, 0.25), mode="same"))
     return state
 
 
@@ -345,7 +342,8 @@ def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: fl
     px a frame. Shapes: fit (n_frames, 6).
     """
     speed, fast = _fast_frames(state, fit)
-    if fast.sum() < FEWEST_FAST_FRAMES:
+    # 6: fewest frames from which a blur is told from the shape of the tip (chosen)
+    if fast.sum() < 6:
         return np.nan, np.nan
     misfits = _misfits_of_exposures(strip, state, fit, speed, fast, np.append(EXPOSURES, stated_frames))
     contradicted = misfits[-1] > CONTRADICTION_RATIO * misfits.min()
@@ -388,7 +386,8 @@ def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
         vertex = -curve[1] / (2 * curve[0]) if curve[0] > 1e-6 else np.inf
         if foremost.min() <= vertex + middle <= foremost.max():
             lead = float(np.polyval(curve, vertex))
-    return np.clip(smooth - lead, -3.0, DEEPEST_LAG_PX), lead
+    # 60.0: largest lag of a row behind the foremost point (chosen)
+    return np.clip(smooth - lead, -3.0, 60.0), lead
 
 
 def _least_misfit(candidates: Floats, misfits: Floats) -> float:

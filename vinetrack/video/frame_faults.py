@@ -13,17 +13,11 @@ from vinetrack.core.records import Bools, Floats
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
 
-ODD_FRAMES_WITHIN = 3  # Number of first frames that may be odd (chosen)
-# A frame is odd where it differs from later ones by this many times what neighbours differ by (chosen)
-ODD_RATIO, ODD_GREY = 8.0, 6.0
 AROUND_PX = 40  # Columns on either side of the edge that are compared (chosen)
 CLEAR_STEP_PX = 2.0  # Mean step of three frames above which a copy can be told from slow growth (chosen)
-# A copy moves less than this part of a step, and its picture changes by less than this part of the median (chosen)
-COPY_STEP_PART, COPY_CHANGE_PART = 0.1, 0.15
 
 # Side of the blocks that are compared (derived)
 TORN_BLOCK_PX, TORN_RUN = 16, 12
-TORN_GREY, TORN_RATIO = 4.0, 4.0  # Distance of a block outside them (chosen)
 
 
 def torn_frames(luma: NDArray[Any]) -> Bools:
@@ -47,7 +41,8 @@ def torn_frames(luma: NDArray[Any]) -> Bools:
         low, high = np.minimum(block[before], block[after]), np.maximum(block[before], block[after])
         excess = np.maximum(excess, np.maximum(block - high, low - block))
     unit = 1.0 if luma.dtype == np.uint8 else max(float(block.max()), 1.0) / 255
-    limit = TORN_GREY * unit + TORN_RATIO * np.quantile(excess, 0.75, axis=0)
+    # 4.0, 4.0: distance of a block outside them (chosen)
+    limit = 4.0 * unit + 4.0 * np.quantile(excess, 0.75, axis=0)
     return np.asarray((excess > limit).sum(axis=2).max(axis=1) >= TORN_RUN)
 
 
@@ -65,8 +60,10 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
 
     median_difference = float(np.median([difference(i, i + 1) for i in range(3, 7)]))
     unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
-    limit = max(ODD_RATIO * median_difference, ODD_GREY * unit)
-    for i in range(ODD_FRAMES_WITHIN):
+    # 8.0, 6.0: A frame is odd where it differs from later ones by this many times what neighbours differ by (chosen)
+    limit = max(8.0 * median_difference, 6.0 * unit)
+    # 3: number of first frames that may be odd (chosen)
+    for i in range(3):
         odd[i] = difference(i, 3) > limit and difference(i, 4) > limit
     return odd
 
@@ -87,8 +84,10 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
     repeated = np.zeros(n, dtype=bool)
     for i in range(2, n - 1):
         mean_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
-        stands = abs(edge_px[i] - edge_px[i - 1]) < COPY_STEP_PART * mean_step
-        repeated[i] = mean_step > CLEAR_STEP_PX and stands and change[i] < COPY_CHANGE_PART * median_change
+        # 0.1, 0.15: A copy moves less than this part of a step, and its picture changes by less than this
+        # part of the median (chosen)
+        stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * mean_step
+        repeated[i] = mean_step > CLEAR_STEP_PX and stands and change[i] < 0.15 * median_change
     return repeated
 
 

@@ -31,8 +31,6 @@ from vinetrack.video.frames import (
 
 SAME_RATE = 0.005  # Relative difference within which two rates are the same (derived)
 
-SAME_EXPOSURE = 0.02  # Relative difference within which exposures of sheet and recording are the same (chosen)
-
 
 def capture_rate(trial: Trial, recording: Recording) -> float:
     """Return the capture rate: the recording's where it states one, else the sheet's."""
@@ -60,7 +58,8 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
     true_s, stated_s = recording.exposure_s, trial.exposure_s
     if true_s is None:
         return stated_s
-    if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > SAME_EXPOSURE:
+    # 0.02: relative difference within which exposures of sheet and recording are the same (chosen)
+    if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > 0.02:
         raise RecordingError(
             f"{trial.name}: exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording; "
             "correct the sheet"
@@ -93,7 +92,6 @@ CIHX_PLACES = {
 }
 
 SIDE_FILES = (".cih", ".cihx")
-LONGEST_SIDE_FILE = 4_000_000  # Most bytes of a side file that are read (chosen)
 
 PACKED_BITS = {0: None, 256: 10, 1024: 12}  # Bits of a packed pixel by `biCompression` of a cine
 
@@ -101,7 +99,6 @@ BAYER_CODES = frozenset({1, 2, 3, 4, 5, 6})  # Codes of colour filters of 2 by 2
 
 EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
 
-IMAGE_TIMES, IMAGE_EXPOSURES = 1002, 1003  # Types of the tagged blocks of a cine
 
 FRACTION_S = 2.0**-32  # Unit of times and exposures in a cine (defined)
 
@@ -206,14 +203,15 @@ def _cine_clock(
     exposure_s = struct.unpack_from("<I", setup, SHUTTER_US_AT)[0] * 1e-6
     if length >= SHUTTER_NS_AT + 4:
         exposure_s = struct.unpack_from("<I", setup, SHUTTER_NS_AT)[0] * 1e-9 or exposure_s
-    times_s, stored_exposures = None, blocks.get(IMAGE_EXPOSURES, b"")
+    # 1002, 1003: types of the tagged blocks of a cine
+    times_s, stored_exposures = None, blocks.get(1003, b"")
     if len(stored_exposures) >= 4 * count:
         exposures_s = np.frombuffer(stored_exposures, "<u4", count) * FRACTION_S
         exposure_s = float(np.median(exposures_s)) or exposure_s
         if np.ptp(exposures_s) > EXPOSURE_TOLERANCE * exposure_s:
             span = f"{1e6 * exposures_s.min():.4g} to {1e6 * exposures_s.max():.4g} µs"
             notes.append(f"{name}: the exposure changes from frame to frame, {span}: switch automatic exposure off")
-    stamps = blocks.get(IMAGE_TIMES, b"")
+    stamps = blocks.get(1002, b"")
     if len(stamps) >= 8 * count and count > 2:
         pairs = np.frombuffer(stamps, "<u4", 2 * count).reshape(-1, 2).astype(np.int64)
         # The lowest two bits flag synchronisation. Integers are subtracted: a float cannot hold both words.
@@ -280,7 +278,8 @@ def read_side_file(path: Path) -> SideFile:
     try:
         file_size(path)  # refuses a pipe, on which reading would wait
         with path.open("rb") as stream:
-            data = stream.read(LONGEST_SIDE_FILE)
+            # 4_000_000: most bytes of a side file that are read (chosen)
+            data = stream.read(4_000_000)
     except OSError as error:
         raise RecordingError(f"{name}: cannot be read: {error.strerror}") from None
     values = _cihx_values(name, data) if path.suffix.lower() == ".cihx" else _cih_values(data)

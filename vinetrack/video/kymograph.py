@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 LEVELS = 256  # Range of the values of the histogram (derived)
 BINS_PER_LEVEL = 16  # Histogram bins per grey level; the median is then sought within one or two bins (chosen)
-MAX_SORTED = 300  # Number of values up to which they are sorted directly (chosen)
 
 
 @njit(cache=True, nogil=True)
@@ -75,7 +74,8 @@ def median(values: np.ndarray, keep: np.ndarray, bins_per_unit: float) -> float:
 @njit(cache=True, nogil=True)
 def _order_statistic(values: np.ndarray, rank: int) -> float:
     """Return the value of a rank, counted from 0, by repeated histograms until few values remain."""
-    while len(values) > MAX_SORTED:
+    # 300: number of values up to which they are sorted directly (chosen)
+    while len(values) > 300:
         low, high = values.min(), values.max()
         if low == high:
             return float(low)
@@ -306,8 +306,6 @@ def _sums_of_changes(pictures: np.ndarray, step: int) -> np.ndarray:
     return out
 
 
-# Number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
-ROW_GROUPS, MAX_GROUP_ROWS = 12, 4
 WINDOW = 10  # Frames before and after a frame whose means are compared (chosen)
 # Peak score from which a column counts as changed (chosen)
 MIN_SCORE, PEAK_FRACTION, UNCHANGED_COLUMN_COST = 3.0, 0.15, 0.2
@@ -318,13 +316,6 @@ HALF_VOTE_NOISE = 4.0
 RESIDUAL_CLIP = 3.0  # Residual, in units of the noise, at which residuals are clipped (chosen)
 
 MIN_CHANGED_ROWS = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
-CHANGE_THRESHOLD = 4.0  # Change, in units of the noise, that counts (chosen)
-SIGMA_PX = 0.8  # Standard error of an arrival
-# A first step more than so many times the median of the four that follow is not growth (chosen)
-START_LEAP_RATIO, MIN_TYPICAL_STEP_PX = 3.0, 2.0
-
-
-FEWEST_COLUMNS = 100  # Fewest columns of a strip for which another thread is used (chosen)
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -430,7 +421,8 @@ def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
             strip.values, strip.scale, strip.offset, WINDOW, _group_size(strip), strip.noise, first, last
         )
 
-    score = np.concatenate(in_parts(score_of, strip.values.shape[2], FEWEST_COLUMNS), axis=1)
+    # 100: fewest columns of a strip for which another thread is used (chosen)
+    score = np.concatenate(in_parts(score_of, strip.values.shape[2], 100), axis=1)
     peak = score.max(axis=0)
     column_weight = np.where(peak > MIN_SCORE, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(
         np.float32
@@ -468,7 +460,8 @@ def path_by_appearance(strip: Strip) -> tuple[Floats, Floats]:
 
 def _group_size(strip: Strip) -> int:
     """Number of rows of a strip that are averaged."""
-    return int(np.clip(strip.values.shape[1] // ROW_GROUPS, 1, MAX_GROUP_ROWS))
+    # 12, 4: number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
+    return int(np.clip(strip.values.shape[1] // 12, 1, 4))
 
 
 def _median_frame(strip: Strip, frames: slice) -> NDArray[np.float32]:
@@ -587,7 +580,8 @@ def column_after_leap(path: Floats) -> int:
     onset = int(np.argmax(steps > 0))
     begin = 0
     for t in range(onset, min(onset + 4, len(steps) - 4)):
-        if steps[t] > START_LEAP_RATIO * max(float(np.median(steps[t + 1 : t + 5])), MIN_TYPICAL_STEP_PX):
+        # 3.0, 2.0: A first step more than so many times the median of the four that follow is not growth (chosen)
+        if steps[t] > 3.0 * max(float(np.median(steps[t + 1 : t + 5])), 2.0):
             begin = int(path[t + 1])
     return begin
 
@@ -599,7 +593,8 @@ def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
     values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     values += strip.offset[:, None, None].astype(np.float32)
     first = np.median(values[:END_FRAMES], axis=0)
-    threshold = CHANGE_THRESHOLD * max(strip.noise, 3.0)
+    # 4.0: change, in units of the noise, that counts (chosen)
+    threshold = 4.0 * max(strip.noise, 3.0)
     changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
     smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
     evidence = (MIN_CHANGED_ROWS - np.minimum(smooth, 3 * MIN_CHANGED_ROWS)).astype(np.float32)
@@ -610,4 +605,5 @@ def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
     path = dividing_path(evidence)
     edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
     smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    return smoothed, np.full(len(edge), SIGMA_PX)
+    # 0.8: standard error of an arrival
+    return smoothed, np.full(len(edge), 0.8)

@@ -34,15 +34,9 @@ REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while i
 # Steps this many times the tolerance of rest, followed by one last frame without a step, show an abrupt stop, though
 # elsewhere two equal positions are no rest (chosen)
 ABRUPT_STOP_RATIO = 5.0
-LEAST_TRAVEL_PX = 2.0  # Least travel that counts as motion (chosen)
 # Distance from the curve through its neighbours, in standard errors and in px, from which a point is an outlier
 # (chosen)
 OUTLIER_SIGMAS, OUTLIER_PX = 6.0, 1.0
-INTERPOLATION_SD = 1.4  # Standard deviation of a point minus the parabola through its four neighbours, for equal errors
-# A first step this many times the mean of the next two (chosen)
-FIRST_STEP_RATIO, FIRST_STEP_EXCESS_PX = 1.2, 0.5
-# A last step that exceeds the extrapolated one by this part of a step (chosen)
-FLYING_STEP_PART, FLYING_ROUGHNESS_RATIO = 0.5, 4.0
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,8 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
         return n, -1
     y, noise = edge_px[good], float(np.nanmedian(sigma_px[good]))
     low, high = float(np.median(y[:3])), float(np.median(y[-3:]))
-    if high - low < max(2 * REST_SIGMAS * noise, LEAST_TRAVEL_PX):
+    # 2.0: least travel that counts as motion (chosen)
+    if high - low < max(2 * REST_SIGMAS * noise, 2.0):
         return n, -1
     first = _first_moving_point(y, max(REST_SIGMAS * noise, REST_PX))
     tolerance = max(REST_SIGMAS * noise, END_REST_PX)
@@ -189,7 +184,8 @@ def _off_parabola(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
             continue
         expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
         bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
-        sigma = INTERPOLATION_SD * float(np.max(sigma_px[i - 2 : i + 3]))
+        # 1.4: standard deviation of a point minus the parabola through its four neighbours, for equal errors
+        sigma = 1.4 * float(np.max(sigma_px[i - 2 : i + 3]))
         distance = abs(y[i] - expected)
         distance_px[i] = distance if distance > max(OUTLIER_SIGMAS * sigma, OUTLIER_PX, bend) else 0.0
     return distance_px
@@ -200,7 +196,8 @@ def _hidden_at_start(y: Floats, sigma_px: Floats, first: int) -> Floats:
     distance_px = np.zeros(len(y))
     for i in range(max(first - 1, 1), min(first + 2, len(y) - 2)):
         step, later_step = y[i] - y[i - 1], 0.5 * (y[i + 2] - y[i])
-        too_long = step > FIRST_STEP_RATIO * later_step + max(sigma_px[i], FIRST_STEP_EXCESS_PX)
+        # 1.2, 0.5: A first step this many times the mean of the next two (chosen)
+        too_long = step > 1.2 * later_step + max(sigma_px[i], 0.5)
         if np.isfinite(step - later_step) and too_long:
             distance_px[:i] = np.maximum(distance_px[:i], step - 0.5 * later_step)
     return distance_px
@@ -213,9 +210,10 @@ def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
         before = y[i - 4 : i]
         excess = y[i] - 2 * before[-1] + before[-2]
         roughness = float(np.max(np.abs(np.diff(before, 2))))
+        # 0.5, 4.0: A last step that exceeds the extrapolated one by this part of a step (chosen)
         limit = max(
-            OUTLIER_SIGMAS * sigma_px[i], 2 * OUTLIER_PX, FLYING_STEP_PART * (before[-1] - before[-2]),
-            FLYING_ROUGHNESS_RATIO * roughness,
+            OUTLIER_SIGMAS * sigma_px[i], 2 * OUTLIER_PX, 0.5 * (before[-1] - before[-2]),
+            4.0 * roughness,
         )  # fmt: skip
         if np.isfinite(excess) and excess > limit:
             distance_px[i : last + 1] = np.maximum(distance_px[i : last + 1], excess)
@@ -228,12 +226,7 @@ def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
 # A payload in free flight leaves background behind it; film stays. A motion ends when the whole vine has grown, when
 # an obstacle stops it, or when the recording ends.
 
-GROWN_TOLERANCE = 0.03  # Relative difference of travel and length within which the whole vine has grown (chosen)
-FEWEST_STILL_FRAMES = 4  # Fewest frames of standstill at the end that are reported (chosen)
-# Change of the pictures after the stop, as a part of that in motion, above which the picture goes on changing (chosen)
-CHANGING_PART = 0.3
 
-BARE_PART = 0.2  # Share of the film's median difference from the background (chosen)
 SHORTEST_BARE_PX = 10  # Fewest columns in a row that must show background again (chosen)
 # Parts of the columns passed, from the first, in at least one of which film is the majority (derived)
 FILM_PARTS = (0.7, 0.35, 0.175)
@@ -254,7 +247,8 @@ class Ending:
 
     def notes(self, length_px: float) -> list[str]:
         """What a track is told about its end; nothing where the whole vine has grown."""
-        if abs(self.grown_px / length_px - 1) < GROWN_TOLERANCE:
+        # 0.03: relative difference of travel and length within which the whole vine has grown (chosen)
+        if abs(self.grown_px / length_px - 1) < 0.03:
             return []
         share = f", after {self.truncated_px / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
         moves = f"{self.name}: the recording ends while the leading edge moves{share}"
@@ -294,7 +288,8 @@ def growth_end_notes(
     (n_frames,).
     """
     n, last = len(edge_px), quality.last_moving
-    if last < 0 or last >= n - FEWEST_STILL_FRAMES or quality.left_picture is not None:
+    # 4: fewest frames of standstill at the end that are reported (chosen)
+    if last < 0 or last >= n - 4 or quality.left_picture is not None:
         return []
     change = mean_changes(luma, 5)
     before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
@@ -304,7 +299,9 @@ def growth_end_notes(
     if not resting.size:
         return [f"{name}: the leading edge is not seen after frame {number[last]}"]
     where = f"{name}: the leading edge stops at {np.median(resting):.0f} px after frame {number[last]}"
-    if later - least > CHANGING_PART * (before - least):
+    # 0.3: change of the pictures after the stop, as a part of that in motion, above which the picture goes on
+    # changing (chosen)
+    if later - least > 0.3 * (before - least):
         return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
     return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
 
@@ -320,7 +317,8 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
     difference = _lasting_change(strip, columns, arrival)
     film_difference = max(float(np.median(difference[: int(part * len(difference))])) for part in FILM_PARTS)
-    is_bare = difference < BARE_PART * film_difference
+    # 0.2: share of the film's median difference from the background (chosen)
+    is_bare = difference < 0.2 * film_difference
     bare_from = _first_bare_column(is_bare, strip.values.shape[1])
     if bare_from < 3 * SHORTEST_BARE_PX or is_bare[bare_from - 2 * SHORTEST_BARE_PX : bare_from].mean() > 0.3:
         return passed[1]

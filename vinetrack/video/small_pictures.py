@@ -22,16 +22,11 @@ from vinetrack.video.kymograph import BINS_PER_LEVEL, block_means, largest_chang
 
 SMALL_PX = 240  # Longer side of the pictures in which the axis is sought (chosen)
 MAX_FRAMES = 150  # Maximum number of frames in which it is sought, spread evenly over the changes (chosen)
-BUSIEST_PIXELS = 200  # Number of pixels of a small picture whose mean change is its activity (chosen)
 # Score of a pixel (measured)
 MIN_GROWTH_SCORE = 0.4
 MIN_GROWN_PART = 0.16  # Part of all change that must pass MIN_GROWTH_SCORE (chosen)
 # Distance, in the small pictures, over which unchanged pixels define the surroundings of a pixel (chosen)
 SURROUNDINGS_PX = 4.0
-END_DIVISOR = 12  # One in so many pictures at either end are averaged (chosen)
-# Time by which the change of a pixel may differ from the passage of the front (chosen)
-TOLERANCE, MIN_TOLERANCE = 0.03, 2.0
-MIN_TIMING_INFORMATION = 0.05  # Minimum information of a change, in nats (chosen)
 
 Pixels = tuple[Floats, Floats, Floats, Floats, int]  # Pixels that change: x, y, time of change and weight, shape
 
@@ -119,8 +114,9 @@ def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
     if n <= MAX_FRAMES:
         return np.arange(n)
     flat = small.reshape(n, -1)
+    # 200: number of pixels of a small picture whose mean change is its activity (chosen)
     activity = np.concatenate(
-        in_parts(lambda first, last: largest_changes(flat[first : last + 1], BUSIEST_PIXELS), n - 1, FEWEST_PICTURES)
+        in_parts(lambda first, last: largest_changes(flat[first : last + 1], 200), n - 1, FEWEST_PICTURES)
     )
     floor = float(np.quantile(activity, 0.2))
     busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
@@ -165,7 +161,8 @@ def _contrast_gain(
     """
     import cv2
 
-    count = max(2, len(frames) // END_DIVISOR)
+    # 12: one in so many pictures at either end are averaged (chosen)
+    count = max(2, len(frames) // 12)
     ends = [np.median(frames[:count], axis=0), np.median(frames[-count:], axis=0)]
     still = np.ones(frames.shape[1:], np.float32)
     still[rows, columns] = 0.0
@@ -206,7 +203,8 @@ def _side_sums(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 def order_tolerance(n_times: int) -> float:
     """Return by how many pictures a pixel may change before or after the front passes it."""
-    return max(MIN_TOLERANCE, TOLERANCE * n_times)
+    # 0.03, 2.0: time by which the change of a pixel may differ from the passage of the front (chosen)
+    return max(2.0, 0.03 * n_times)
 
 
 def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
@@ -217,7 +215,8 @@ def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
     by_time = np.bincount(time.astype(int), weight, n_times)
     span = int(order_tolerance(n_times))
     share = np.convolve(by_time, np.ones(2 * span + 1))[span : span + n_times] / by_time.sum()
-    return np.asarray(MIN_TIMING_INFORMATION - np.log(np.minimum(share[time.astype(int)], 1.0)))
+    # 0.05: minimum information of a change, in nats (chosen)
+    return np.asarray(0.05 - np.log(np.minimum(share[time.astype(int)], 1.0)))
 
 
 # ------------------------------------------------------------------------------
@@ -236,8 +235,6 @@ SAMPLE_SIZE_PX = 320  # Longer side of the samples, px (chosen)
 CHANGE_THRESHOLD = 6.0  # Change of a pixel that counts, in units of its noise (measured)
 MIN_CHANGE = 3.0  # Smallest change that counts, grey levels of 255 (chosen)
 MIN_CHANGED_PIXELS = 8  # Number of pixels that must have changed (chosen)
-NOISE_PAIRS = 40  # Pairs of samples from which the noise is estimated (chosen)
-EMPTY_BYTES = 100  # Maximum packet size of a frame that repeats the one before it (measured)
 # Something moves where packets are, on average over the second number of frames (chosen)
 ACTIVE_RATIO, ACTIVE_FRAMES = 2.0, 9
 MARGIN_FRAMES, MARGIN_PART = 40, 0.15  # Frames, and fraction of the event, added at either end (chosen)
@@ -272,7 +269,8 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], co
         gain = np.clip(np.median((blurred[::2, ::2] + 1.0) / reference), 0.2, 5.0)
         return np.asarray(blurred / np.float32(gain), dtype=np.float32)
 
-    pairs = np.linspace(0, len(pictures) - 2, min(NOISE_PAIRS, len(pictures) - 1)).astype(int)
+    # 40: pairs of samples from which the noise is estimated (chosen)
+    pairs = np.linspace(0, len(pictures) - 2, min(40, len(pictures) - 1)).astype(int)
     steps = [np.abs(level(pictures[i + 1]) - level(pictures[i])) for i in pairs]
     noise = 1.4826 / np.sqrt(2) * np.median(steps, axis=0)
     # The median of three samples at either end shows the scene at rest.
@@ -322,7 +320,8 @@ def _range_by_packets(recording: Recording, index: PacketIndex) -> tuple[int, in
     smallest = float(size[~index.key].min(initial=np.inf))
     mean = np.convolve(size, np.ones(ACTIVE_FRAMES), "same") / np.convolve(~index.key, np.ones(ACTIVE_FRAMES), "same")
     active = np.flatnonzero(mean > ACTIVE_RATIO * smallest)
-    if smallest > EMPTY_BYTES or not len(active):
+    # 100: maximum packet size of a frame that repeats the one before it (measured)
+    if smallest > 100 or not len(active):
         return None
     first, last = _with_margin(int(active[0]), int(active[-1]), count)
     before, after = keys[keys <= active[0]], keys[keys >= active[-1]]

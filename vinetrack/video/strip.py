@@ -28,7 +28,6 @@ from vinetrack.video.kymograph import BINS_PER_LEVEL, median
 # computed at a time.
 
 CUBIC_COEFFICIENT = np.float32(-0.75)  # Coefficient a of the bicubic kernel (Keys 1981) (defined)
-MIN_MEAN_RUN_PX = 16  # Mean length of runs of neighbours from which the compiled loops are used (measured)
 # Adding and subtracting it rounds a single-precision number to the nearest integer, ties to even (derived)
 ROUNDING_CONSTANT = np.float32(2**23)
 VECTOR = 16  # Pixels computed at a time (derived)
@@ -41,7 +40,8 @@ def warp_all(luma: NDArray[Any], matrix: NDArray[np.float64], n_rows: int, n_alo
     """
     out = np.empty((len(luma), n_rows, n_along), luma.dtype)
     fractions, runs = _grid(np.asarray(matrix, np.float32), n_rows, n_along)
-    if luma.dtype in (np.uint8, np.uint16) and len(runs) * MIN_MEAN_RUN_PX <= n_rows * n_along:
+    # 16: mean length of runs of neighbours from which the compiled loops are used (measured)
+    if luma.dtype in (np.uint8, np.uint16) and len(runs) * 16 <= n_rows * n_along:
         _interpolate(luma, fractions, runs, np.float32(np.iinfo(luma.dtype).max), out.reshape(len(luma), -1))
         return out
     import cv2
@@ -230,12 +230,9 @@ SHAKE_FLOOR_PX = 0.04  # Smaller shake is not removed (chosen)
 SHAKE_ROUNDS = 4  # Number of registration iterations, each from the result of the one before (chosen)
 SHAKE_STEP_PX = 1.5  # Maximum shift per iteration (chosen)
 SHAKE_CONVERGED_PX = 0.02  # Change of the shift below which the iteration has converged (chosen)
-WHOLE_PIXEL_TOLERANCE = 1e-6  # Distance of a position from a whole pixel that is due to rounding (derived)
 # Difference of the shifts measured in the two halves of the background, over their sum, below which the camera is taken
 # to have shaken
 HALF_DISAGREEMENT = 0.7
-
-FEWEST_MEDIANS = 1000  # Fewest pixels of a reference for which another thread is used (chosen)
 
 
 @dataclass(frozen=True)
@@ -353,8 +350,9 @@ def _reference_at_whole_pixels(
     height, width = luma.shape[1:]
     place = np.rint(axis.points(along[::stride].astype(float), across[::stride].astype(float))).astype(int)
     x, y = np.clip(place[:, 0], 1, width - 2), np.clip(place[:, 1], 1, height - 2)
+    # 1000: fewest pixels of a reference for which another thread is used (chosen)
     middle, left, right, above, below = np.concatenate(
-        in_parts(lambda first, last: _medians_about(luma, picks, x[first:last], y[first:last]), len(x), FEWEST_MEDIANS),
+        in_parts(lambda first, last: _medians_about(luma, picks, x[first:last], y[first:last]), len(x), 1000),
         axis=1,
     )
     right, below = (right - left) / 2, (below - above) / 2
@@ -424,7 +422,8 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floa
     along, across = axis.direction, axis.normal
     start = axis.points(reference.along_px, reference.across_px)
     rounded = np.rint(start)
-    if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - rounded).max() < WHOLE_PIXEL_TOLERANCE):
+    # 1e-6: distance of a position from a whole pixel that is due to rounding (derived)
+    if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - rounded).max() < 1e-6):
         x, y = (np.clip(rounded[:, i], 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
         return np.concatenate(
             in_parts(lambda first, last: _whole_pixels(luma[first:last], x, y), len(luma), FEWEST_PICTURES)

@@ -161,11 +161,8 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
 # A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out
 # as physics.
 
-WIDTH_TOLERANCE = 0.08  # Relative difference of width and diameter that is allowed beyond the stated error (measured)
-GROWTH_TOLERANCE = 0.06  # Relative excess of growth over length that is allowed (measured)
 EXPOSURE_TOLERANCE_PX = 3.0  # Difference of the blur lengths of stated and seen exposure that is allowed (measured)
 ERROR_FACTOR = 1.5  # Factor between picture and sheet above which the difference is an error (chosen)
-SIGMAS = 3.0  # Standard errors of the width that are allowed for
 # Difference of logarithms within which width and growth are off by the same factor (chosen)
 SAME_FACTOR_LOG = 0.1
 # Angle, in degrees, between growth and the picture's rows above which growth runs up or down (chosen)
@@ -227,8 +224,11 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     diameter_mm, length_mm = 1e3 * trial.diameter_m, 1e3 * trial.length_m
     width, growth = facts.tube_width_mm / diameter_mm, facts.growth_mm / length_mm
     sigma = math.hypot(facts.tube_width_sigma_mm / diameter_mm, float(np.nan_to_num(facts.scale_rel_sigma)))
-    width_off = abs(width - 1) > WIDTH_TOLERANCE + SIGMAS * sigma
-    growth_too_long = growth > 1 + GROWTH_TOLERANCE
+    # 0.08: relative difference of width and diameter that is allowed beyond the stated error (measured)
+    # 3.0: standard errors of the width that are allowed for
+    width_off = abs(width - 1) > 0.08 + 3.0 * sigma
+    # 0.06: relative excess of growth over length that is allowed (measured)
+    growth_too_long = growth > 1 + 0.06
     width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
     growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
     remedy = f"check it, its unit and the scale, {OR_SKIP_COMPARISON}"
@@ -370,7 +370,6 @@ def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
 
 
 SETTINGS = "experiment.yaml"
-LARGEST_WALKED_BYTES = 64_000_000  # Largest file without an index that is read to its end to count its frames (chosen)
 
 
 MOST_LOOKS = 12  # Most recordings that are tracked, a second or two each (chosen)
@@ -488,7 +487,8 @@ def _frames_present(recording: Recording) -> int | None:
             entries = stream.index_entries
             if stream.frames and len(entries) >= stream.frames:
                 return sum(entry.pos + entry.size <= size for entry in entries)
-            if size > LARGEST_WALKED_BYTES:
+            # 64_000_000: largest file without an index that is read to its end to count its frames (chosen)
+            if size > 64_000_000:
                 return None
             return sum(1 for packet in container.demux(stream) if packet.size)
     except (av.error.FFmpegError, AttributeError):

@@ -29,10 +29,7 @@ if TYPE_CHECKING:
 
 HALF_WINDOW_PX = 12  # Half the side of the window (derived)
 EDGE_SHARE = 0.42  # Part of a square over which its edges are followed from the corner (chosen)
-LARGEST_MOVE_PX = 2.5  # Largest distance of a refined corner from the detected one (chosen)
-FIRST_BLUR_PX = 1.1  # First value of the blur (chosen)
 
-BLURS_PX = (0.4, 8.0)  # Bounds of the blur (chosen)
 
 MOST_STEPS, SETTLED_PX = 20, 1e-4  # Most steps of the fit, and the step at which a corner has converged (chosen)
 
@@ -54,7 +51,8 @@ def refine_saddles(
         diagonal = np.einsum("nii->ni", normal)
         normal = normal + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(values.shape[1])
         trial = values + np.linalg.solve(normal, gradient)[:, :, 0]
-        trial[:, 4] = np.clip(trial[:, 4], *BLURS_PX)
+        # (0.4, 8.0): bounds of the blur (chosen)
+        trial[:, 4] = np.clip(trial[:, 4], *(0.4, 8.0))
         trial_model, trial_slopes = _model(trial, offsets)
         trial_cost = (weights * (levels - trial_model) ** 2).sum(axis=1)
         better = trial_cost < cost
@@ -66,7 +64,8 @@ def refine_saddles(
             break
     crossings = np.rint(corners_px) + values[:, :2]
     usable = (weights.sum(axis=1) > 30) & (np.abs(values[:, 6]) > 3)
-    return crossings, usable & (np.linalg.norm(crossings - corners_px, axis=1) < LARGEST_MOVE_PX)
+    # 2.5: largest distance of a refined corner from the detected one (chosen)
+    return crossings, usable & (np.linalg.norm(crossings - corners_px, axis=1) < 2.5)
 
 
 def _windows(
@@ -98,7 +97,8 @@ def _first_values(offsets: Floats, levels: Floats, weights: Floats, steps_px: Fl
     values = np.zeros((n, 9))
     # The normal of an edge is a quarter turn from the step along it.
     values[:, 2:4] = np.arctan2(steps_px[:, :, 0], -steps_px[:, :, 1])
-    values[:, 4] = FIRST_BLUR_PX
+    # 1.1: first value of the blur (chosen)
+    values[:, 4] = 1.1
     total = weights.sum(axis=1).clip(1)
     values[:, 5] = (levels * weights).sum(axis=1) / total
     sides = np.sign(_distances(values, offsets)).prod(axis=2)
@@ -415,10 +415,7 @@ def _no_checkerboard(grey: Grey, across: int, down: int) -> str:
 #
 # Sizes in millimetres cannot be seen; the ratio of a marker to its square can.
 
-FEWEST_MARKERS = 6  # Fewest markers that distinguish a board from chance (chosen)
-LEAST_AGREEMENT = 0.8  # Least share of the markers that must lie where a board has them (chosen)
 MOST_SQUARES = 40  # Most squares along a side (chosen)
-HIDDEN_MARKERS = 2  # Markers at the end of a board that may be hidden (chosen)
 
 
 @dataclass(frozen=True)
@@ -437,7 +434,8 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     grey = eight_bits(picture)
     seen = [(*markers_seen(grey, _largest(family)), family) for family in OTHER_DICTIONARIES]
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
-    if len(ids) >= FEWEST_MARKERS:
+    # 6: fewest markers that distinguish a board from chance (chosen)
+    if len(ids) >= 6:
         board = _charuco(corners, ids, family)
         if board is not None:
             return board
@@ -455,14 +453,16 @@ def _charuco(corners: Any, ids: NDArray[np.int32], family: str) -> BoardSeen | N
         if share > best_share:
             dictionary = _smallest(family, squares[0] * squares[1] // 2)
             best_share, best_board = share, BoardSeen("charuco", squares, dictionary, marker, len(ids))
-    return best_board if best_share >= LEAST_AGREEMENT else None
+    # 0.8: least share of the markers that must lie where a board has them (chosen)
+    return best_board if best_share >= 0.8 else None
 
 
 def _layouts(n_markers: int) -> Iterator[tuple[int, int]]:
     """Squares across and down of the boards with this many markers, or a few more."""
     for across in range(2, MOST_SQUARES + 1):
         for down in range(2, MOST_SQUARES + 1):
-            if n_markers <= across * down // 2 <= n_markers + HIDDEN_MARKERS:
+            # 2: markers at the end of a board that may be hidden (chosen)
+            if n_markers <= across * down // 2 <= n_markers + 2:
                 yield across, down
 
 

@@ -60,7 +60,6 @@ MOST_RECUTS = 3  # Most times that the strip is cut anew: what lay outside the f
 # Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows or columns
 # (chosen)
 FIRST_SLOPE = 0.08
-OFF_CENTRE_PX = 0.8  # Tilt of the axis over its length, or shift, that is left uncorrected (chosen)
 
 
 def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tuple[Strip, Outline] | None:
@@ -98,7 +97,8 @@ def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
         return cut_along(luma, curve, half * 1.15 + 5, strip)
     tilt = slope * strip.axis.length_px
     middle = shift + tilt / 2
-    if abs(middle) + abs(tilt) / 2 < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
+    # 0.8: tilt of the axis over its length, or shift, that is left uncorrected (chosen)
+    if abs(middle) + abs(tilt) / 2 < 0.8 and 0 <= room < 0.3 * half + 6:
         return strip
     start = strip.axis.points(np.array(0.0), shift)
     stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
@@ -109,12 +109,8 @@ def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
 # ------------------------------------------------------------------------------
 # Follow what moves along an axis, by frame: the edge of a tube, a body, or else the arrival of whatever comes.
 
-DISAGREEMENT_PX = 1.0  # Disagreement of bands above which some band follows something other than the edge (chosen)
-LARGEST_AMPLITUDE = 1.5  # Amplitude (relative contrast) above which something adds to the edge (chosen)
 # A frame whose misfit is this many times the median one, taken as at least LEAST_MISFIT, is doubtful (chosen)
 MISFIT_RATIO, LEAST_MISFIT = 6.0, 0.3
-# A point with a larger standard error, and one this many times the median, is doubtful (chosen)
-UNCERTAIN_PX, UNCERTAIN_RATIO = 1.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -197,10 +193,13 @@ def _unsure(fit: EdgeFit) -> Bools:
     from vinetrack.video.edge_repair import LEAST_AMPLITUDE
 
     median_misfit = float(np.nanmedian(fit.misfit))
-    poor = (fit.amplitude < LEAST_AMPLITUDE) | (fit.amplitude > LARGEST_AMPLITUDE)
+    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
+    poor = (fit.amplitude < LEAST_AMPLITUDE) | (fit.amplitude > 1.5)
     poor = poor | (fit.misfit > MISFIT_RATIO * max(median_misfit, LEAST_MISFIT))
-    poor |= (fit.extra_sigma_px > DISAGREEMENT_PX) | fit.hidden
-    uncertain = fit.sigma_px > np.maximum(UNCERTAIN_PX, UNCERTAIN_RATIO * np.nanmedian(fit.sigma_px))
+    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
+    poor |= (fit.extra_sigma_px > 1.0) | fit.hidden
+    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
+    uncertain = fit.sigma_px > np.maximum(1.0, 5.0 * np.nanmedian(fit.sigma_px))
     return np.asarray(poor | uncertain)
 
 
@@ -212,7 +211,6 @@ def _unsure(fit: EdgeFit) -> Bools:
 # such a frame (`corrections.csv`).
 
 LONGEST_HOLE = 1  # Most frames missing in a row that the tracker bridges (measured)
-MOST_DROPPED = 3  # Most frames missing in a row that a recorder may have dropped from an undamaged recording (chosen)
 LEAST_PART = 0.5  # Least part of the frames that must follow each other without damage (measured)
 
 
@@ -226,7 +224,8 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
     if allowed.all():
         span = max(span, (frames.recording.declared_frames or 0) - len(frames.slots_before) - len(frames.slots_after))
     complete = span < allowed.sum() / LEAST_PART
-    if complete and not damaged.any() and np.max(np.diff(frames.slot[allowed]), initial=1) <= MOST_DROPPED + 1:
+    # 3: most frames missing in a row that a recorder may have dropped from an undamaged recording (chosen)
+    if complete and not damaged.any() and np.max(np.diff(frames.slot[allowed]), initial=1) <= 3 + 1:
         return allowed
     sound = np.flatnonzero(allowed & ~damaged)
     breaks = np.flatnonzero(np.diff(frames.slot[sound]) > LONGEST_HOLE + 1) + 1
@@ -247,7 +246,6 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
 FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)
 
 GIVEN_AXIS_MARGIN = 0.08  # Width added to a given axis, as a fraction of its length (derived)
-MOVING_PX = 0.3  # Step of a frame from which the frame counts for the roughness of the track (chosen)
 # Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing moves
 # (chosen)
 MOSTLY_LOST = 0.5
@@ -393,7 +391,8 @@ def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Float
     larger one counts.
     """
     edge_px = followed.edge_px
-    moving = np.gradient(edge_px) > MOVING_PX if len(edge_px) > 1 else np.ones(len(edge_px), bool)
+    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
+    moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
     largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
     random_px = calibrated_sigma(edge_px, followed.sigma_px, moving & np.isfinite(edge_px), largest=largest)
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))

@@ -16,8 +16,6 @@ CRF = 26  # Quality of the encoder (chosen)
 # Option of libx264 without which the same pictures are encoded to different bytes (measured)
 REPRODUCIBLE = {"mbtree": "0"}
 
-BT709 = 1  # Code of ITU-R BT.709 in the stream (defined)
-
 
 def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float, crf: int = CRF) -> int:
     """Write RGB pictures of shape (height, width, 3), all of one size and with even sides; the whole clip
@@ -63,5 +61,6 @@ def _stream(container: Any, width: int, height: int, play_fps: float, crf: int) 
     stream.codec_context.thread_count = 1
     stream.options = {"preset": "faster", "crf": str(crf), "profile": "high", "tune": "animation", **REPRODUCIBLE}
     context = stream.codec_context
-    context.colorspace = context.color_primaries = context.color_trc = BT709
+    # 1: code of ITU-R BT.709 in the stream (defined)
+    context.colorspace = context.color_primaries = context.color_trc = 1
     return stream
