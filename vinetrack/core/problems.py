@@ -12,7 +12,6 @@ from typing import Any
 
 CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
 
-MAX_QUOTED_LENGTH = 60  # Longest quotation of a value in a message (chosen)
 
 # Reason given for a trial or stage that an unexpected exception stopped
 INTERNAL_ERROR = "an internal error of the program; the traceback is in the log of this stage"
@@ -122,7 +121,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def _shorten(text: str) -> str:
-    return text if len(text) <= MAX_QUOTED_LENGTH else text[: MAX_QUOTED_LENGTH - 1] + "…"
+    max_quoted_length = 60  # Longest quotation of a value in a message (chosen)
+    return text if len(text) <= max_quoted_length else text[: max_quoted_length - 1] + "…"
 
 
 def _one_line(text: str) -> str:

@@ -34,8 +34,6 @@ GAS_CONSTANT_AIR_J_KG_K = 287.0  # Derived: 8.314 J/(mol·K) over 0.02896 kg/mol
 #
 # Used by terminal, report, figures and explorer alike.
 
-_FIXED_EXPONENTS = (-4, 6)  # Decimal exponents written without "e" (convention)
-
 
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -53,12 +51,13 @@ def or_nan(value: Any) -> float:
 
 def number(value: float | None, digits: int = 3) -> str:
     """Return `value` to `digits` significant digits, without exponent from 0.0001 to 999999; "–" for None and NaN."""
+    fixed_exponents = (-4, 6)  # Decimal exponents written without "e" (convention)
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
         return "0"
     exponent = math.floor(math.log10(abs(value)))
-    if not _FIXED_EXPONENTS[0] <= exponent < _FIXED_EXPONENTS[1]:
+    if not fixed_exponents[0] <= exponent < fixed_exponents[1]:
         return f"{value:.{digits - 1}e}"
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
 

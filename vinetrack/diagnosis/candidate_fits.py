@@ -63,12 +63,9 @@ from vinetrack.inference.solving import SLOW_NOISE, as_recorded
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]  # Effects to add, and parameter values to start from
 
-SUBSET_SPREADS = (0.01, 0.03)  # Between-trial standard deviations of pressure and ln B in a subset fit (chosen)
 
 # Iterations of a subset fit from each start, and of the best one each further time (chosen)
 SUBSET_FIRST_ITERATIONS, SUBSET_FURTHER_ITERATIONS = 4, 10
-
-MAX_SUBSET_TRIALS = 14  # Trials of a subset fit: one of every condition, at most this many (chosen)
 
 
 # Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
@@ -127,12 +124,13 @@ class SubsetFitter:
         search: bool = False,
     ) -> SubsetFit | None:
         """Fit the model with these effects added; None where the fit fails."""
+        subset_spreads = (0.01, 0.03)  # Between-trial standard deviations of pressure and ln B in a subset fit (chosen)
         model = self.fit.model.with_effects(effects).with_values({**self.fit.model.values, **start})
         layout = make_layout(model, self.data, fixed=self._fixed(model.parameter_names), shared={})
         predictor = Predictor(layout, self.data, self.fit.predictor.host)
         trial_effects = self.fit.solution.state.trial_effects[self.chosen].copy()
         trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-        fixed = FixedTerms(spread=SUBSET_SPREADS, correlation=self.correlation)
+        fixed = FixedTerms(spread=subset_spreads, correlation=self.correlation)
         try:
             theta = layout.start
             if align_first:
@@ -143,7 +141,7 @@ class SubsetFitter:
             part = marginal(solution.cross_products, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
-        level = deviance(part, solution.problem, solution.state, SUBSET_SPREADS, restricted=False)
+        level = deviance(part, solution.problem, solution.state, subset_spreads, restricted=False)
         if not math.isfinite(level):
             return None
         values, yields_Pa = _values(layout, solution.state.theta)
@@ -177,11 +175,12 @@ def _subset(data: Sequence[FitTrial]) -> list[int]:
     """Indices of one trial of every condition, that with the most points; evenly thinned where there are too many.
     Every vine keeps at least one trial.
     """
+    max_subset_trials = 14  # Trials of a subset fit: one of every condition, at most this many (chosen)
     candidates = one_trial_per_condition(data)
-    if len(candidates) <= MAX_SUBSET_TRIALS:
+    if len(candidates) <= max_subset_trials:
         return candidates
     vines = {data[i].trial.vine for i in candidates}
-    evenly = np.unique(np.linspace(0, len(candidates) - 1, MAX_SUBSET_TRIALS).round().astype(int))
+    evenly = np.unique(np.linspace(0, len(candidates) - 1, max_subset_trials).round().astype(int))
     chosen = [candidates[k] for k in evenly]
     missing = vines - {data[i].trial.vine for i in chosen}
     return sorted({*chosen, *(next(i for i in candidates if data[i].trial.vine == vine) for vine in missing)})

@@ -32,7 +32,6 @@ RANGE_SHARE_BESIDE_SLIP = 0.5
 
 # Columns that only a tube has, and what an effect that needs them acts on
 COLUMN_BLANK, COLUMNS_PARTLY_BLANK = "column_blank", "columns_partly_blank"  # Codes of reasons
-TUBE_ONLY_COLUMNS = ("chamber_l", "inlet_mm", "yield_pressure_kPa")
 
 
 @dataclass(frozen=True)
@@ -64,11 +63,12 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
     """Candidates that these trials can test, and for the others the reason why not. Returns testable, reasons (why each
     of the others cannot be tested, by name).
     """
+    tube_only_columns = ("chamber_l", "inlet_mm", "yield_pressure_kPa")
     can_act: list[Effect] = []
     reasons: dict[str, Remark] = {}
     no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
     for effect in candidates:
-        if no_tube and (absent := [column for column in effect.needs if column in TUBE_ONLY_COLUMNS]):
+        if no_tube and (absent := [column for column in effect.needs if column in tube_only_columns]):
             reasons[effect.name] = remark("no_tube", column=absent[0])
             continue
         if effect.in_trace and all(trial_data.trace is not None for trial_data in data):
@@ -197,11 +197,6 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
 # products, from which score tests, cosines and expected gains follow by linear algebra.
 
 
-# Part of its travel by which a trajectory must change to count as responding, four times the integrator's error
-# (measured)
-LEAST_DETECTABLE_RESPONSE = 3e-6
-
-
 @dataclass(frozen=True)
 class EffectSensitivities:
     """Columns of shape (n_points, n_shapes) for every trial, in the order of `shapes`, per unit of each size. `silent`
@@ -253,13 +248,16 @@ def _sensitivity(
     fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]
 ) -> tuple[CandidateShape, list[Floats]] | None:
     """Change of all positions per unit of size, and the shape with the step used; None without a response."""
+    # Part of its travel by which a trajectory must change to count as responding, four times the integrator's
+    # error (measured)
+    least_detectable_response = 3e-6
     try:
         change = _change(fit, shape, baseline)
         response = _response(fit, change)
         if shape.whole:
-            usable = response > LEAST_DETECTABLE_RESPONSE and not _prevents_growth(baseline, change)
+            usable = response > least_detectable_response and not _prevents_growth(baseline, change)
             return (shape, [moved / shape.step for moved in change]) if usable else None
-        if response <= LEAST_DETECTABLE_RESPONSE * 1e-3:
+        if response <= least_detectable_response * 1e-3:
             return None
         # 2e-3, 2e-2, 2e-4: A finite-difference step should move a trajectory by the first of these parts of
         # its travel (derived)
@@ -272,7 +270,7 @@ def _sensitivity(
             response = _response(fit, change)
     except SimulationError:
         return None
-    return (shape, [moved / shape.step for moved in change]) if response > LEAST_DETECTABLE_RESPONSE else None
+    return (shape, [moved / shape.step for moved in change]) if response > least_detectable_response else None
 
 
 def _prevents_growth(baseline: Sequence[Trajectory], change: Sequence[Floats]) -> bool:

@@ -288,7 +288,6 @@ class ConstancyTest:
 # trials is the same in both halves and cancels in their difference. An effect that builds up along the growth shows
 # here even where n and the yield pressure absorb it in every comparison between trials.
 
-STEP = 1e-3  # Relative step of a finite difference (derived)
 
 DRIFT_ALONG_LEAST_SCATTER = 2e-3  # Lower limit of the standard deviation of the rise of ln B in single trials (chosen)
 
@@ -345,12 +344,13 @@ def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> _Halves:
 
 def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
     """Derivative of the tail's acceleration by ln B in each half of the growth, m/s², shape (n_times, 2)."""
+    step = 1e-3  # Relative step of a finite difference (derived)
     value = motion.model.values[DAMPING]
     assert isinstance(value, float)
-    increased = motion.model.with_values({DAMPING: value * math.exp(STEP)})
+    increased = motion.model.with_values({DAMPING: value * math.exp(step)})
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
     changed = evaluate(increased, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
-    push = (changed - motion.model_acceleration) / STEP
+    push = (changed - motion.model_acceleration) / step
     return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
 
 

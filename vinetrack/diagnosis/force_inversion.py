@@ -353,9 +353,6 @@ def _responses(motions: Sequence[FittedMotion], acceleration: Floats) -> tuple[F
 INDEPENDENT_POINTS_PER_TRIAL = 10.0  # Effective number of independent residuals in one trial (chosen)
 
 
-# Part of the largest information below which a force amplitude is not estimable (chosen)
-LEAST_RELATIVE_INFORMATION = 1e-9
-
 PARAMETER_CUTOFF = 1e-11  # Relative eigenvalue below which a combination of model parameters is not estimable (derived)
 
 # Penalties on second differences among which generalised cross-validation chooses, relative to the mean information
@@ -542,12 +539,14 @@ class LinearInversion:
         """The force whose amplitudes are in `columns`, from the equations with all other unknowns eliminated. Its
         standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
         """
+        # Part of the largest information below which a force amplitude is not estimable (chosen)
+        least_relative_information = 1e-9
         information, score = reduced[columns, columns], reduced[columns, -1]
         size = np.diag(information)
-        estimable = size > LEAST_RELATIVE_INFORMATION * max(float(size.max()), 1e-300)
+        estimable = size > least_relative_information * max(float(size.max()), 1e-300)
         if not estimable.any():
             return ForceEstimate(0.0, np.zeros(score.size), math.inf, np.zeros(parameter_response.shape[0]), 0)
-        covariance = scaled_pseudo_inverse(information, LEAST_RELATIVE_INFORMATION, estimable)
+        covariance = scaled_pseudo_inverse(information, least_relative_information, estimable)
         amplitude = covariance @ score
         shift = parameter_response[:, -1] - parameter_response[:, columns] @ amplitude
         scores = self._scores_by_trial(products, parameter_response[:, columns], columns, amplitude, shift)

@@ -42,10 +42,6 @@ PATCH_CENTRES, PATCH_WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
 EDGE_FRACTION = 0.1  # Part of a patch's width over which the force rises at each end (chosen)
 
 
-# Positions and speeds in the grid above which a force may set in (chosen)
-N_THRESHOLD_POSITIONS, N_THRESHOLD_SPEEDS = 8, 8
-
-
 @dataclass(frozen=True)
 class Law:
     """One form of force along a motion. `kind` names it; `low` and `high` are the ends of a patch (m of growth),
@@ -181,13 +177,15 @@ class _Range:
 
 def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     """The grid of all laws; where vines differ in width, also each in proportion to the cross-section."""
+    # Positions and speeds in the grid above which a force may set in (chosen)
+    n_threshold_positions, n_threshold_speeds = 8, 8
     visited = _visited_range(motions)
     plain = ["constant", "position", "speed", "speed_squared", "pressure", "time", "position_squared", "speed_cubed"]
     laws = [Law(kind) for kind in plain]
-    for k in range(N_THRESHOLD_POSITIONS):
-        laws.append(Law("beyond_a_place", n_shapes=1, scale=(k + 0.5) / N_THRESHOLD_POSITIONS * visited.growth_m))
-    for k in range(N_THRESHOLD_SPEEDS):
-        threshold_m_s = (k + 0.5) / N_THRESHOLD_SPEEDS * visited.speed_m_s
+    for k in range(n_threshold_positions):
+        laws.append(Law("beyond_a_place", n_shapes=1, scale=(k + 0.5) / n_threshold_positions * visited.growth_m))
+    for k in range(n_threshold_speeds):
+        threshold_m_s = (k + 0.5) / n_threshold_speeds * visited.speed_m_s
         laws += [Law(kind, n_shapes=1, scale=threshold_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
     # 0.05: part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest (chosen)
     laws.append(Law("inverse_speed", scale=0.05 * visited.speed_m_s))
@@ -288,9 +286,6 @@ def _visited_range(motions: Sequence[FittedMotion]) -> _Range:
 
 MAX_STEPS, MOTION_CORRECTIONS = 12, 2  # Most Gauss-Newton steps, and corrections of the motions at each (chosen)
 
-# The first steps are undamped Gauss-Newton steps, taken even where the cost rises (chosen)
-UNDAMPED_STEPS, STEPS_WITH_SHAPE_HELD = 5, 2
-
 
 # Damping factors of Levenberg and Marquardt, for steps that must lower the cost (chosen)
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
@@ -387,8 +382,10 @@ def _gauss_newton(
     fit: Fit, inversion: LinearInversion, start: SearchPoint, damping: float
 ) -> tuple[SearchPoint, NormalEquations] | None:
     """The point of least cost on the way from `start`; without damping the first steps may raise the cost."""
+    # The first steps are undamped Gauss-Newton steps, taken even where the cost rises (chosen)
+    undamped_steps, steps_with_shape_held = 5, 2
     best: tuple[SearchPoint, NormalEquations] | None = None
-    point, undamped = start, 0 if damping else UNDAMPED_STEPS
+    point, undamped = start, 0 if damping else undamped_steps
     for iteration in range(MAX_STEPS):
         try:
             with np.errstate(all="raise", under="ignore"):
@@ -400,7 +397,7 @@ def _gauss_newton(
         if best is None or normal.cost < best[1].cost:
             best = point, normal
         if iteration < undamped:
-            point = _step(inversion, point, normal, 0.0, shape_free=iteration >= STEPS_WITH_SHAPE_HELD)
+            point = _step(inversion, point, normal, 0.0, shape_free=iteration >= steps_with_shape_held)
             continue
         if undamped and best[1].cost > UNDAMPED_SUCCESS * inversion.chi2_without_force:
             break
@@ -410,7 +407,7 @@ def _gauss_newton(
                 break
         elif before is not None and iteration > undamped:
             damping = max(5 * damping, LEAST_DAMPING)
-        point = _step(inversion, *best, damping, shape_free=iteration >= STEPS_WITH_SHAPE_HELD)
+        point = _step(inversion, *best, damping, shape_free=iteration >= steps_with_shape_held)
     return best
 
 

@@ -48,9 +48,6 @@ KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4  # Relative variances below which 
 ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
 
 
-PRESSURE_MARGIN = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
-
-
 def standard_error(basis: Floats, covariance: Floats) -> Floats:
     """Standard error of a linear combination of coefficients, for each row of a basis. Shapes: basis (n, n_splines);
     covariance (n_splines, n_splines) → (n,).
@@ -237,6 +234,7 @@ class SmoothForce:
 
 def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
     """Every variable alone, then every pair, over the ranges that the motions visit."""
+    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
     ranges: dict[str, tuple[float, float, float]] = {}
     for name, attribute in VARIABLES.items():
         by_trial = [
@@ -248,7 +246,7 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
         # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
         if high - low > 0.02 * abs(high):
             if name == "pressure":
-                low, high = (1 - PRESSURE_MARGIN) * low, (1 + PRESSURE_MARGIN) * high
+                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
             typical = float(np.median([np.median(values) for values in by_trial]))
             # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
             ranges[name] = low, high, typical if name in ("speed", "time") else math.inf

@@ -206,9 +206,6 @@ def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:
     return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))
 
 
-PAIRS_PER_STEP = (1, 2)  # Pairs of one condition that are added at a time; the best gain a pair counts (chosen)
-
-
 # What further trials need, in order of effort
 EFFORT_WORDS = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
 
@@ -290,18 +287,19 @@ class _Search(DesignInformation):
 
     def _design(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
         """Pairs added one by one up to the wanted information, exchanged, and removed where not needed."""
+        pairs_per_step = (1, 2)  # Pairs of one condition that are added at a time; the best gain a pair counts (chosen)
         chosen: list[int] = []
         information = self.information(())
         while information < wanted and len(chosen) < most:
             total = self.total(chosen)
             gains = [
                 (self.first_information(total + count * self.each[allowed]) - information) / count
-                for count in PAIRS_PER_STEP
+                for count in pairs_per_step
             ]
-            step, index = np.unravel_index(int(np.argmax(gains)), (len(PAIRS_PER_STEP), allowed.size))
+            step, index = np.unravel_index(int(np.argmax(gains)), (len(pairs_per_step), allowed.size))
             if not gains[step][index] > 0:
                 break
-            chosen += [int(allowed[index])] * min(PAIRS_PER_STEP[step], most - len(chosen))
+            chosen += [int(allowed[index])] * min(pairs_per_step[step], most - len(chosen))
             information = self.information(chosen)
         chosen = self.exchanged(chosen, allowed, self.first_information)
         while len(chosen) > 1:

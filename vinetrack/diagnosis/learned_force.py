@@ -55,14 +55,10 @@ if TYPE_CHECKING:
 # A force that is zero where growth begins, one that is constant there and one that is free there are compared by
 # their marginal likelihoods; `force_surface` explains why the first is drawn unless the tracks contradict it.
 
-# Information, where each unknown alone has 1, below which a combination of unknowns is not estimable (derived)
-LEAST_INFORMATION = 1e-8
 
 # Log-likelihood below that of the best hyperparameters at which a set of them is left out of the mean and the band
 # (chosen)
 NEGLIGIBLE_LOG_RATIO = 5.0
-
-GRID_POINTS = 30  # Points over a variable at which the standard error of a force is evaluated (chosen)
 
 
 @dataclass(frozen=True)
@@ -152,13 +148,14 @@ class VariableChoice:
         """Standard error of a force that is free where growth begins, N: its median over the other variable. B, n and
         P_y compete with such a force.
         """
+        grid_points = 30  # Points over a variable at which the standard error of a force is evaluated (chosen)
         free = [each for each in self.posteriors if each.at_start == FREE_AT_START]
         if not free or self.domain.start_axis < 0:
             return 0.0
         grid = [
-            np.linspace(low, high, GRID_POINTS) for low, high in zip(self.domain.low, self.domain.high, strict=True)
+            np.linspace(low, high, grid_points) for low, high in zip(self.domain.low, self.domain.high, strict=True)
         ]
-        grid[self.domain.start_axis] = np.full(GRID_POINTS, self.domain.low[self.domain.start_axis])
+        grid[self.domain.start_axis] = np.full(grid_points, self.domain.low[self.domain.start_axis])
         return float(np.median(free[0].force(grid)[1]))
 
     def with_start(self, at_start: str) -> SmoothForce:
@@ -172,6 +169,9 @@ class VariableChoice:
 
 def coefficient_likelihood(point: SearchPoint, normal: NormalEquations) -> CoefficientLikelihood:
     """Integrate out all unknowns but the force coefficients, after scaling each unknown to unit information."""
+    # Information, where each unknown alone has 1, below which a combination of unknowns is not estimable
+    # (derived)
+    least_information = 1e-8
     p, q = point.theta.size, point.amplitude.size
     size = np.diag(normal.matrix)
     unit = np.where(size > 0, 1 / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
@@ -180,12 +180,12 @@ def coefficient_likelihood(point: SearchPoint, normal: NormalEquations) -> Coeff
     nuisance = np.concatenate([np.arange(p), np.arange(p + q, score.size)])
     nuisance = nuisance[size[nuisance] > 0]
     values, vectors = np.linalg.eigh(matrix[np.ix_(nuisance, nuisance)])
-    estimable = values > LEAST_INFORMATION
+    estimable = values > least_information
     root = vectors[:, estimable] / np.sqrt(values[estimable])
     cross, nuisance_score = root.T @ matrix[np.ix_(nuisance, force)], root.T @ score[nuisance]
     strength, directions = np.linalg.eigh(matrix[np.ix_(force, force)] - cross.T @ cross)
     # Directions that the nuisance parameters reproduce have information only from rounding.
-    directions, strength = directions[:, strength > LEAST_INFORMATION], strength[strength > LEAST_INFORMATION]
+    directions, strength = directions[:, strength > least_information], strength[strength > least_information]
     scale = np.where(unit[force] > 0, 1 / np.where(unit[force] > 0, unit[force], 1.0), 0.0)
     back = scale[:, None] * directions
     local_score = directions.T @ (score[force] - cross.T @ nuisance_score)
@@ -430,12 +430,6 @@ LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is es
 CHOICES_REFINED = {1: 1, 2: 3}  # Choices of one variable and of two for which the nonlinear problem is solved (chosen)
 
 
-HYPERPARAMETER_UPDATES = 2  # Rounds of optimising the force and then its amplitude and length scales (chosen)
-
-
-PLOT_POINTS, VISITED_DISTANCE = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
-
-
 @dataclass(frozen=True)
 class LearnedForce:
     """The missing force over the variables that it most likely depends on. `best` is the posterior of the force;
@@ -659,12 +653,13 @@ def _refined(
     """The nonlinear fit of a force over given variables, alternating between the force and its hyperparameters. The
     force is constrained to be constant at the start of growth, and freed in a last round if that is more likely.
     """
+    hyperparameter_updates = 2  # Rounds of optimising the force and then its amplitude and length scales (chosen)
     solution: tuple[SearchPoint, CoefficientLikelihood] | None = None
     every_spline = SmoothForce(choice.domain, np.eye(choice.domain.size))
-    for update in range(HYPERPARAMETER_UPDATES + 1):
+    for update in range(hyperparameter_updates + 1):
         likely = choice.best()
-        surface = choice.with_start(CONSTANT_AT_START) if update < HYPERPARAMETER_UPDATES else likely.surface
-        if update == HYPERPARAMETER_UPDATES and likely.at_start != FREE_AT_START:
+        surface = choice.with_start(CONSTANT_AT_START) if update < hyperparameter_updates else likely.surface
+        if update == hyperparameter_updates and likely.at_start != FREE_AT_START:
             break
         # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
         surface = replace(surface, sd_N=surface.sd_N / math.sqrt(inflation))
@@ -687,9 +682,10 @@ def _table(best: ForcePosterior, motions: Sequence[FittedMotion]) -> pd.DataFram
     """The force on a grid, with the trials that visited each point, and along the first trial of each condition."""
     import pandas as pd
 
+    plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
     domain = best.domain
     axes = [
-        np.linspace(low, high, PLOT_POINTS[len(domain.variables) - 1])
+        np.linspace(low, high, plot_points[len(domain.variables) - 1])
         for low, high in zip(domain.low, domain.high, strict=True)
     ]
     grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
@@ -699,7 +695,7 @@ def _table(best: ForcePosterior, motions: Sequence[FittedMotion]) -> pd.DataFram
         near &= motion.time_s <= motion.counts_until_s
         visited = domain.normalised(domain.values_along(motion))
         for at, along in zip(domain.normalised(grid), visited, strict=True):
-            near &= np.abs(at[:, None] - along) < VISITED_DISTANCE
+            near &= np.abs(at[:, None] - along) < visited_distance
         trials += near.any(axis=1)
     parts = [_rows(best, grid, trials, "")]
     drawn: set[str] = set()
@@ -707,7 +703,7 @@ def _table(best: ForcePosterior, motions: Sequence[FittedMotion]) -> pd.DataFram
         if motion.trial.condition not in drawn:
             drawn.add(motion.trial.condition)
             last = int(np.count_nonzero(motion.time_s <= motion.counts_until_s)) - 1
-            points = np.linspace(0, last, PLOT_POINTS[0]).astype(int)
+            points = np.linspace(0, last, plot_points[0]).astype(int)
             values = [along[points] for along in domain.values_along(motion)]
             parts.append(_rows(best, values, np.ones(points.size), motion.trial.condition))
     return pd.concat(parts, ignore_index=True)

@@ -55,10 +55,6 @@ from vinetrack.inference.whitening import at_correlation
 # there: the Asimov data set of Cowan, Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011.
 
 
-# Ratio of an expected score to that of linear theory from which neither is used, as below 0 (chosen)
-MAX_SCORE_RATIO = 2.0
-
-
 @dataclass(frozen=True)
 class NoiselessStart:
     """Trajectories of a fit with the deviations of its trials set to zero, where every fit without an effect starts.
@@ -94,18 +90,20 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Noise
     seven units, above any threshold, agrees with linear theory, no other size is computed. Returns sizes, ratios. Shape
     (n_sizes,).
     """
+    # Ratio of an expected score to that of linear theory from which neither is used, as below 0 (chosen)
+    max_score_ratio = 2.0
     large = score_ratio(tests, shape_index, 7 * unit, start)
     # 0.02: relative deviation of an expected score from linear theory that is neglected (chosen)
     if 0 < abs(large - 1) < 0.02:
         return np.array([7 * unit]), np.array([large])
     multiples, ratios = [4.0, 7.0], [score_ratio(tests, shape_index, 4 * unit, start), large]
-    if not all(0 < ratio < MAX_SCORE_RATIO for ratio in ratios):
+    if not all(0 < ratio < max_score_ratio for ratio in ratios):
         return unit * np.array(multiples), np.ones(2)
     # 7.0: expected score from which no larger size is tried (chosen)
     # 56.0: multiple of the size of one standard error beyond which no size is tried (chosen)
     while ratios[-1] * multiples[-1] < 7.0 and multiples[-1] < 56.0:
         ratio = score_ratio(tests, shape_index, 2 * multiples[-1] * unit, start)
-        if ratio == 1 or not 0 < ratio < MAX_SCORE_RATIO:
+        if ratio == 1 or not 0 < ratio < max_score_ratio:
             break
         multiples.append(2 * multiples[-1])
         ratios.append(ratio)

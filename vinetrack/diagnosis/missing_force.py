@@ -243,7 +243,6 @@ LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi
 # Splines of a force that depends on one variable alone, the same in all trials
 SPLINES_OF_VARIABLE = {"growth": 24, "speed": 10, "time": 10}
 
-N_BINS = 10  # Bins along each axis in which the mean over all conditions is taken (chosen)
 
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
 
@@ -391,9 +390,10 @@ def _binned_means(part: pd.DataFrame) -> pd.DataFrame:
     """Weighted means over all conditions in bins of an axis; errors at least as large as conditions differ."""
     import pandas as pd
 
+    n_bins = 10  # Bins along each axis in which the mean over all conditions is taken (chosen)
     values = part["value"].to_numpy(float)
-    edges = np.linspace(values.min(), values.max(), N_BINS + 1)
-    bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, N_BINS - 1)
+    edges = np.linspace(values.min(), values.max(), n_bins + 1)
+    bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, n_bins - 1)
     rows = []
     for k in np.unique(bin_of):
         inside = part[bin_of == k]

@@ -48,7 +48,6 @@ from vinetrack.planning.simulated_campaigns import DesignProblem, mean_separatio
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
 
-LEAST_SEPARATION = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
 
 # Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended (chosen)
 SUFFICIENT_SEPARATION = 8.0
@@ -270,11 +269,12 @@ def _recommended(options: Sequence[_Option]) -> _Option:
 
 
 def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int) -> NextExperiment:
+    least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
     best = _recommended(options)
     best = _Option(best.design, np.concatenate([best.rises, simulated_rises(bench, best.design, [1], seed)]))
     names = [hypothesis.name for hypothesis in bench.hypotheses]
     expected_sigma = _by_pair(best.separations)
-    worth_it = max(expected_sigma.values()) >= LEAST_SEPARATION
+    worth_it = max(expected_sigma.values()) >= least_separation
     # 20.0: separation, in standard deviations, beyond which the check takes one draw less (chosen)
     draws = max(CHECK_DRAWS.get(len(names), 1) - (min(expected_sigma.values()) > 20.0), 1)
     simulated = {}
@@ -283,7 +283,7 @@ def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int)
     unresolved = [
         pair
         for pair, sigma in expected_sigma.items()
-        if min(sigma, simulated.get(pair, (sigma,))[0]) < LEAST_SEPARATION
+        if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
     ]
     worth_it = worth_it and len(unresolved) < len(expected_sigma)
     fits = [hypothesis.fit for hypothesis in bench.hypotheses]
@@ -304,7 +304,7 @@ def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int)
             simulated=simulated_by_name,
             unresolved=[_pair_name(names, pair) for pair in unresolved],
             measurement=measurement,
-            least_sigma=LEAST_SEPARATION,
+            least_sigma=least_separation,
         ),
         trials=trials if worth_it else (),
         separation_sigma=sigmas,

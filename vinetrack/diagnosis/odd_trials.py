@@ -32,8 +32,6 @@ from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 
 Indices = NDArray[np.int_]
 
-USUAL_EXPONENT = 0.37  # Starting value of the exponent (PHYSICS)
-
 
 LEAST_SCATTER = 0.02  # Lower limit of the scatter of ln F: the scatter of careful trials (chosen)
 
@@ -136,17 +134,18 @@ def _fit_curves(log_force: Floats, log_speed: Floats, vine_index: Indices) -> Ca
     """Fit ln F against ln v robustly (Cauchy loss): a level for each vine, a slope and a curvature common to all."""
     from scipy.optimize import least_squares
 
+    usual_exponent = 0.37  # Starting value of the exponent (PHYSICS)
     n_vines, middle = int(vine_index.max()) + 1, float(np.median(log_speed))
 
     def curve(values: Floats, log_v: Floats, vine: Indices | int) -> Floats:
         return np.asarray(values[vine] + values[-2] * (log_v - middle) + values[-1] * (log_v - middle) ** 2)
 
-    straight = log_force - USUAL_EXPONENT * (log_speed - middle)
+    straight = log_force - usual_exponent * (log_speed - middle)
     levels = [float(np.median(straight[vine_index == vine])) for vine in range(n_vines)]
     # 0.05: residual of ln F at which the robust fit halves the weight of a trial (chosen)
     fit = least_squares(
         lambda values: log_force - curve(values, log_speed, vine_index),
-        [*levels, USUAL_EXPONENT, 0.0],
+        [*levels, usual_exponent, 0.0],
         loss="cauchy",
         f_scale=0.05,
     )

@@ -132,8 +132,6 @@ def _fit_with(before: Fit, effect: Effect) -> Fit:
 # learned.
 
 
-TABLE_DIGITS = 6  # Significant digits of a coefficient in the file (chosen)
-
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
 _SYMBOL = {"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}
 _UNIT = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
@@ -258,14 +256,15 @@ def _code_number(value: float) -> str:
 
 def _table_lines(table: Floats) -> list[str]:
     """The table as lines of code: a tuple of numbers, or a tuple of rows."""
+    table_digits = 6  # Significant digits of a coefficient in the file (chosen)
     if table.ndim == 1:
-        numbers = ", ".join(f"{value:.{TABLE_DIGITS}g}" for value in table.tolist())
+        numbers = ", ".join(f"{value:.{table_digits}g}" for value in table.tolist())
         return [
             "TABLE = np.array((  # N",
             *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "),
             "))",
         ]
-    rows = [f"    ({', '.join(f'{value:.{TABLE_DIGITS}g}' for value in row)})," for row in table.tolist()]
+    rows = [f"    ({', '.join(f'{value:.{table_digits}g}' for value in row)})," for row in table.tolist()]
     return ["TABLE = np.array((  # N", *rows, "))"]
 
 

@@ -28,8 +28,6 @@ from vinetrack.tracks.position_noise import FEWEST_POINTS, local_fit, rest_point
 # Best-fit value of one parameter for each trial, with all other parameters at their common values.
 
 
-LARGEST_STEP = 0.3  # Largest step of ln B, or of a parameter in units of its scale (chosen)
-
 MAX_DEVIATION_SCALES = 3.0  # Largest deviation from the common value, in scales (chosen)
 
 
@@ -140,6 +138,7 @@ def _gauss_newton_step(
     """One Gauss–Newton step for every trial: scaled deviation, trial effects, and the projected sensitivities. The
     sensitivities of position to the parameter are projected off those to release and origin.
     """
+    largest_step = 0.3  # Largest step of ln B, or of a parameter in units of its scale (chosen)
     step = 1e-3
     plain = predictor.jobs(np.empty(0), trial_effects)
 
@@ -164,7 +163,7 @@ def _gauss_newton_step(
         design = np.column_stack([sensitivity, *others])
         best = np.linalg.lstsq(design, residual, rcond=1e-9)[0]
         scaled[i] = np.clip(
-            scaled[i] + np.clip(best[0], -LARGEST_STEP, LARGEST_STEP), -MAX_DEVIATION_SCALES, MAX_DEVIATION_SCALES
+            scaled[i] + np.clip(best[0], -largest_step, largest_step), -MAX_DEVIATION_SCALES, MAX_DEVIATION_SCALES
         )
         trial_effects[i, RELEASE] += np.clip(best[1], -2 * trial_data.frame_s, 2 * trial_data.frame_s)
         trial_effects[i, ORIGIN] += 0.0 if origin_fixed[i] else best[2]
@@ -203,9 +202,6 @@ def _variance(aligned: AlignedTrials, projected: list[Floats], scale: Floats) ->
 # the sensitivities of the trajectories, and a residual scatter that is independent between stretches. They are
 # estimated from differences between replicates alone, so that a model that fails does not inflate them.
 
-START_VALUES = (0.01, 0.03, 0.2)  # Starting values of the search: pressure, ln B, residual scatter (chosen)
-
-LOWER_BOUNDS, UPPER_BOUNDS = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)  # Bounds of the search (chosen)
 
 # Lower limits of the standard deviations of pressure and B where both are needed (chosen)
 LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
@@ -266,10 +262,12 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
     """Maximum-likelihood estimate of the between-trial scatter from the differences between replicates."""
     from scipy.optimize import minimize
 
+    start_values = (0.01, 0.03, 0.2)  # Starting values of the search: pressure, ln B, residual scatter (chosen)
+    lower_bounds, upper_bounds = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)  # Bounds of the search (chosen)
     dof = sum(len(group.means_m) - 1 for group in groups)
     if dof < 1:
         spreads = [fit.spreads[name].value if name in fit.spreads else 0.0 for name in ("pressure", "B")]
-        return Scatter(spreads[0], spreads[1], START_VALUES[2], 0)
+        return Scatter(spreads[0], spreads[1], start_values[2], 0)
     parts = []
     for group in groups:
         if len(group.means_m) > 1:
@@ -277,7 +275,7 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
             parts.append((len(deviations) - 1, deviations.T @ deviations, group))
 
     def minus_two_log_likelihood(logs: Floats) -> float:
-        variances = np.exp(2 * np.clip(logs, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS)))
+        variances = np.exp(2 * np.clip(logs, np.log(lower_bounds), np.log(upper_bounds)))
         total = 0.0
         for count, square, group in parts:
             covariance = _covariance(group, variances)
@@ -286,9 +284,9 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
         return total
 
     best = minimize(
-        minus_two_log_likelihood, np.log(START_VALUES), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01}
+        minus_two_log_likelihood, np.log(start_values), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01}
     )
-    pressure, damping, residual = np.exp(np.clip(best.x, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS))).tolist()
+    pressure, damping, residual = np.exp(np.clip(best.x, np.log(lower_bounds), np.log(upper_bounds))).tolist()
     return Scatter(pressure, damping, residual, dof)
 
 
@@ -320,9 +318,6 @@ def replicate_z(mean: Floats, covariance: Floats, trials: int, scatter: Scatter)
     square = trials * float(np.mean((mean / sigma) ** 2))
     p = float(fisher.sf(square, degrees, scatter.dof) if scatter.dof else chi2.sf(square * degrees, degrees))
     return float(norm.isf(max(p, 1e-300)))
-
-
-LARGEST_STEP_FRAMES = 2.0  # Largest shift of a round, in frames (chosen)
 
 
 @dataclass(frozen=True)
@@ -393,6 +388,7 @@ def frames_at_rest(trial: TrialFit) -> int:
 
 def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
     """Align the measured motions of one condition in time and position."""
+    largest_step_frames = 2.0  # Largest shift of a round, in frames (chosen)
     rests = [frames_at_rest(trial) for trial in trials]
     release_s, origin_m = (np.array(values) for values in zip(*map(_begin, trials, rests), strict=True))
     rest_seen = np.array([n > 0 or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)])
@@ -414,7 +410,7 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
     for _ in range(200):
         deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
         time_shift_s, position_shift_m = _shifts(deviation_m, speed_m_s, origin_known)
-        time_shift_s = np.clip(time_shift_s, -LARGEST_STEP_FRAMES * frame_s, LARGEST_STEP_FRAMES * frame_s)
+        time_shift_s = np.clip(time_shift_s, -largest_step_frames * frame_s, largest_step_frames * frame_s)
         # Only differences of releases are determined: a common shift would drift away from the reference.
         time_shift_s -= time_shift_s.mean()
         shifted_s = release_s + time_shift_s

@@ -48,8 +48,6 @@ from vinetrack.inference.whitening import all_products, at_correlation
 # In this order: trial effects, parameters of the fit (keys), residual, shapes of candidates, shared systematic
 # errors.
 
-TRIALS_AT_ONCE = 64  # Trials whose cross products are held at once, each of half a megabyte (chosen)
-
 
 @dataclass(frozen=True)
 class Products:
@@ -80,7 +78,8 @@ class Products:
     @cached_property
     def parts(self) -> list[slice]:
         """Slices of the trials whose cross products are held at once."""
-        return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
+        trials_at_once = 64  # Trials whose cross products are held at once, each of half a megabyte (chosen)
+        return [slice(begin, begin + trials_at_once) for begin in range(0, len(self.columns), trials_at_once)]
 
     def cross_products(self, part: slice) -> Floats:
         """Cross products of a part of the trials, see `whitening`. They are cached where there is only one part; those

@@ -44,12 +44,11 @@ RATIO, FREE = TrialInputs._fields.index("travel_ratio"), TrialInputs._fields.ind
 
 MOST_STEPS = 20_000  # Maximum number of steps of a trajectory, chosen: trajectories of the catalogue take 20 to 600
 
-MOVING, AT_REST, SLACK = 0, 1, 2  # Phases of a trajectory; a convention of this file
-
 
 @merged
 def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     """Follow one trajectory from rest at time 0."""
+    moving, at_rest, slack = 0, 1, 2  # Phases of a trajectory; a convention of this file
     count = times.size
     point = Point(0.0, 0.0, 0.0, 0.0, equations.first_chamber(trial))
     row = _write_at_rest(equations, trial, times, 0, 0.0, point, out)
@@ -57,11 +56,11 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     if row == count:
         return RUNNING, end_time, 0.0, 0, slack_time
     last_time = times[count - 1]
-    phase, slack_located = AT_REST, False
+    phase, slack_located = at_rest, False
     previous_stages, h, speed_scale = NO_STAGES, 0.0, 0.0
     next_breakpoint = sample = n_steps = 0
     while True:
-        if phase == SLACK:
+        if phase == slack:
             slack_time = point.time if np.isnan(slack_time) else slack_time
             status, row, point, end_speed = equations.follow_slack(
                 equations, trial, times, row, point, stop, rtol, out, work
@@ -71,10 +70,10 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             if status != TAUT:
                 end_time = end_time if status == RUNNING else point.time
                 return status, end_time, end_speed, n_steps, slack_time
-            phase = AT_REST if point.v <= 0 else MOVING
+            phase = at_rest if point.v <= 0 else moving
             point, speed_scale, h = _resume_taut(equations, trial, point, speed_scale)
             previous_stages = NO_STAGES
-        if phase == AT_REST:
+        if phase == at_rest:
             if _rest_acceleration(equations, point.time, point.x, point.chamber, trial) <= 0:
                 start, chamber = _wait_for_drive(equations, trial, point, last_time)
                 resting = Point(point.time, point.x, 0.0, 0.0, chamber)
@@ -84,10 +83,10 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 point = Point(start, point.x, 0.0, 0.0, chamber)
             if equations.slack_at_rest(equations, trial, point.time, point.x, point.chamber):
                 point = Point(point.time, point.x, 0.0, 0.0, point.chamber)
-                phase = SLACK
+                phase = slack
                 continue
             point, speed_scale, h = _start_from_rest(equations, trial, point, last_time, stop)
-            phase, previous_stages = MOVING, NO_STAGES
+            phase, previous_stages = moving, NO_STAGES
         while next_breakpoint < breakpoints.size and point.x >= breakpoints[next_breakpoint]:
             next_breakpoint += 1
         breakpoint_x = breakpoints[next_breakpoint] if next_breakpoint < breakpoints.size else stop
@@ -105,7 +104,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             point = Point(
                 point.time + h, point.x + 0.5 * h * max(point.v, 0.0), point.v, point.acceleration, end.chamber
             )
-            phase, end_time = AT_REST, point.time
+            phase, end_time = at_rest, point.time
             row = _write_at_rest(equations, trial, times, row, point.time, point, out)
             if row == count:
                 return STALLED, end_time, 0.0, n_steps, slack_time
@@ -123,7 +122,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 slack_located, previous_stages = True, NO_STAGES
                 h *= slack_fraction
                 continue
-            ended, phase, slack_located, fraction = False, SLACK, False, slack_fraction
+            ended, phase, slack_located, fraction = False, slack, False, slack_fraction
         row = _write_moving(equations, trial, times, row, fraction, h, point, end, out)
         if ended and point.time + fraction * h <= last_time:
             end_time = point.time + fraction * h
@@ -132,7 +131,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             return ENDED, end_time, end_speed, n_steps, slack_time
         if row == count:
             return RUNNING, end_time, end.v, n_steps, slack_time
-        if phase == SLACK:
+        if phase == slack:
             point = _point_within_step(fraction, h, point, end)
             continue
         # A drive that rises from zero may take the speed far beyond the estimate at the start.

@@ -20,7 +20,6 @@ from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, read_cell, u
 from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"
-MAX_NAME_LENGTH = 100  # Longest trial name; files are named after it (chosen)
 
 # Columns that a trial of an everting vine requires; a body that moves as a whole requires the diameter only
 REQUIRED_COLUMNS = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
@@ -123,19 +122,20 @@ def similar_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
 
 def _check_name(row: Row) -> None:
     """Report an invalid trial name, and replace it by the number of the line."""
+    max_name_length = 100  # Longest trial name; files are named after it (chosen)
     given = row.name
     if not given:
         code, message = "blank", "is blank"
     elif given.startswith("-"):
         code, message = "name", "begins with a hyphen, like a command-line option"
-    elif len(given) > MAX_NAME_LENGTH:
+    elif len(given) > max_name_length:
         code, message = "name", "is too long"
     elif not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII):
         code, message = "name", "is not a valid trial name"
     else:
         return
     row.name = f"line-{row.line}"
-    remedy = f"at most {MAX_NAME_LENGTH} characters, no spaces or dots: files are named after it"
+    remedy = f"at most {max_name_length} characters, no spaces or dots: files are named after it"
     row.add(code, message, "trial", value=given, allowed=COLUMNS["trial"].allowed, remedy=remedy)
 
 

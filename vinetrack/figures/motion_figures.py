@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_CONDITION_PANELS = 60  # Chosen: in rows of nine they are 1.2 in wide, the narrowest that has room for its label
-MAX_PANELS = 120  # Chosen: twelve rows of ten panels; further vines are left out, and the title says so
 
 # ------------------------------------------------------------------------------
 # All trials: speed against growth in small panels, replicates superposed, steady windows thick.
@@ -66,6 +65,7 @@ class _Curve:
 @figure("overview", "damping", "All trials at a glance", data="trials.csv")
 def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure | None:
     """Speed of the leading edge against growth, replicates superposed. Thick: the steady window of the gated rule."""
+    max_panels = 120  # Chosen: twelve rows of ten panels; further vines are left out, and the title says so
     shown = trials[trials["status"] != "left_out"]
     tables = {name: kinematics[name] for name in shown["trial"] if len(kinematics.get(name, ())) > 1}
     if not tables:
@@ -79,7 +79,7 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
         groups = ordered.groupby("condition", sort=False)
         panels = [(str(part["condition_label"].iloc[0]), part) for _, part in groups]
     else:
-        panels = [(str(vine), part) for vine, part in shown.groupby("vine", sort=False)][:MAX_PANELS]
+        panels = [(str(vine), part) for vine, part in shown.groupby("vine", sort=False)][:max_panels]
     n_columns = page_columns(len(panels), 10)
     font = panel_font(n_columns)
     row_in = min(max(0.72 * 11.0 / n_columns, 1.15), 3.6)
@@ -99,7 +99,7 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     missing = len(shown) - len(curves)
     title = f"{len(curves)} {'trial' if len(curves) == 1 else 'trials'}, {what}; thick: steady by the gated rule"
     title += f"; {missing} without positions" if missing else ""
-    title += f"; the first {MAX_PANELS} panels" if len(panels) == MAX_PANELS else ""
+    title += f"; the first {max_panels} panels" if len(panels) == max_panels else ""
     page_labels(fig, "growth (mm)", "leading-edge speed (m/s)", title)
     return fig
 

@@ -43,14 +43,8 @@ from vinetrack.inference.gauge_readings import (
 # likely: the distribution of offsets in the other trials is the prior of each (empirical Bayes: Robbins, Proc. 3rd
 # Berkeley Symp. 1, 157, 1956), since a short trace determines its own offset to a few samples at best.
 
-LARGEST_OFFSET_FRAMES = 60  # Largest clock offset, samples (chosen)
-
 
 EM_ITERATIONS = 30  # Iterations of the expectation–maximisation of frequencies (measured)
-
-
-# Degrees in time and in growth of the curve by which the offset is estimated (chosen)
-TIME_DEGREE, GROWTH_DEGREE = 1, 2
 
 
 @dataclass(frozen=True)
@@ -104,11 +98,12 @@ def gauge_clocks(
     read: Sequence[Readings], growths: Sequence[Growth | None], noises: Sequence[GaugeNoise]
 ) -> list[Clock | None]:
     """Clock offset of every trace of a campaign."""
+    largest_offset_frames = 60  # Largest clock offset, samples (chosen)
     frames_s = [growth.frame_s for growth in growths if growth is not None]
     if not frames_s:
         return [None] * len(read)
     step_s = float(np.median(frames_s))
-    offsets_s: Floats = step_s * np.arange(-LARGEST_OFFSET_FRAMES, LARGEST_OFFSET_FRAMES + 1.0)
+    offsets_s: Floats = step_s * np.arange(-largest_offset_frames, largest_offset_frames + 1.0)
     logs: dict[int, Floats] = {}
     for i, (readings, growth, noise) in enumerate(zip(read, growths, noises, strict=True)):
         if growth is not None and noise.sigma_Pa > 0:
@@ -143,7 +138,9 @@ def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise
     """Log likelihood of offsets, samples, relative to the likeliest; None if there is no information. Where no curve
     explains the readings to their noise, the residual counts as noise.
     """
-    size, columns = readings.places.size, TIME_DEGREE + GROWTH_DEGREE + 1
+    # Degrees in time and in growth of the curve by which the offset is estimated (chosen)
+    time_degree, growth_degree = 1, 2
+    size, columns = readings.places.size, time_degree + growth_degree + 1
     if size <= columns:
         return None
     means = readings.edges is not None
@@ -158,7 +155,7 @@ def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise
         range_m = np.ptp(shifted_m)
         if range_m == 0:
             continue
-        curves = polynomial_along(t, (shifted_m - shifted_m[0]) / range_m, TIME_DEGREE, GROWTH_DEGREE)
+        curves = polynomial_along(t, (shifted_m - shifted_m[0]) / range_m, time_degree, growth_degree)
         white = whitened(readings.means_of(curves) if means else curves, noise.rho)
         q = np.linalg.qr(white[::stride])[0]
         residual_squares[k] = y @ y - np.sum((q.T @ y) ** 2)

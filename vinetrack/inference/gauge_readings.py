@@ -28,10 +28,6 @@ EXACT_TOLERANCE = 1e-9
 INTERPOLATED_PART = 0.25
 
 
-# Samples by which a change may deviate from the even sampling period of a gauge (derived)
-PERIOD_TOLERANCE, PERIOD_FALSE_ALARM = 0.75, 1e-4
-
-
 NEGLIGIBLE_NOISE = 1e-4  # Noise below this fraction of the median pressure is rounding, and is not removed (chosen)
 
 FEWEST_SAMPLES = 9  # Samples below which a trace does not determine its noise (derived)
@@ -219,6 +215,8 @@ def _sample_and_hold_readings(pressure_Pa: Floats, digit_Pa: float) -> tuple[Flo
 
 def _sampling_period(instants: Floats) -> tuple[float, float] | None:
     """First instant and period, samples, of a regular grid that contains all the instants; None if there is none."""
+    # Samples by which a change may deviate from the even sampling period of a gauge (derived)
+    period_tolerance, period_false_alarm = 0.75, 1e-4
     gaps = np.diff(instants)
     if gaps.size < 3 or gaps.min() < 2:
         return None
@@ -230,8 +228,8 @@ def _sampling_period(instants: Floats) -> tuple[float, float] | None:
     periods = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
     slope, first = np.polyfit(periods, instants, 1)
     largest_error = np.max(np.abs(instants - first - slope * periods))
-    if largest_error > PERIOD_TOLERANCE or gaps.size * math.log(slope / (2 * PERIOD_TOLERANCE)) < -math.log(
-        PERIOD_FALSE_ALARM
+    if largest_error > period_tolerance or gaps.size * math.log(slope / (2 * period_tolerance)) < -math.log(
+        period_false_alarm
     ):
         return None
     return float(first), float(slope)

@@ -36,8 +36,6 @@ from vinetrack.inference.whitening import at_correlation
 # ------------------------------------------------------------------------------
 # The constant part of a fit (priors, bounds) and its initial state (noise, between-trial standard deviations).
 
-FIRST_SPREADS = (0.01, 0.03)  # Initial between-trial standard deviations of pressure (relative) and ln B (chosen)
-
 
 def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     """The constant part of a fit. Shapes: trial_effects (n_trials, 4)."""
@@ -101,12 +99,13 @@ def track_correlation(data: Sequence[FitTrial]) -> float:
 
 def _stated_between_trial_sd(data: Sequence[FitTrial]) -> tuple[float, float]:
     """Between-trial standard deviation of pressure as the sheet states it, and the typical one of ln B."""
+    first_spreads = (0.01, 0.03)  # Initial between-trial standard deviations of pressure (relative) and ln B (chosen)
     relative = [
         trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
         for trial_data in data
         if trial_data.trial.pressure_Pa > 0 and np.isfinite(trial_data.trial.pressure_sigma_Pa)
     ]
-    return (float(np.mean(relative)) if relative else FIRST_SPREADS[0]), FIRST_SPREADS[1]
+    return (float(np.mean(relative)) if relative else first_spreads[0]), first_spreads[1]
 
 
 def variance_floor(data: Sequence[FitTrial]) -> Floats:
@@ -176,9 +175,6 @@ CONVERGED_DECREASE = 1e-2  # Predicted decrease of −2 ln L per step below whic
 CONVERGED_VARIANCES = 0.02
 
 
-# Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
-FIRST_ITERATIONS, MOST_FIRST_ITERATIONS, FAR_FROM_OPTIMUM = 3, 9, 1e3
-
 PROGRESS_STEPS = 4  # Steps over which progress is measured before a fit is stopped early (chosen)
 
 # Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped (derived)
@@ -247,6 +243,8 @@ def solve(
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
     Levenberg–Marquardt damping where a full step fails. Shapes: columns (n_points, 4 + n_keys + 1).
     """
+    # Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
+    first_iterations, most_first_iterations, far_from_optimum = 3, 9, 1e3
     fixed_terms = fixed_terms or FixedTerms()
     estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
     state = _with_fixed_terms(state, fixed_terms)
@@ -262,8 +260,8 @@ def solve(
     deviances: list[float] = []
     releases, at_corner = ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
-        close = predicted_decrease < FAR_FROM_OPTIMUM or iteration > MOST_FIRST_ITERATIONS
-        first_phase = first_phase and not (iteration > FIRST_ITERATIONS and close)
+        close = predicted_decrease < far_from_optimum or iteration > most_first_iterations
+        first_phase = first_phase and not (iteration > first_iterations and close)
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
         state = _update_variances(
@@ -300,7 +298,7 @@ def solve(
             reached = Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
             if is_poor_fit(predictor, reached):
                 break
-        if shortfall is not None and iteration > FIRST_ITERATIONS:
+        if shortfall is not None and iteration > first_iterations:
             expected_later = (most_iterations - iteration) * _decrease_per_step(deviances)
             if (
                 shortfall(cross_products, problem, state, penalised_squares)

@@ -263,9 +263,6 @@ def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
     return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])
 
 
-ORDERS = (1, 2, 3, 4)  # Legendre orders of the shapes
-
-
 # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
 # comparison, where differences count from 1; and the maximum number of steps (measured)
 CONVERGED_DECREASE_SMOOTH, MOST_STEPS = 1e-2, 15
@@ -287,15 +284,16 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     """Displacement by one standard deviation of each shape, m, for every trial. The polynomials span the growth of all
     trials, since one camera records them. Shapes: grown_m (n_points,) → (n_points, n_shapes).
     """
+    orders = (1, 2, 3, 4)  # Legendre orders of the shapes
     sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
     if not (sigma_m > 0).any():
         return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
     # Without any growth the shapes are zero, since their value at rest is subtracted.
     # 1e-9: growth that counts as none (derived)
     reach = max(1e-9, *(float(np.max(growth_m)) for growth_m in grown_m))
-    select = np.eye(max(ORDERS) + 1)[list(ORDERS)].T
+    select = np.eye(max(orders) + 1)[list(orders)].T
     # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
-    at_rest = (-1.0) ** np.array(ORDERS)
+    at_rest = (-1.0) ** np.array(orders)
     return [
         sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - at_rest)
         for growth_m, sigma in zip(grown_m, sigma_m.tolist(), strict=True)

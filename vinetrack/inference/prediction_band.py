@@ -38,8 +38,6 @@ from vinetrack.inference.whitening import whiten
 # A trial counts as covered where this part of its positions is, and a band has to cover this part of trials (chosen)
 COVERED_POSITIONS, COVERAGE = 0.9, 0.95
 
-DRAWS = 1000  # Curves drawn for a simultaneous band (chosen)
-
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit, TrialFit
@@ -92,10 +90,11 @@ def _simultaneous(loadings: Floats, degrees: float) -> float:
     """Standard deviations within which COVERED_POSITIONS of the positions of COVERAGE of trials lie. For a single way
     to deviate that is Student's t; for several, more, since a trial may deviate by one early and by another late.
     """
+    draws = 1000  # Curves drawn for a simultaneous band (chosen)
     draw = np.random.default_rng(1)
-    scale = np.ones(DRAWS) if math.isinf(degrees) else np.sqrt(degrees / draw.chisquare(degrees, DRAWS))
+    scale = np.ones(draws) if math.isinf(degrees) else np.sqrt(degrees / draw.chisquare(degrees, draws))
     thinned = loadings[:: max(len(loadings) // 60, 1)]
-    curves = np.abs(thinned @ draw.standard_normal((loadings.shape[1], DRAWS))) * scale
+    curves = np.abs(thinned @ draw.standard_normal((loadings.shape[1], draws))) * scale
     return float(np.quantile(np.quantile(curves, COVERED_POSITIONS, axis=0), COVERAGE))
 
 

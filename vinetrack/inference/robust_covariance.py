@@ -36,14 +36,9 @@ PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to 
 
 FILM_ERROR = 0.02  # Least standard deviation of the mass of a vine's film, relative (chosen)
 
-PAYLOAD_STEP = 1e-2  # Relative step of a payload's mass for its derivative (derived)
 
 # Largest number of half waves along the growth in the slow error of a tracker that all trials share (chosen)
 HALF_WAVES = 6
-
-
-# Fractions of the growth before its end (measured)
-END_SHAPES = ((0.1, 2.0), (0.03, 4.0))
 
 
 @dataclass(frozen=True)
@@ -120,6 +115,7 @@ def _of_every_trial(columns: list[Floats]) -> Systematics:
 
 def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
+    payload_step = 1e-2  # Relative step of a payload's mass for its derivative (derived)
     no_errors = Systematics.none([trial.time_s.size for trial in trials])
     loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
     if not loaded:
@@ -127,13 +123,13 @@ def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[T
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
         plain = predictor.run([jobs[i] for i in loaded])
-        heavier = predictor.run([jobs[i]._replace(payload_factor=1 + PAYLOAD_STEP) for i in loaded])
+        heavier = predictor.run([jobs[i]._replace(payload_factor=1 + payload_step) for i in loaded])
     except SimulationError:
         return no_errors
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
     for i, plain_trajectory, heavier_trajectory in zip(loaded, plain, heavier, strict=True):
         # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
-        columns[i][:, 0] = 0.005 / PAYLOAD_STEP * position_change(plain_trajectory, heavier_trajectory)
+        columns[i][:, 0] = 0.005 / payload_step * position_change(plain_trajectory, heavier_trajectory)
     names = {i: round(trials[i].trial.payload_kg, 9) for i in loaded}
     return _one_per_group(columns, [names.get(i) for i in range(len(trials))])
 
@@ -242,14 +238,15 @@ def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
     have the usual error of the trial each. What is stated beyond that, near a door or at low contrast, is one error at
     the very start and one after it; two more grow towards the end.
     """
+    end_shapes = ((0.1, 2.0), (0.03, 4.0))  # Fractions of the growth before its end (measured)
     if slow_m is None:
-        return np.zeros((part.size, HALF_WAVES + 2 + len(END_SHAPES)))
+        return np.zeros((part.size, HALF_WAVES + 2 + len(end_shapes)))
     usual = np.minimum(slow_m, np.median(slow_m))
     excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
     waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
     # 0.015: fraction of the growth over which a slow error that is larger at the start may decay (chosen)
     start = np.exp(-np.maximum(part, 0.0) / 0.015)
-    ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in END_SHAPES]
+    ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in end_shapes]
     return np.column_stack([waves, excess * start, excess * (1 - start), *ends])
 
 

@@ -239,7 +239,6 @@ N_TRIAL_EFFECTS = 4  # Trial effects of each trial: release, s; origin, m; relat
 RELEASE_STEP_FRAMES = 0.1  # Step of the release (chosen)
 
 PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
-DAMPING_STEP = 1e-3  # Relative step of B (derived)
 
 
 class Predictor:
@@ -463,6 +462,7 @@ class Predictor:
         self, unperturbed: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool
     ) -> Iterator[tuple[int, Floats, Jobs]]:
         """For each column to be differenced: its place, the step of each trial, and the perturbed jobs."""
+        damping_step = 1e-3  # Relative step of B (derived)
         if len(shifted_trials := np.flatnonzero(~self.release_is_shift)):
             steps, perturbed = RELEASE_STEP_FRAMES * self.frames_s[shifted_trials], unperturbed.take(shifted_trials)
             yield RELEASE, steps, replace(perturbed, release_s=perturbed.release_s + steps)
@@ -471,8 +471,8 @@ class Predictor:
             yield PRESSURE, steps, replace(perturbed, pressure_deviation=perturbed.pressure_deviation + steps)
         if DAMPING not in self.layout.keys and len(damping_trials := np.flatnonzero(self.has_damping_deviation)):
             perturbed = unperturbed.take(damping_trials)
-            perturbed.row[:, self.damping_column] *= np.exp(DAMPING_STEP)
-            yield DAMPING_DEVIATION, np.full(damping_trials.size, DAMPING_STEP), perturbed
+            perturbed.row[:, self.damping_column] *= np.exp(damping_step)
+            yield DAMPING_DEVIATION, np.full(damping_trials.size, damping_step), perturbed
         upper = self.layout.bounds[1]
         for column, key in enumerate(self.layout.keys):
             trials_of_key = np.flatnonzero(self.layout.index[:, column] >= 0)

@@ -150,8 +150,6 @@ def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, p
     )
 
 
-LARGEST_DEVIATION_STEP = 0.3  # Largest step of a trial's deviations of pressure and ln B (chosen)
-
 LARGEST_DEVIATION = 0.9  # Largest deviation of pressure and ln B (chosen)
 
 
@@ -199,6 +197,7 @@ def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> F
     """Trial effects after a step, within the trust region: two frames for the release, 0.3 for a deviation. Shapes:
     trial_effects, step (n_trials, 4) → (n_trials, 4).
     """
+    largest_deviation_step = 0.3  # Largest step of a trial's deviations of pressure and ln B (chosen)
     # 2.0: largest step of a release, frames (chosen)
     largest_release_step = 2.0 * np.array([trial_data.frame_s for trial_data in predictor.data])
     effects = trial_effects + step
@@ -206,7 +205,7 @@ def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> F
         step[:, RELEASE], -largest_release_step, largest_release_step
     )
     deviations = [PRESSURE, DAMPING_DEVIATION]
-    deviation_step = np.clip(step[:, deviations], -LARGEST_DEVIATION_STEP, LARGEST_DEVIATION_STEP)
+    deviation_step = np.clip(step[:, deviations], -largest_deviation_step, largest_deviation_step)
     effects[:, deviations] = np.clip(
         trial_effects[:, deviations] + deviation_step, -LARGEST_DEVIATION, LARGEST_DEVIATION
     )
@@ -241,8 +240,6 @@ LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release ju
 
 # Least and largest change of origin and deviations
 STEP_LIMITS = np.array([-np.inf, -0.3, -0.3]), np.array([np.inf, 0.3, 0.3])
-
-DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
 
 
 class ReleaseSearch:
@@ -399,6 +396,7 @@ def _release_sensitivities(
     """For each trial times since release, shape (n,), positions there, m, and their sensitivities to its effects.
     Sensitivities have shape (4, n), zero for an effect that the trial does not have.
     """
+    damping_step, pressure_step = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
     jobs: list[Job] = []
     perturbations: list[tuple[int, float]] = []
     grids: list[Floats] = []
@@ -406,12 +404,12 @@ def _release_sensitivities(
         i = job.trial
         variants = [((-1, 0.0), job)]
         if predictor.has_pressure_deviation[i]:
-            deviation = job.pressure_deviation + PRESSURE_STEP
-            variants.append(((PRESSURE, PRESSURE_STEP), job._replace(pressure_deviation=deviation)))
+            deviation = job.pressure_deviation + pressure_step
+            variants.append(((PRESSURE, pressure_step), job._replace(pressure_deviation=deviation)))
         if predictor.has_damping_deviation[i]:
             row = job.row.copy()
-            row[predictor.damping_column] *= np.exp(DAMPING_STEP)
-            variants.append(((DAMPING_DEVIATION, DAMPING_STEP), job._replace(row=row)))
+            row[predictor.damping_column] *= np.exp(damping_step)
+            variants.append(((DAMPING_DEVIATION, damping_step), job._replace(row=row)))
         longest_s = float(predictor.data[i].time_s[-1] - candidates_s.min())
         for perturbation, perturbed_job in variants:
             perturbations.append(perturbation)

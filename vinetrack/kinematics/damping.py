@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-FEWEST_PER_VINE = 3  # Fewest points of a vine in the fit of a shared exponent (derived)
-
-LEAST_FORCE_RATIO = 1.2  # Least ratio of largest to smallest force of a vine (derived)
-
 LEAST_STEADY_SHARE = 0.5  # Fraction of a condition's trials that must be steady for any of them to enter a fit (chosen)
 
 
@@ -123,16 +119,18 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
 
 def _admit(points: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
     """Points of vines that determine a slope, and the reasons why others do not."""
+    fewest_per_vine = 3  # Fewest points of a vine in the fit of a shared exponent (derived)
+    least_force_ratio = 1.2  # Least ratio of largest to smallest force of a vine (derived)
     usable = points[(points["x_ss_m_s"] > 0) & (points["force_N"] > 0)]
     left_out = {}
     for vine in dict.fromkeys(points["vine"]):
         force = usable.loc[usable["vine"] == vine, "force_N"]
-        if len(force) < FEWEST_PER_VINE:
-            left_out[str(vine)] = f"{len(force)} steady trials, at least {FEWEST_PER_VINE} are needed"
-        elif force.max() < LEAST_FORCE_RATIO * force.min():
+        if len(force) < fewest_per_vine:
+            left_out[str(vine)] = f"{len(force)} steady trials, at least {fewest_per_vine} are needed"
+        elif force.max() < least_force_ratio * force.min():
             ratio = force.max() / force.min()
             left_out[str(vine)] = (
-                f"forces span a factor {ratio:.3g}, at least {LEAST_FORCE_RATIO:g} is needed: vary the pressure"
+                f"forces span a factor {ratio:.3g}, at least {least_force_ratio:g} is needed: vary the pressure"
             )
     return usable[~usable["vine"].isin(list(left_out))].sort_values("vine", kind="stable"), left_out
 
@@ -466,7 +464,6 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
 SAME_SETTING_WITHIN = 0.01  # Pressures and payloads that agree within this fraction count as equal (chosen)
 
 SIZES = {"thickness_um": "wall", "diameter_mm": "diameter"}
-EFFICIENCIES = ("efficiency", "efficiency_payload", "efficiency_with_weight")
 
 
 def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
@@ -549,16 +546,17 @@ def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _efficiency_family(group: pd.DataFrame) -> dict[str, Any]:
+    efficiencies = ("efficiency", "efficiency_payload", "efficiency_with_weight")
     fixed = ("pressure_kPa", "payload_g", "length_mm", "efficiency_at_mm")
     each = ("diameter_mm", "thickness_um", "n_efficiency", "weight_share")
-    values = (name for key in EFFICIENCIES for name in (key, f"{key}_sigma"))
+    values = (name for key in efficiencies for name in (key, f"{key}_sigma"))
     sizes = {name: group[name].to_numpy(float) for name in ("thickness_um", "diameter_mm")}
     return {
         **{name: float(group[name].iloc[0]) for name in fixed},
         "conditions": group["condition"].tolist(),
         "vines": group["vine"].tolist(),
         **{name: group[name].tolist() for name in (*each, *values)},
-        "trend": {key: planes(sizes, group[key].to_numpy(float)) for key in EFFICIENCIES},
+        "trend": {key: planes(sizes, group[key].to_numpy(float)) for key in efficiencies},
     }
 
 

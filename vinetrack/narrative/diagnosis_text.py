@@ -243,8 +243,6 @@ GO_ON = (
     "It looks for a law that describes the missing force and writes the law as an effect file of your own."
 )
 
-CLEAR_GAIN = 9.0  # Δχ² above which an added effect is said to help (derived)
-
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
     """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors, next experiment."""
@@ -355,12 +353,13 @@ def gain_in_words(before: Fit, after: Fit) -> str:
     """Return the improvement by an added effect. The model with the effect contains the one without it, so a loss shows
     that the optimiser has not converged.
     """
+    clear_gain = 9.0  # Δχ² above which an added effect is said to help (derived)
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     if gain < 0:
         return "the fit did not converge, so whether it helps is unknown"
     helps = f"Δχ² = {gain:.1f}"
-    if gain <= CLEAR_GAIN:
-        helps = f"no significant improvement ({helps}; {CLEAR_GAIN:g} are needed)"
+    if gain <= clear_gain:
+        helps = f"no significant improvement ({helps}; {clear_gain:g} are needed)"
     return helps if after.converged else f"{helps}; the fit did not converge"
 
 

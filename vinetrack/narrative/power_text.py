@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 LOW_POWER = 0.1  # Power below which an effect counts as undetectable (chosen)
 
-MOST_SENTENCES = 4  # Effects that get a sentence each, at most (chosen)
 
 AT_LARGEST = "with 90 % power at their largest plausible size"  # Follows the number of detectable effects
 
@@ -199,10 +198,11 @@ def _size_table(effects: Sequence[EffectPower]) -> list[str]:
 
 def _effects_in_sentences(power: Power) -> list[EffectPower]:
     """All effects if they are few, else the physical ones of the lowest power."""
-    if len(power.effects) <= MOST_SENTENCES:
+    most_sentences = 4  # Effects that get a sentence each, at most (chosen)
+    if len(power.effects) <= most_sentences:
         return list(power.effects)
     physical = [entry for entry in power.effects if entry.kind == "physical"]
-    return sorted(physical, key=lambda entry: entry.probability_at(entry.largest))[:MOST_SENTENCES]
+    return sorted(physical, key=lambda entry: entry.probability_at(entry.largest))[:most_sentences]
 
 
 def simulated_lines(power: Power) -> list[str]:

@@ -457,9 +457,6 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> Model:
 log = logging.getLogger(__name__)
 
 FAULT = "A fault of the program, not of your data: run vinetrack explore with --log FILE for the traceback."
-# Chosen: with this correlation each standard error is 1/√(1 − 0.9²) = 2.3 times its value with the other parameter
-# known
-STRONG_CORRELATION = 0.9
 
 CLEARLY_WORSE = 0.5  # Decrease in ln L (chosen)
 
@@ -535,12 +532,15 @@ def likelihood_change_text(before: Fit, after: Fit) -> str:
 
 def correlated_pairs_text(result: Fit) -> list[str]:
     """Return the pairs of strongly correlated estimates, largest correlation first, as text."""
+    # Chosen: with this correlation each standard error is 1/√(1 − 0.9²) = 2.3 times its value with the other
+    # parameter known
+    strong_correlation = 0.9
     pairs = []
     for i, number in enumerate(result.numbers):
         for k in range(i):
             scale = math.sqrt(float(result.covariance[i, i] * result.covariance[k, k]))
             r = float(result.covariance[i, k]) / scale if scale > 0 and math.isfinite(scale) else 0.0
-            if abs(r) > STRONG_CORRELATION:
+            if abs(r) > strong_correlation:
                 pairs.append((abs(r), f"{result.numbers[k].title} and {number.title}: correlation {r:+.2f}"))
     return [words for _, words in sorted(pairs, reverse=True)]
 

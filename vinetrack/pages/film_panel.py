@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 # A recording is decoded once, in the background, and its frames are kept as JPEG no wider than the page shows them: one
 # second of a high-speed camera takes a few tens of megabytes.
 
-MAX_WIDTH_PX = 960  # Chosen: as wide as the page shows a recording
-
 
 @dataclass(frozen=True)
 class RecordingView:
@@ -149,6 +147,7 @@ class DecodedRecording:
         """Decode every frame."""
         from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
+        max_width_px = 960  # Chosen: as wide as the page shows a recording
         try:
             recording = inspect_recording(self.path)
             self.expected = recording.declared_frames or 0
@@ -156,9 +155,9 @@ class DecodedRecording:
                 if self._cancelled:
                     return self
                 height, width = luma.shape
-                shown_px = min(width, MAX_WIDTH_PX)
+                shown_px = min(width, max_width_px)
                 self.shape, self.scale = (max(1, round(height * shown_px / width)), shown_px), shown_px / width
-                self._frames.append(jpeg(luma, MAX_WIDTH_PX, 2.0**recording.bit_depth - 1))
+                self._frames.append(jpeg(luma, max_width_px, 2.0**recording.bit_depth - 1))
                 self.count += 1
                 # Frames between two reports of progress; chosen: several reports a second
                 if on_progress is not None and self.count % 10 == 1:

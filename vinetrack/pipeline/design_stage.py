@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from vinetrack.planning.fastest_vine import Chamber, Choice, Room
     from vinetrack.planning.predictive_inputs import PredictiveInputs
 
-MAX_FILMS = 12  # Largest number of films (chosen)
 
 FILMS = "--films-um"
 
@@ -138,9 +137,10 @@ def _choice_entry(choice: Choice) -> dict[str, Any]:
 
 def _check_films(room: Room, films: str, diameter: str) -> None:
     """Refuse an empty or too long list of films, and films too thick for the smallest diameter."""
-    if not 0 < len(room.films_m) <= MAX_FILMS:
+    max_films = 12  # Largest number of films (chosen)
+    if not 0 < len(room.films_m) <= max_films:
         message = f"names {len(room.films_m)} films"
-        raise _refusal("thickness_um", films, message, f"name 1 to {MAX_FILMS}", name=FILMS)
+        raise _refusal("thickness_um", films, message, f"name 1 to {max_films}", name=FILMS)
     if max(room.films_m) > room.diameter_m[0] / 4:
         message = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
         raise _refusal("diameter_mm", diameter, message, f"begin at {4e3 * max(room.films_m):g} mm or more")
@@ -207,9 +207,6 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield from (f"! {warning}" for warning in design_checks(best))
 
 
-REQUIRED_FOR_RESERVOIR = ("diameter_mm", "length_mm", "pressure_kPa")
-
-
 def design_reservoir(
     request: PredictionRequest,
     *,
@@ -225,8 +222,9 @@ def design_reservoir(
     from vinetrack.effects import EffectError
     from vinetrack.planning.fastest_vine import chambers
 
+    required_for_reservoir = ("diameter_mm", "length_mm", "pressure_kPa")
     check_figure(figure)
-    basis = read_basis(request, needed=REQUIRED_FOR_RESERVOIR)
+    basis = read_basis(request, needed=required_for_reservoir)
     trial = basis.planned.trials[0]
     inputs = inputs_of(basis)[0] if math.isfinite(trial.thickness_m) else None
     loss = within_percent / 100

@@ -38,7 +38,6 @@ log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
-FASTEST_FPS, SLOWEST_FPS = 30.0, 4.0  # Limits of the playback rate of a clip, frames per second (chosen)
 
 MARGIN_FRAMES = 8  # Frames before and after the motion that a clip shows (chosen)
 
@@ -161,8 +160,9 @@ def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
     """Return playback rate and stride of a clip that lasts about `seconds`. Returns play_fps (frames per second),
     stride (every how many frames of the recording one is shown).
     """
-    stride = max(round(n_frames / seconds / FASTEST_FPS), 1)
-    return float(np.clip(n_frames / stride / seconds, SLOWEST_FPS, FASTEST_FPS)), stride
+    fastest_fps, slowest_fps = 30.0, 4.0  # Limits of the playback rate of a clip, frames per second (chosen)
+    stride = max(round(n_frames / seconds / fastest_fps), 1)
+    return float(np.clip(n_frames / stride / seconds, slowest_fps, fastest_fps)), stride
 
 
 def draw_over(

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from vinetrack.inference.fit_data import Pairs
     from vinetrack.inference.fit_result import Fit
 
-DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0  # Default noise of a position, and default frame rate (chosen)
-
 
 @dataclass(frozen=True)
 class PowerRequest:
@@ -195,6 +193,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     from vinetrack.inference.parameters import DAMPING, EXPONENT
     from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
+    default_noise_mm, default_capture_fps = 0.1, 1069.0  # Default noise of a position, and default frame rate (chosen)
     folder, settings = planned.folder or Path(), planned.settings
     user_effects = dict(own_effects([folder / path for path in settings.effects]))
     stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=user_effects)
@@ -204,8 +203,8 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
             by_vine[trial.vine] = predictive_inputs(trial, stated)
     vine_inputs = list(by_vine.values())
     first = vine_inputs[0]
-    noise = _stated(request.noise, (DEFAULT_NOISE_MM / 1e3, 0.0))
-    noise_m, correlation = noise or (DEFAULT_NOISE_MM / 1e3, 0.0)
+    noise = _stated(request.noise, (default_noise_mm / 1e3, 0.0))
+    noise_m, correlation = noise or (default_noise_mm / 1e3, 0.0)
     spreads = _stated(request.spreads, first.spreads)
     systematic_m, systematic_origin = _planned_systematic(request, settings)
     trials = tuple(
@@ -214,7 +213,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     )
     filmed_fps = [request.capture_fps if math.isfinite(request.capture_fps) else trial.capture_fps for trial in trials]
     cameras = tuple(
-        FilmingPlan(fps if math.isfinite(fps) else DEFAULT_CAPTURE_FPS, noise_m, correlation) for fps in filmed_fps
+        FilmingPlan(fps if math.isfinite(fps) else default_capture_fps, noise_m, correlation) for fps in filmed_fps
     )
     origins = ("stated" if noise else "guess", "stated" if spreads else "guess: a usual batch of vines")
     inputs = [

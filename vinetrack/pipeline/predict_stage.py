@@ -71,7 +71,6 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
 # ------------------------------------------------------------------------------
 # Inputs of the commands about new vines: options or a sheet, a fit, effects; and formatting of their output.
 
-FIGURE_FORMATS = (".png", ".svg", ".pdf")
 
 NEVER = "never"
 
@@ -265,8 +264,9 @@ def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
 
 def check_figure(path: Path | None) -> None:
     """Check the suffix of an output figure before anything is computed."""
-    if path is not None and path.suffix.lower() not in FIGURE_FORMATS:
-        remedy = f"end it in one of {', '.join(FIGURE_FORMATS)}"
+    figure_formats = (".png", ".svg", ".pdf")
+    if path is not None and path.suffix.lower() not in figure_formats:
+        remedy = f"end it in one of {', '.join(figure_formats)}"
         raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])
 
 

@@ -137,7 +137,6 @@ def has_wildcard(path: Path) -> bool:
 # A run holds a lock of the operating system as long as its process lives. Snakemake's own locks are files, which stay
 # when a run is killed; the profile and `vinetrack run` do without them.
 
-RUN_LOCK = ".run.lock"
 
 # Temporary names of files that are being written
 UNFINISHED_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
@@ -153,9 +152,10 @@ def _locked(results: Path) -> FileLock:
     """Return the lock of a results folder, held by this process."""
     from filelock import FileLock, Timeout
 
+    run_lock = ".run.lock"
     results.mkdir(parents=True, exist_ok=True)
     try:
-        lock = FileLock(results.absolute() / RUN_LOCK, timeout=0)
+        lock = FileLock(results.absolute() / run_lock, timeout=0)
         lock.acquire()
     except Timeout:
         process = _claim(results).get("process", "unknown")

@@ -53,9 +53,6 @@ from vinetrack.tracks.position_noise import ar1_noise
 SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
 
 
-PRESSURE_STEP_PA = 100.0  # Resolution of set pressures, Pa (chosen)
-
-
 @dataclass(frozen=True)
 class Condition:
     """A trial that could be made. `like` is the index, among the trials of the experiment, of the trial it is modelled
@@ -179,6 +176,7 @@ def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
 
 def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Limits) -> list[tuple[float, float]]:
     """Set pressures in equal ratios, Pa, each with its standard error."""
+    pressure_step_pa = 100.0  # Resolution of set pressures, Pa (chosen)
     pressures = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
     if not pressures:
         return []
@@ -191,7 +189,7 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
         is_stated = "hoop_stress_MPa" in limits.model_fields_set
         held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine and not is_stated]
         bursts_Pa = 1e6 * limits.hoop_stress_MPa / stress_Pa
-        high = min(high, max([PRESSURE_STEP_PA * math.floor(bursts_Pa / PRESSURE_STEP_PA), *held]))
+        high = min(high, max([pressure_step_pa * math.floor(bursts_Pa / pressure_step_pa), *held]))
     if payload_kg == 0 and math.isfinite(rig.yield_pressure_Pa):
         # 1.15: lowest candidate pressure of a vine without payload, as a multiple of the yield pressure (chosen)
         low = max(low, 1.15 * rig.yield_pressure_Pa)
@@ -201,7 +199,7 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
     steps = np.geomspace(low, high, 6) if high > 1.02 * low else np.array([high])
     relative = [t.pressure_sigma_Pa / t.pressure_Pa for t in used if t.pressure_Pa > 0]
     share = float(np.nanmedian(relative)) if np.isfinite(relative).any() else math.nan
-    steps = np.clip(PRESSURE_STEP_PA * np.round(steps / PRESSURE_STEP_PA), low, high)
+    steps = np.clip(pressure_step_pa * np.round(steps / pressure_step_pa), low, high)
     return [(float(pressure), share * float(pressure)) for pressure in np.unique(steps.round(3))]
 
 

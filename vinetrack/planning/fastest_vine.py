@@ -41,9 +41,6 @@ from vinetrack.planning.predictive_inputs import (
 GRID = (17, 9)  # Numbers of diameters and lengths in each round (chosen)
 
 
-BOUND_TOLERANCE = 0.005  # Relative distance from a bound below which a vine counts as limited by it (chosen)
-
-
 @dataclass(frozen=True)
 class Room:
     """Limits of what can be built, SI. `rig` has what all share: payload, angle, chamber, yield pressure."""
@@ -148,15 +145,16 @@ def _neighbours(axis: Floats, k: int, limits: tuple[float, float]) -> tuple[floa
 
 def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
     """The constraints that keep a vine from being faster: of its pressure, and bounds of its size."""
+    bound_tolerance = 0.005  # Relative distance from a bound below which a vine counts as limited by it (chosen)
     bearable_Pa = room.bearable_Pa(trial.diameter_m, trial.thickness_m)
     limits = ["supply" if room.pressure_Pa <= bearable_Pa else "burst"]
     for name, value, (low, high) in (
         ("diameter", trial.diameter_m, room.diameter_m),
         ("length", trial.length_m, room.length_m),
     ):
-        if high > low and value > high * (1 - BOUND_TOLERANCE):
+        if high > low and value > high * (1 - bound_tolerance):
             limits.append(f"largest {name}")
-        elif high > low and value < low * (1 + BOUND_TOLERANCE):
+        elif high > low and value < low * (1 + bound_tolerance):
             limits.append(f"smallest {name}")
     return tuple(limits)
 

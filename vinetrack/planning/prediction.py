@@ -188,7 +188,6 @@ EDGE, TAIL = "speed of the leading edge", "speed of the tail"
 EJECTION = "ejection speed of the payload"
 TENSION, LEAST_TENSION = "tension of the tail", "least tension of the tail"
 STEADY = "steady tail speed, Eq. (3)"
-HOOP = "hoop stress PD/2t"
 
 
 @dataclass(frozen=True)
@@ -320,6 +319,7 @@ def band(values: Floats) -> Floats:
 
 
 def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int) -> Iterator[Quantity]:
+    hoop = "hoop stress PD/2t"
     r, at = inputs.trial.travel_ratio, float(along[place])
     speed = runs.lead_velocity_m_s[:, place]
 
@@ -340,7 +340,7 @@ def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int)
     yield quantity(LEAST_TENSION, math.nan, runs.least_tension_N, "N")
     trial = inputs.trial
     stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-    yield Quantity(HOOP, math.nan, stress, stress, stress, "Pa")
+    yield Quantity(hoop, math.nan, stress, stress, stress, "Pa")
 
 
 def _curve(inputs: PredictiveInputs, runs: Runs, along: Floats) -> pd.DataFrame:

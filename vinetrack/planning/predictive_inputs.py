@@ -44,14 +44,11 @@ SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
 
 SPLIT_SIGMA = 0.25  # Standard error of the exponent of t against that of D, at constant sum
 
-PRINTED_ERROR = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
 
 YIELD_PRESSURE_PA = 1000 * published.YIELD_PRESSURE_KPA
 PRINTED_YIELD_SIGMA_PA = 1000 / math.sqrt(12)  # Standard error of the printed yield pressure, Pa
 
 BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
-
-PRESSURE_SPREAD, DAMPING_SPREAD = 0.01, 0.03  # Relative between-trial standard deviations of pressure and B (chosen)
 
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
@@ -556,6 +553,7 @@ def predictive_inputs(
 
 
 def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) -> None:
+    printed_error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
     vine, is_same = anchor
     trial, fit = sources.trial, sources.fit
     if math.isfinite(stated.B):
@@ -579,8 +577,8 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
         split = split_leverage(trial.diameter_m, trial.thickness_m) - split_leverage(*size)
     elif (scale := _printed_scale(trial)) is not None:
         sources.set(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
-        words = f"the error of the printed B is not printed: assumed to be {100 * PRINTED_ERROR:.0f} %"
-        sources.add_uncertainty("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, PRINTED_ERROR))
+        words = f"the error of the printed B is not printed: assumed to be {100 * printed_error:.0f} %"
+        sources.add_uncertainty("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, printed_error))
         return
     else:
         sources.set(
@@ -723,10 +721,12 @@ def _joint_draw_of_fit(sources: _Sources) -> None:
 
 def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[float, float]:
     """Relative between-trial standard deviations of pressure and B; both become uncertainties."""
+    # Relative between-trial standard deviations of pressure and B (chosen)
+    pressure_spread, damping_spread = 0.01, 0.03
     fit, trial = sources.fit, sources.trial
-    stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else PRESSURE_SPREAD
-    pressure = stated if math.isfinite(stated) else PRESSURE_SPREAD
-    damping, origin, dof = DAMPING_SPREAD, "assumed:", {"pressure": math.inf, "B": math.inf}
+    stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else pressure_spread
+    pressure = stated if math.isfinite(stated) else pressure_spread
+    damping, origin, dof = damping_spread, "assumed:", {"pressure": math.inf, "B": math.inf}
     if fit is not None and fit.spreads:
         pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
         origin, dof = f"estimated in {fit.source}:", {**dof, **fit.spread_dof}
@@ -751,7 +751,6 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
 # scaling prior (`planning.predictive_inputs`). A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by
 # even more.
 
-FAR_OFF = 4.0  # Factor between implied and prior damping from which another unit is tried (chosen)
 
 NEAR = 2.5  # Factor to the prior within which the other unit explains the speeds (chosen)
 
@@ -760,9 +759,10 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     """Return a warning if the speeds contradict the pressures as stated but agree with them in another unit. The other
     unit is psi, kPa where psi are stated, or absolute instead of gauge pressure.
     """
+    far_off = 4.0  # Factor between implied and prior damping from which another unit is tried (chosen)
     pairs = [(trial, speed) for trial, speed in speeds if trial.travel_ratio == 2 and trial.pressure_trace is None]
     as_stated = _middle_ratio(pairs, 1.0, 1.0)
-    if not (as_stated < 1 / FAR_OFF or as_stated > FAR_OFF):
+    if not (as_stated < 1 / far_off or as_stated > far_off):
         return []
     place: dict[str, Any] = {"file": "trials.csv", "column": "pressure_kPa", "severity": "warning"}
     gauge = [(replace(each, pressure_Pa=each.pressure_Pa - each.ambient_pressure_Pa), speed) for each, speed in pairs]

@@ -25,8 +25,6 @@ from vinetrack.planning.discriminating_design import Condition, Hypothesis, Trac
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.tracks.position_noise import ar1_noise
 
-REST_FRAMES = 20  # Frames at rest before release (chosen)
-
 FEWEST_GROWTH_FRAMES = 12  # Frames of growth below which a trial is not worth filming (chosen)
 
 
@@ -60,6 +58,7 @@ def make(
     """Simulate one campaign: its trials as the sheet states them, and their tracks. The camera counts as calibrated:
     positions have no systematic error unless the sheet states one.
     """
+    rest_frames = 20  # Frames at rest before release (chosen)
     trials = [
         trial if math.isfinite(trial.position_systematic_m) else replace(trial, position_systematic_m=0.0)
         for trial in trials
@@ -84,8 +83,8 @@ def make(
         min(end.end_time_s if end.status == "ended" else longest, camera.stops_s)
         for end, longest, camera in zip(ends, longest_s, cameras, strict=True)
     ]
-    release = (REST_FRAMES - draw.uniform(size=count)) * frames_s
-    counts = [REST_FRAMES + int(end * camera.capture_fps) for end, camera in zip(stop_s, cameras, strict=True)]
+    release = (rest_frames - draw.uniform(size=count)) * frames_s
+    counts = [rest_frames + int(end * camera.capture_fps) for end, camera in zip(stop_s, cameras, strict=True)]
     times: list[Floats] = [
         np.arange(frames, dtype=float) * frame_s for frames, frame_s in zip(counts, frames_s, strict=True)
     ]
@@ -115,9 +114,6 @@ MOST_ITERATIONS = 20  # Iterations of a refit, at most (chosen)
 
 # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
 ALTERNATING = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-
-# Standard deviations at which draws of the true parameters are clipped, since the linearised fit is not valid beyond
-FURTHEST_DRAW = 2.0
 
 
 class PartlyLinear(Predictor):
@@ -216,11 +212,14 @@ def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
     """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
     Returns free parameters, scaled, within their bounds. Shape (n_free,).
     """
+    # Standard deviations at which draws of the true parameters are clipped, since the linearised fit is not valid
+    # beyond
+    furthest_draw = 2.0
     old = hypothesis.fit.predictor.layout.start.size
     values, vectors = np.linalg.eigh(hypothesis.scatter_levels[0].information[:old, :old])
     is_determined = values > 1e-9 * values[-1]
     sd = np.where(is_determined, 1 / np.sqrt(np.where(is_determined, values, 1.0)), 0.0)
-    normal = np.clip(rng.standard_normal(old), -FURTHEST_DRAW, FURTHEST_DRAW)
+    normal = np.clip(rng.standard_normal(old), -furthest_draw, furthest_draw)
     of_new = rng.standard_normal(hypothesis.sd_of_new.size) * hypothesis.sd_of_new
     down, up = hypothesis.room
     return np.asarray(hypothesis.theta + np.clip(np.concatenate([vectors @ (sd * normal), of_new]), down, up))

@@ -142,8 +142,6 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
 
 MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single trials
 
-SPARK_PX = (132, 30)  # Width and height of the small curve of a trial (chosen)
-
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
     """Return all trials for the template, and the number of trials whose figures were left out for size. Returns
@@ -185,12 +183,13 @@ def speed_sparkline(curve: pd.DataFrame, steady_s: tuple[float, float]) -> Marku
     """Return the speed of a trial against time as a small SVG, with the steady window thick; blank if there is nothing
     to draw.
     """
+    spark_px = (132, 30)  # Width and height of the small curve of a trial (chosen)
     known = curve[np.isfinite(curve["time_s"]) & np.isfinite(curve["lead_velocity_m_s"])]
-    known = known.iloc[:: max(len(known) // SPARK_PX[0], 1)]
+    known = known.iloc[:: max(len(known) // spark_px[0], 1)]
     time_s, speed_m_s = (known[name].to_numpy(dtype=float) for name in ("time_s", "lead_velocity_m_s"))
     if len(known) < 2 or np.ptp(time_s) <= 0:
         return Markup()
-    width, height = SPARK_PX
+    width, height = spark_px
     top = max(float(np.percentile(speed_m_s, 99)), 1e-12)
     x = 1 + (width - 2) * (time_s - time_s[0]) / np.ptp(time_s)
     y = np.clip(height - 2 - (height - 5) * speed_m_s / top, 1, height - 1)

@@ -76,9 +76,6 @@ def base64_uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-_UNESCAPED = ",;:!*'()/ -._~+@=$?"  # Characters that need no escaping in a quoted URL
-
-
 @dataclass(frozen=True)
 class ReportFigure:
     """A figure of the report: its SVG or PNG, its caption, and its data as a file to download."""
@@ -128,7 +125,8 @@ class ReportSection:
 
 def data_uri(name: str, text: str) -> str:
     """Return a file as a data URI, in the shorter of two encodings."""
+    unescaped = ",;:!*'()/ -._~+@=$?"  # Characters that need no escaping in a quoted URL
     kind = "application/json" if name.endswith(".json") else "text/csv"
-    escaped = f"data:{kind};charset=utf-8,{quote(text, safe=_UNESCAPED)}"
+    escaped = f"data:{kind};charset=utf-8,{quote(text, safe=unescaped)}"
     encoded = base64_uri(f"{kind};charset=utf-8", text.encode("utf-8"))
     return min(encoded, escaped, key=len)

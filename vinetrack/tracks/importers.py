@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 FEWEST_POINTS = 5  # Fewest points of a track (derived)
 
-LARGEST_PRESSURE_KPA = 1000.0  # Largest gauge pressure in kPa that is accepted (chosen)
 
 LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
 
@@ -52,16 +51,17 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
     """Refuse pressures outside what the sheet allows; NaN passes. Shapes: pressure_kPa (n,)."""
+    largest_pressure_kpa = 1000.0  # Largest gauge pressure in kPa that is accepted (chosen)
     # -101.4: least gauge pressure that is accepted; sensors do read a little below zero (derived)
-    wrong = np.flatnonzero((pressure_kPa > LARGEST_PRESSURE_KPA) | (pressure_kPa < -101.4))
+    wrong = np.flatnonzero((pressure_kPa > largest_pressure_kpa) | (pressure_kPa < -101.4))
     if len(wrong):
         i = int(wrong[0])
         value = float(pressure_kPa[i])
         where = f"line {lines[i]}, column pressure_kPa: {value:g}"
         if value < 0:
             raise TrackError(f"{where} is below vacuum", "gauge pressure in kPa is wanted")
-        hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1000 * LARGEST_PRESSURE_KPA else ""
-        raise TrackError(f"{where} is above {LARGEST_PRESSURE_KPA:g} kPa{hint}")
+        hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1000 * largest_pressure_kpa else ""
+        raise TrackError(f"{where} is above {largest_pressure_kpa:g} kPa{hint}")
 
 
 def new_track(
@@ -434,9 +434,6 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
 # ------------------------------------------------------------------------------
 # Find where the motion of a body in an imported track ends: it turns back (a bounce) or stops abruptly.
 
-# Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop (chosen)
-STILL_SIGMAS, FEWEST_STILL = 5.0, 3
-
 
 def flag_end_of_body(track: Track) -> Track:
     """Flag points after the end of the body's motion `after_end`, and report the end in the notes."""
@@ -467,9 +464,11 @@ def _turns_back(y: Floats, noise_m: float) -> int | None:
 
 def _stops_dead(y: Floats, noise_m: float) -> int | None:
     """First point of a standstill that lasts to the end and begins within a frame; None where there is none."""
-    tolerance_m = max(STILL_SIGMAS * noise_m, 1e-9)
-    moving = np.flatnonzero(np.abs(y - np.median(y[-FEWEST_STILL:])) > tolerance_m)
-    if not moving.size or y.size - moving[-1] - 1 < FEWEST_STILL or moving[-1] < FEWEST_POINTS:
+    # Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop (chosen)
+    still_sigmas, fewest_still = 5.0, 3
+    tolerance_m = max(still_sigmas * noise_m, 1e-9)
+    moving = np.flatnonzero(np.abs(y - np.median(y[-fewest_still:])) > tolerance_m)
+    if not moving.size or y.size - moving[-1] - 1 < fewest_still or moving[-1] < FEWEST_POINTS:
         return None
     last = int(moving[-1])
     median_step = float(np.median(np.diff(y[last - FEWEST_POINTS : last + 1])))
@@ -479,10 +478,6 @@ def _stops_dead(y: Floats, noise_m: float) -> int | None:
 
 
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
-
-LARGEST_TDMS_BYTES = 200_000_000  # Largest TDMS file that is read (chosen)
-# Lines within which the header of a text export is looked for, below its title and remarks (chosen)
-HEADER_WITHIN_LINES = 20
 
 
 def load_track(trial: Trial) -> Track:
@@ -505,6 +500,8 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
     `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and Tracker's text export
     (columns t, x, y or t and one coordinate, with or without a title above).
     """
+    # Lines within which the header of a text export is looked for, below its title and remarks (chosen)
+    header_within_lines = 20
     if path.suffix.lower() == ".trz":
         raise TrackError("is a packed Tracker project", "unpack it and name the .trk inside")
     try:
@@ -513,7 +510,7 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
             return read_project(text, point_mass, frames_used)
         if point_mass:
             raise TrackError("has no point masses to choose from", "leave point_mass blank, or name a .trk file")
-        lines = text.split("\n")[:HEADER_WITHIN_LINES]
+        lines = text.split("\n")[:header_within_lines]
         skip = next((i for i, line in enumerate(lines) if is_export_header(line)), None)
         table = parse_table(text, skip or 0)
         if skip is not None and "position_m" not in table.columns:
@@ -597,10 +594,11 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
 
 def _as_csv(path: Path) -> str:
     """The channels of a TDMS file as the text of a CSV, so that units in their names are converted in the same way."""
+    largest_tdms_bytes = 200_000_000  # Largest TDMS file that is read (chosen)
     try:
         size = file_size(path)
-        if size > LARGEST_TDMS_BYTES:
-            raise TrackError(f"is larger than {LARGEST_TDMS_BYTES // 1_000_000} MB", "keep only its pressure channels")
+        if size > largest_tdms_bytes:
+            raise TrackError(f"is larger than {largest_tdms_bytes // 1_000_000} MB", "keep only its pressure channels")
         columns = tdms_columns(path)
     except OSError as error:
         raise TrackError("cannot be read", f"{error.strerror}") from None

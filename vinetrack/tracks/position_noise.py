@@ -28,8 +28,6 @@ THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences
 # Factor by which the median third difference may underestimate correlated noise (derived)
 THIRD_DIFFERENCE_ALLOWANCE = 1.84
 
-SAME_STEP_TOLERANCE = 0.01  # Relative difference within which two rounding steps are the same (chosen)
-
 
 def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     """Estimate the standard deviation and lag-one correlation of the random error of single positions. Returns noise_m
@@ -97,6 +95,7 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     """Return the `rounding_noise` of most of a campaign's tracks where it dominates their noise; it then holds for all.
     Returns 0 where most are not rounded, or to different steps, or are noisier than that. Shapes: tracks (n_points,).
     """
+    same_step_tolerance = 0.01  # Relative difference within which two rounding steps are the same (chosen)
     # Below √2 errors of rounding, most of the noise is rounding.
     limit = math.sqrt(2) / math.sqrt(12)
     noises = sorted(
@@ -105,7 +104,7 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     )
     typical = noises[len(noises) // 2] if noises else 0.0
     n_same = sum(
-        typical * (1 - SAME_STEP_TOLERANCE) <= noise <= typical * (1 + SAME_STEP_TOLERANCE) for noise in noises
+        typical * (1 - same_step_tolerance) <= noise <= typical * (1 + same_step_tolerance) for noise in noises
     )
     return typical if 2 * n_same > len(noises) else 0.0
 
@@ -507,7 +506,6 @@ FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # Weights of a fourth
 # speeds, and of s, by factors of 1.12; the best τ is then refined by a parabola (derived)
 BLUR_GRID_SIZE, SCALE_GRID_SIZE = 41, 61
 
-COARSE_STEP = 5  # Every fifth value of s is tried before those between (chosen)
 
 _SCALE_GRID = np.geomspace(1 / 30, 2.0, SCALE_GRID_SIZE)
 
@@ -593,16 +591,17 @@ def _best_scale(differences: _Differences, extra_m: Floats) -> tuple[float, floa
     """−2 ln L of a trial's differences with sd² = s² + extra², minimised over s, and that s. Every fifth s is tried,
     then those about the best of them: −2 ln L has one valley.
     """
+    coarse_step = 5  # Every fifth value of s is tried before those between (chosen)
     square, extra_square = differences.distance_m[differences.use] ** 2, extra_m[differences.use] ** 2
     typical = math.sqrt(float(np.mean(square))) + 1e-300
     s = typical * _SCALE_GRID
-    indices = np.arange(0, SCALE_GRID_SIZE, COARSE_STEP)
+    indices = np.arange(0, SCALE_GRID_SIZE, coarse_step)
     for _ in range(2):
         variance = s[indices, None] ** 2 + extra_square
         deviances = np.sum(np.log(variance) + square / variance, axis=1)
         best = int(np.argmin(deviances))
         deviance, k = float(deviances[best]), int(indices[best])
-        indices = np.arange(max(k - COARSE_STEP + 1, 0), min(k + COARSE_STEP, SCALE_GRID_SIZE))
+        indices = np.arange(max(k - coarse_step + 1, 0), min(k + coarse_step, SCALE_GRID_SIZE))
     return deviance, float(s[k])
 
 

@@ -22,8 +22,6 @@ MOST_STEPS = 8  # Most Gauss-Newton steps of a registration (chosen)
 
 
 POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
-# Cost of a step back on the coarse path (chosen)
-BACK_COST_PER_PX = 0.05
 
 
 @dataclass(frozen=True)
@@ -193,11 +191,12 @@ def _half_length(foreground: NDArray[np.float32]) -> int:
 
 def _forward_path(score: Floats) -> Floats:
     """Place by frame, shape (n_frames,), that collects most score, by dynamic programming; steps back have a cost."""
+    back_cost_per_px = 0.05  # Cost of a step back on the coarse path (chosen)
     n, columns = score.shape
     best = np.zeros_like(score)
     came_from = np.zeros(score.shape, dtype=int)
     best[0] = score[0]
-    cost = BACK_COST_PER_PX * np.arange(columns)
+    cost = back_cost_per_px * np.arange(columns)
     for t in range(1, n):
         ahead, ahead_from = _running_maximum(best[t - 1])
         behind, behind_from = _running_maximum((best[t - 1] - cost)[::-1])

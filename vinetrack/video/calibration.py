@@ -219,8 +219,6 @@ def _misfit(values: Floats, corners: list[Floats], boards: list[Floats], noise: 
 
 
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
-# Root mean square distance of the corners from the model above which the board is another one (chosen)
-LARGEST_REPROJECTION_PX = 2.0
 
 MOST_PICTURES_READ = 10  # Most pictures of a clip that are read (chosen)
 
@@ -336,6 +334,8 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     target are averaged. Of a target that is moved every picture gets its own plane but all share the lens, and the
     first readable one shows the plane of growth. Shapes: pictures (height, width).
     """
+    # Root mean square distance of the corners from the model above which the board is another one (chosen)
+    largest_reprojection_px = 2.0
     views, complaints = [], []
     read = charuco_corners if isinstance(board, Charuco) else checkerboard_corners
     for picture in pictures:
@@ -355,7 +355,7 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
             f"{board.image}: the target moves by {moved_px:.1f} px; its first picture is taken for the plane of growth"
         )
     fit = fit_planes([_median_corners(views)] if stationary else views, width, height)
-    if fit.reprojection_px > LARGEST_REPROJECTION_PX:
+    if fit.reprojection_px > largest_reprojection_px:
         raise CalibrationError(
             f"{board.image}: corners lie {fit.reprojection_px:.1f} px from where a flat board of {board.squares[0]} × "
             f"{board.squares[1]} squares has them; check `squares`, and that the board is flat"

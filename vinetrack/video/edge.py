@@ -68,8 +68,6 @@ from vinetrack.video.strip import Strip
 
 # Change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed (chosen)
 MIN_LOG_CHANGE = 5.0
-# Length of a run of columns, and the fraction of it that must have changed for a front to have passed (chosen)
-RUN_LENGTH_PX, RUN_CHANGED_PART = 9, 0.6
 
 AVERAGED_FRAMES = 12  # Frames after and before the front over which film and background are averaged (derived)
 
@@ -136,9 +134,12 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> _FrontPath:
     early one: neighbours then stand in for the background, whereas a column that never changed carries no information
     about the edge.
     """
+    # Length of a run of columns, and the fraction of it that must have changed for a front to have passed
+    # (chosen)
+    run_length_px, run_changed_part = 9, 0.6
     strong = change > MIN_LOG_CHANGE
-    run = np.convolve(strong, np.ones(RUN_LENGTH_PX) / RUN_LENGTH_PX, mode="same") > RUN_CHANGED_PART
-    if run.sum() < RUN_LENGTH_PX:
+    run = np.convolve(strong, np.ones(run_length_px) / run_length_px, mode="same") > run_changed_part
+    if run.sum() < run_length_px:
         raise ValueError("nothing moves along the axis")
     changed_columns = np.flatnonzero(run & strong)
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
@@ -179,8 +180,6 @@ FULL_DOOR_EXCESS = 0.7
 # Error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
 WIDTH_ERROR_PX = 1.0
 MIN_FRAME_WEIGHT = 0.05  # Weight of a frame identical to the one before it (chosen)
-# Distance, in standard deviations, at which the difference of a pixel from film or background is clipped (chosen)
-EVIDENCE_CLIP = 2.5
 
 
 @dataclass(frozen=True)
@@ -325,13 +324,16 @@ def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
 
 def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
     """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
+    # Distance, in standard deviations, at which the difference of a pixel from film or background is clipped
+    # (chosen)
+    evidence_clip = 2.5
     contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
 
     def evidence_of(first: int, last: int) -> NDArray[np.float32]:
         part = slice(first, last)
         return kernels.film_evidence(
-            strip.values[part], strip.scale[part], strip.offset[part], state.appearance, width, EVIDENCE_CLIP
+            strip.values[part], strip.scale[part], strip.offset[part], state.appearance, width, evidence_clip
         )
 
     evidence = np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))

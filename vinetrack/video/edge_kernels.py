@@ -274,7 +274,6 @@ def _normal_sums(
 MEMORY_CUTOFF = 4.0  # Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 % (chosen)
 # Coverage from which a pixel counts as film, and below 1 − COVERED_FRACTION as background (chosen)
 COVERED_FRACTION = 0.98
-FAR_PX = 80  # Columns beyond the range of the edge that are gathered (chosen)
 ROWS_PER_BLOCK = 8  # Rows processed together, so that their sums stay in the cache (chosen)
 
 
@@ -321,6 +320,7 @@ def _column_weights(
     """Weights of columns for background and for film, and the first column that counts and the one behind the last.
     Shapes (n_frames, n_along) twice and (n_frames, 2); common to all rows.
     """
+    far_px = 80  # Columns beyond the range of the edge that are gathered (chosen)
     n = len(edge)
     bare_weights, film_weights = np.zeros((n, columns), np.float32), np.zeros((n, columns), np.float32)
     limits = np.zeros((n, 2), np.int64)
@@ -328,7 +328,7 @@ def _column_weights(
     low, high = columns, 0
     for t in range(n):
         if math.isfinite(edge[t]):
-            low, high = min(low, int(edge[t]) - FAR_PX), max(high, int(edge[t]) + FAR_PX)
+            low, high = min(low, int(edge[t]) - far_px), max(high, int(edge[t]) + far_px)
     low, high = max(low, 0), min(high, columns)
     for t in range(n):
         first, last = columns, 0

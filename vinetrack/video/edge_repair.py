@@ -35,8 +35,6 @@ from vinetrack.video.strip import Strip
 # and where a shaken camera was stabilised the slow part of the shake stays.
 
 SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
-LAGS = (1, 2)  # Lags, in frames, at which bands that still disagree alike share a cause (chosen)
-START_RANDOM_PART = 0.4  # Part of the error near the start that differs from frame to frame (measured)
 GUESS_RANDOM_PART = math.sqrt(0.5)  # The same for an edge that is a guess, since a door or the mouth hides it (chosen)
 ARRIVAL_PX = 1.0  # Slow error of a tip that sweeps and bends, tracked by when the picture changes for good (measured)
 
@@ -66,15 +64,16 @@ def shared_disagreement(lead_px: Floats) -> float:
     leaves the mean unchanged. What all frames share is the shape of the tip and is removed. Shapes: lead_px (n_frames,
     n_bands).
     """
+    lags = (1, 2)  # Lags, in frames, at which bands that still disagree alike share a cause (chosen)
     frames, bands = lead_px.shape
-    if bands < 4 or frames < max(LAGS):
+    if bands < 4 or frames < max(lags):
         return 0.0
     deviation = lead_px - lead_px.mean(axis=1, keepdims=True)
     deviation = deviation - np.median(deviation, axis=0)
     pairs = (deviation + deviation[:, ::-1])[:, : bands // 2] / 2
     pairs = pairs - pairs.mean(axis=1, keepdims=True)
     # 4: fewest pairs of frames at a lag (chosen)
-    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in LAGS if frames - lag >= 4]
+    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in lags if frames - lag >= 4]
     if not products:
         return 0.0
     # The mean of a pair has half the variance of a band.
@@ -87,10 +86,11 @@ def noise_and_slow(bands_px: Floats, seen_px: Floats, apart_px: Floats) -> tuple
     between frames; slow ones are shared by neighbouring frames. Returns random and slow error, each of shape
     (n_frames,), px; their sum in quadrature is `apart_px`. Shapes: bands_px, seen_px, apart_px (n_frames,).
     """
+    start_random_part = 0.4  # Part of the error near the start that differs from frame to frame (measured)
     near = np.sqrt(np.maximum(seen_px**2 - bands_px**2, 0.0))
     guess = np.sqrt(np.maximum(apart_px**2 - seen_px**2, 0.0))
-    noise = np.sqrt(bands_px**2 + (START_RANDOM_PART * near) ** 2 + (GUESS_RANDOM_PART * guess) ** 2)
-    slow = np.hypot(math.sqrt(1 - START_RANDOM_PART**2) * near, math.sqrt(1 - GUESS_RANDOM_PART**2) * guess)
+    noise = np.sqrt(bands_px**2 + (start_random_part * near) ** 2 + (GUESS_RANDOM_PART * guess) ** 2)
+    slow = np.hypot(math.sqrt(1 - start_random_part**2) * near, math.sqrt(1 - GUESS_RANDOM_PART**2) * guess)
     return noise, slow
 
 
@@ -99,8 +99,6 @@ ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found wh
 CONSISTENT_MISFIT_RATIO = 1.4
 # Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
 LEAST_FITTED_AMPLITUDE = 0.5
-# Frames of rest, counted from the motion, within which a bad fit is searched again from many starts (chosen)
-LONG_REST_FRAMES = 8
 
 
 def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
@@ -108,6 +106,8 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
     the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
     more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
     """
+    # Frames of rest, counted from the motion, within which a bad fit is searched again from many starts (chosen)
+    long_rest_frames = 8
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
         return fit
@@ -127,10 +127,10 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
             reach = max(1.3 * step, step + 1.5)
             low, high = (previous - reach, previous + 0.8) if sense < 0 else (previous - 0.8, previous + reach)
             inside, faint = low <= edge[t] <= high, out[t, 3] < LEAST_FITTED_AMPLITUDE - 1
-            good_enough = (out[t, 2] <= bad_misfit or resting > LONG_REST_FRAMES) and not faint
+            good_enough = (out[t, 2] <= bad_misfit or resting > long_rest_frames) and not faint
             if not math.isfinite(previous) or (inside and good_enough):
                 continue
-            replacement = _best_between(strip, state, t, low, high, 1 if resting > LONG_REST_FRAMES else 9)
+            replacement = _best_between(strip, state, t, low, high, 1 if resting > long_rest_frames else 9)
             if inside:
                 if replacement is not None and (faint or replacement[2] < out[t, 2]):
                     out[t] = replacement
@@ -200,7 +200,6 @@ BANDS = 4  # Bands across the strip: enough to show which errs, few enough that 
 OUTLYING_BAND = 2.0
 BAND_OFFSET_PX = 50.0  # Growth over which the lead or lag of a band is taken as its usual offset (chosen)
 
-NEIGHBOURS = 2  # Frames on each side over which the median disagreement is taken (chosen)
 MEDIAN_TO_MEAN = 1.27  # Ratio of mean to median of χ² with three degrees of freedom (derived)
 
 
@@ -211,6 +210,7 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
     zeros where there is one band only, slow error of all frames, px; see `slow_errors.shared_disagreement`. Shapes:
     edge, core (n_frames,).
     """
+    neighbours = 2  # Frames on each side over which the median disagreement is taken (chosen)
     edges, sigmas = band_fits(strip, state, edge)
     if edges.shape[1] < 2:
         return np.zeros(len(edge)), 0.0
@@ -224,8 +224,8 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
     total = weight.sum(axis=1)
     mean = (weight * lead_px).sum(axis=1) / total
     variance = (weight * (lead_px - mean[:, None]) ** 2).sum(axis=1) / (lead_px.shape[1] - 1) / total
-    padded = np.pad(variance, NEIGHBOURS, mode="edge")
-    running_median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1), axis=1)
+    padded = np.pad(variance, neighbours, mode="edge")
+    running_median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * neighbours + 1), axis=1)
     return np.asarray(np.sqrt(MEDIAN_TO_MEAN * running_median)), slow
 
 
@@ -303,14 +303,9 @@ UNUSUAL_MISFIT_RATIO = 2.0
 LEAST_AMPLITUDE, REDUCED_AMPLITUDE = 0.6, 0.75
 # Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it
 GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
-# First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
-DOOR_COLUMNS, DOOR_FRAMES = (6, 10), 15
 
-FEWEST_REST_FRAMES = 3  # Fewest frames of rest from which the resting place is known (chosen)
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
-FILM_RANGE_PX = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
-SEARCH_PX = 3  # Distance from the resting place within which a border is looked for (chosen)
 # Least ratio of the border to the largest step between neighbouring columns of film further on (measured)
 BORDER_TO_FILM = 2.0
 FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed and acceleration are estimated (chosen)
@@ -318,8 +313,6 @@ FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed 
 # motion that follows (chosen)
 LEAP_RATIO = 3.0
 LEAST_LEAP_PX = ASTRAY_PX  # Smallest change of the step that is a leap (chosen)
-# Gain of speed over the next four frames (chosen)
-SPEED_GAIN = 0.3
 
 
 @dataclass(frozen=True)
@@ -334,18 +327,21 @@ class Mouth:
 
 def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     """Look for a straight border that stays where the edge rested. Shapes: edge (n_frames,)."""
+    fewest_rest_frames = 3  # Fewest frames of rest from which the resting place is known (chosen)
+    film_range_px = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
+    search_px = 3  # Distance from the resting place within which a border is looked for (chosen)
     none = Mouth(np.zeros(len(edge), dtype=bool), False)
     first = int(np.flatnonzero(moving_frames(state.edge))[0])
-    if first < FEWEST_REST_FRAMES:
+    if first < fewest_rest_frames:
         return none
     rest_px = float(np.median(edge[:first]))
     exited = np.flatnonzero((edge > rest_px + START_CLEARANCE_PX) & (np.arange(len(edge)) >= first))
-    near = np.arange(round(rest_px) - SEARCH_PX, round(rest_px) + SEARCH_PX + 1)
+    near = np.arange(round(rest_px) - search_px, round(rest_px) + search_px + 1)
     # Not where the tip comes to rest: it is round.
     later = np.arange(
-        near[-1] + FILM_RANGE_PX[0], min(near[-1] + FILM_RANGE_PX[1], int(edge.max() - START_CLEARANCE_PX))
+        near[-1] + film_range_px[0], min(near[-1] + film_range_px[1], int(edge.max() - START_CLEARANCE_PX))
     )
-    if len(exited) < FEWEST_REST_FRAMES or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < FILM_RANGE_PX[0]:
+    if len(exited) < fewest_rest_frames or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < film_range_px[0]:
         return none
     beside = BORDER_GAP_PX + BORDER_SIDE_PX
     film_picture = _middle_picture(strip, exited, slice(near[0] - beside, later[-1] + beside))
@@ -370,12 +366,14 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
     """Share of the columns at the start that change before the edge reaches them: a door swings there."""
+    # First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
+    door_columns, door_frames = (6, 10), 15
     begin, columns = state.edge[0], strip.values.shape[2]
-    column_range = np.arange(int(begin) + DOOR_COLUMNS[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
+    column_range = np.arange(int(begin) + door_columns[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
     moving = np.flatnonzero(moving_frames(state.edge))
-    if len(column_range) < DOOR_COLUMNS[1] or moving[0] < 2:
+    if len(column_range) < door_columns[1] or moving[0] < 2:
         return 0.0
-    first = max(0, int(moving[0]) - DOOR_FRAMES)
+    first = max(0, int(moving[0]) - door_frames)
     rising = np.maximum.accumulate(state.edge)
     contrast = float(np.median(np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))))
     changed = 0
@@ -450,6 +448,7 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
     swings in front of the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
     Shapes: edge (n_frames,) → (n_frames,).
     """
+    speed_gain = 0.3  # Gain of speed over the next four frames (chosen)
     out = np.zeros(len(edge))
     if hidden.all():
         return out
@@ -457,7 +456,7 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
     bends = np.diff(steps)  # bends[t] is the change between the steps from t and from t + 1
     for t in range(int(np.argmin(hidden)) - 1, -1, -1):
         later = bends[t + 1 : t + FRAMES_AFTER_EXIT]
-        if len(later) < FRAMES_AFTER_EXIT - 1 or not later.sum() > SPEED_GAIN * steps[t + 1]:
+        if len(later) < FRAMES_AFTER_EXIT - 1 or not later.sum() > speed_gain * steps[t + 1]:
             continue
         if abs(bends[t]) <= max(LEAP_RATIO * np.abs(later).max(), LEAST_LEAP_PX):
             continue

@@ -21,8 +21,6 @@ from vinetrack.video.strip import Strip
 
 # Frames before and after the passage of the edge over which the weight of a pixel's values falls to 1/e (chosen)
 MEMORY_FRAMES = 6.0
-RIDGE_WEIGHT = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)
-NEIGHBOUR_DECAY = 0.93  # Factor by which the weight of neighbours falls per column (derived)
 # Standard deviation, grey levels, of a pixel about the mean of its neighbours, used where the pixel was never visible
 TEXTURE_SD = 12.0
 # Prior standard deviation of relative amplitude and level of the contrast in one frame (chosen)
@@ -95,6 +93,8 @@ def hold_at_rest(edge: Floats, informative: NDArray[np.bool_]) -> Floats:
 
 def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeState:
     """Estimate the brightness of film and background at every pixel, given the edge."""
+    ridge_weight = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)
+    neighbour_decay = 0.93  # Factor by which the weight of neighbours falls per column (derived)
     early, late = _passage_frames(state, strip.values.shape[2])
     sums = edge_kernels.gather(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
@@ -102,11 +102,11 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     )  # fmt: skip
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
-    appearance = edge_kernels.solve(sums, RIDGE_WEIGHT, NEIGHBOUR_DECAY, middle, strip.noise, TEXTURE_SD)
+    appearance = edge_kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     film_all_along = _film_at_start(state, appearance)
     if film_all_along.any():
         sums[5:8, :, film_all_along] = 0.0
-        appearance = edge_kernels.solve(sums, RIDGE_WEIGHT, NEIGHBOUR_DECAY, middle, strip.noise, TEXTURE_SD)
+        appearance = edge_kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     return replace(state, appearance=appearance)
 
 
@@ -258,7 +258,6 @@ ASSUMED_EXPOSURE = 0.25  # Exposure over frame period until it is estimated (cho
 # Ratio of the misfit with the stated exposure to the least of any exposure, above which the stated one is contradicted
 # (measured)
 CONTRADICTION_RATIO = 1.01
-LARGEST_LAG_STEP_PX = 4.0  # Largest change of a row's lag in one round (chosen)
 
 
 OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel to a picture out of focus (chosen)
@@ -269,12 +268,13 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
     the core frames with less motion blur; frames in which a door may still stand in front of the tip are not among
     them. Shapes: fit (n_frames, 6).
     """
+    largest_lag_step_px = 4.0  # Largest change of a row's lag in one round (chosen)
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
         by_row = row_sums(strip, state, fit, slow)
         step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
-        step = np.clip(step, -LARGEST_LAG_STEP_PX, LARGEST_LAG_STEP_PX)
+        step = np.clip(step, -largest_lag_step_px, largest_lag_step_px)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
         state = replace(state, lag=lag, edge=state.edge - lead)
     # 16: frames from which the blur is estimated (chosen)

@@ -13,24 +13,19 @@ from vinetrack.core.records import Bools, Floats
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
 
-AROUND_PX = 40  # Columns on either side of the edge that are compared (chosen)
-CLEAR_STEP_PX = 2.0  # Mean step of three frames above which a copy can be told from slow growth (chosen)
-
-# Side of the blocks that are compared (derived)
-TORN_BLOCK_PX, TORN_RUN = 16, 12
-
 
 def torn_frames(luma: NDArray[Any]) -> Bools:
     """Frames in which part of a row of blocks is unlike the frames before and after: decoded from damaged data. A front
     that passes leaves a block between its values before and after; a tear lies outside both. Shapes: luma (n_frames,
     height, width) → (n_frames,).
     """
+    torn_block_px, torn_run = 16, 12  # Side of the blocks that are compared (derived)
     n, height, width = luma.shape
-    rows, columns = height // TORN_BLOCK_PX, width // TORN_BLOCK_PX
-    if n < 6 or rows == 0 or columns < TORN_RUN:
+    rows, columns = height // torn_block_px, width // torn_block_px
+    if n < 6 or rows == 0 or columns < torn_run:
         return np.zeros(n, dtype=bool)
-    cropped = luma[:, : rows * TORN_BLOCK_PX, : columns * TORN_BLOCK_PX]
-    grid = (rows, TORN_BLOCK_PX, columns, TORN_BLOCK_PX)
+    cropped = luma[:, : rows * torn_block_px, : columns * torn_block_px]
+    grid = (rows, torn_block_px, columns, torn_block_px)
     block = np.array([picture.reshape(grid).mean(axis=(1, 3), dtype=np.float32) for picture in cropped])
     block -= np.median(block - np.median(block, axis=0), axis=(1, 2))[:, None, None]  # flicker
     excess = np.zeros_like(block)
@@ -43,7 +38,7 @@ def torn_frames(luma: NDArray[Any]) -> Bools:
     unit = 1.0 if luma.dtype == np.uint8 else max(float(block.max()), 1.0) / 255
     # 4.0, 4.0: distance of a block outside them (chosen)
     limit = 4.0 * unit + 4.0 * np.quantile(excess, 0.75, axis=0)
-    return np.asarray((excess > limit).sum(axis=2).max(axis=1) >= TORN_RUN)
+    return np.asarray((excess > limit).sum(axis=2).max(axis=1) >= torn_run)
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:
@@ -73,13 +68,15 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
     compared with that where the edge moves, and the edge must stand still between frames that show it moving on.
     Shapes: edge_px (n_frames,) → (n_frames,).
     """
+    around_px = 40  # Columns on either side of the edge that are compared (chosen)
+    clear_step_px = 2.0  # Mean step of three frames above which a copy can be told from slow growth (chosen)
     n, _, columns = strip.values.shape
     seen_px = np.where(np.isfinite(edge_px), edge_px, 0.0)
-    low = np.clip(seen_px - AROUND_PX, 0, columns - 1).astype(int)
-    high = np.maximum(np.clip(seen_px + AROUND_PX, 1, columns).astype(int), low + 1)
+    low = np.clip(seen_px - around_px, 0, columns - 1).astype(int)
+    high = np.maximum(np.clip(seen_px + around_px, 1, columns).astype(int), low + 1)
     change = np.where(np.isfinite(edge_px), _changes_between(strip.values, low, high) * strip.scale, np.inf)
     moving = np.zeros(n, dtype=bool)
-    moving[1:] = np.diff(edge_px) > CLEAR_STEP_PX / 2
+    moving[1:] = np.diff(edge_px) > clear_step_px / 2
     median_change = float(np.median(change[moving])) if moving.any() else np.inf
     repeated = np.zeros(n, dtype=bool)
     for i in range(2, n - 1):
@@ -87,7 +84,7 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
         # 0.1, 0.15: A copy moves less than this part of a step, and its picture changes by less than this
         # part of the median (chosen)
         stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * mean_step
-        repeated[i] = mean_step > CLEAR_STEP_PX and stands and change[i] < 0.15 * median_change
+        repeated[i] = mean_step > clear_step_px and stands and change[i] < 0.15 * median_change
     return repeated
 
 

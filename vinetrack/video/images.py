@@ -100,9 +100,6 @@ BAYER_CODES = frozenset({1, 2, 3, 4, 5, 6})  # Codes of colour filters of 2 by 2
 EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
 
 
-FRACTION_S = 2.0**-32  # Unit of times and exposures in a cine (defined)
-
-
 def inspect_cine(path: Path) -> Recording:
     """Read the header of a Phantom `.cine`."""
     name = path.name
@@ -198,6 +195,7 @@ def _cine_clock(
     name: str, setup: bytes, blocks: dict[int, bytes], count: int
 ) -> tuple[float | None, float | None, Floats | None, tuple[str, ...]]:
     """Rate and exposure of capture: from the stamps of the frames where they exist, else as the camera was set."""
+    fraction_s = 2.0**-32  # Unit of times and exposures in a cine (defined)
     notes = []
     length, rate = struct.unpack_from("<H", setup, MARK_AT + 2)[0], float(struct.unpack_from("<I", setup, RATE_AT)[0])
     exposure_s = struct.unpack_from("<I", setup, SHUTTER_US_AT)[0] * 1e-6
@@ -206,7 +204,7 @@ def _cine_clock(
     # 1002, 1003: types of the tagged blocks of a cine
     times_s, stored_exposures = None, blocks.get(1003, b"")
     if len(stored_exposures) >= 4 * count:
-        exposures_s = np.frombuffer(stored_exposures, "<u4", count) * FRACTION_S
+        exposures_s = np.frombuffer(stored_exposures, "<u4", count) * fraction_s
         exposure_s = float(np.median(exposures_s)) or exposure_s
         if np.ptp(exposures_s) > EXPOSURE_TOLERANCE * exposure_s:
             span = f"{1e6 * exposures_s.min():.4g} to {1e6 * exposures_s.max():.4g} µs"
@@ -216,7 +214,7 @@ def _cine_clock(
         pairs = np.frombuffer(stamps, "<u4", 2 * count).reshape(-1, 2).astype(np.int64)
         # The lowest two bits flag synchronisation. Integers are subtracted: a float cannot hold both words.
         ticks = ((pairs[:, 1] - pairs[0, 1]) << 32) + (pairs[:, 0] & ~3)
-        times_s = (ticks - ticks[0]) * FRACTION_S
+        times_s = (ticks - ticks[0]) * fraction_s
         period_s = float(np.median(np.diff(times_s)))
         if period_s <= 0:
             times_s = None
@@ -351,10 +349,6 @@ def _as_number(text: str) -> float:
     except (ValueError, ZeroDivisionError):
         return 0.0
 
-
-TAG_EXPOSURE = 33434  # Defined by TIFF/EP (ISO 12234-2): exposure time
-
-TAG_FRAME_RATE = 51044  # Defined by CinemaDNG: frame rate
 
 JPEG_END, PNG_END = b"\xff\xd9", b"IEND\xaeB`\x82"
 
@@ -539,16 +533,18 @@ def _dng_clock(file: Path) -> tuple[float | None, float | None]:
     """Capture rate and exposure of a CinemaDNG frame (tags 51044 and 33434); None where absent."""
     import tifffile
 
+    tag_exposure = 33434  # Defined by TIFF/EP (ISO 12234-2): exposure time
+    tag_frame_rate = 51044  # Defined by CinemaDNG: frame rate
     values: dict[int, float] = {}
     with tifffile.TiffFile(file) as tiff:
         for page in _dng_pages(tiff):
-            for code in (TAG_FRAME_RATE, TAG_EXPOSURE):
+            for code in (tag_frame_rate, tag_exposure):
                 if code in page.tags and code not in values:
                     value = page.tags[code].value
                     top, bottom = (value[0], value[1]) if isinstance(value, tuple) else (value, 1)
                     if bottom:
                         values[code] = float(top) / float(bottom)
-    return values.get(TAG_FRAME_RATE), values.get(TAG_EXPOSURE)
+    return values.get(tag_frame_rate), values.get(tag_exposure)
 
 
 def _read_dng(file: Path) -> NDArray[np.uint16]:

@@ -313,9 +313,6 @@ MIN_SCORE, PEAK_FRACTION, UNCHANGED_COLUMN_COST = 3.0, 0.15, 0.2
 END_FRAMES = 5
 # Difference of initial and final appearance, in units of the noise, at which a pixel has half a vote (chosen)
 HALF_VOTE_NOISE = 4.0
-RESIDUAL_CLIP = 3.0  # Residual, in units of the noise, at which residuals are clipped (chosen)
-
-MIN_CHANGED_ROWS = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -552,8 +549,9 @@ def clipped_residual_sums(
     strip (n_frames, n_across, n_along); scale, offset, path (n_frames,); appearance (2, n_across, end − begin) →
     (n_frames,).
     """
+    residual_clip = 3.0  # Residual, in units of the noise, at which residuals are clipped (chosen)
     n, rows, _ = strip.shape
-    unit, largest_square, totals = np.float32(1 / noise), np.float32(RESIDUAL_CLIP * RESIDUAL_CLIP), np.zeros(n)
+    unit, largest_square, totals = np.float32(1 / noise), np.float32(residual_clip * residual_clip), np.zeros(n)
     for t in range(n):
         gain, level = np.float32(scale[t]), np.float32(offset[t])
         front = min(max(math.ceil(path[t]), begin), end)
@@ -590,6 +588,7 @@ def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
     """Track the edge of a vine that bends or sweeps, as the column up to which the scene has changed. Returns edge and
     its standard error, each of shape (n_frames,), px.
     """
+    min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
     values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     values += strip.offset[:, None, None].astype(np.float32)
     first = np.median(values[:END_FRAMES], axis=0)
@@ -597,8 +596,8 @@ def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
     threshold = 4.0 * max(strip.noise, 3.0)
     changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
     smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
-    evidence = (MIN_CHANGED_ROWS - np.minimum(smooth, 3 * MIN_CHANGED_ROWS)).astype(np.float32)
-    ever = np.flatnonzero((smooth > MIN_CHANGED_ROWS).mean(axis=0) > 0.05)
+    evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
+    ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
     if len(ever) < 10:
         raise ValueError("nothing moves along the axis")
     evidence[:, : ever[0]] = 0.0

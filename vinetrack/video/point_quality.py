@@ -230,7 +230,6 @@ def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
 SHORTEST_BARE_PX = 10  # Fewest columns in a row that must show background again (chosen)
 # Parts of the columns passed, from the first, in at least one of which film is the majority (derived)
 FILM_PARTS = (0.7, 0.35, 0.175)
-FLIGHT_SPEED_RATIO = 1.35  # Ratio of the speeds after and before, below which the motion is still growth (chosen)
 
 
 @dataclass(frozen=True)
@@ -311,6 +310,7 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     backwards from the last column passed: first the flying object (no longer than the tube is wide), then columns that
     look as they did before anything came, then film. Shapes: path (n_frames,).
     """
+    flight_speed_ratio = 1.35  # Ratio of the speeds after and before, below which the motion is still growth (chosen)
     columns, frames = np.arange(passed[0], passed[1]), len(path)
     if len(columns) < 5 * SHORTEST_BARE_PX or frames < 8:
         return passed[1]
@@ -327,8 +327,8 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     # An object that comes out is ahead of the film at once by its own length, however slowly it then flies.
     exit_frame = int(arrival[bare_from])
     leap = float(np.diff(path)[max(exit_frame - 2, 0) : exit_frame + 2].max(initial=0.0))
-    leaps = leap > max(FLIGHT_SPEED_RATIO * growth, growth + SHORTEST_BARE_PX / 2)
-    flies_on = flight > FLIGHT_SPEED_RATIO * growth or leaps
+    leaps = leap > max(flight_speed_ratio * growth, growth + SHORTEST_BARE_PX / 2)
+    flies_on = flight > flight_speed_ratio * growth or leaps
     return int(columns[bare_from]) + 1 if flies_on else passed[1]
 
 

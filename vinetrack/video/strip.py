@@ -223,16 +223,12 @@ REFERENCE_FRAMES = 15  # Frames whose median is the reference (derived)
 SHIFT_PIXELS = 9000  # Pixels of the bands used to measure a shift, evenly spaced (derived)
 # Pixels used to measure flicker alone, and to decide whether to measure shake with SHIFT_PIXELS (derived)
 LEVEL_PIXELS = 3000
-MEDIAN_EVERY = 4  # Stride of the pixels used for medians (derived)
 # Median shift over its standard error, with LEVEL_PIXELS, below which no shake is measured (derived)
 NOISE_SHIFT_RATIO = 1.5
 SHAKE_FLOOR_PX = 0.04  # Smaller shake is not removed (chosen)
 SHAKE_ROUNDS = 4  # Number of registration iterations, each from the result of the one before (chosen)
 SHAKE_STEP_PX = 1.5  # Maximum shift per iteration (chosen)
 SHAKE_CONVERGED_PX = 0.02  # Change of the shift below which the iteration has converged (chosen)
-# Difference of the shifts measured in the two halves of the background, over their sum, below which the camera is taken
-# to have shaken
-HALF_DISAGREEMENT = 0.7
 
 
 @dataclass(frozen=True)
@@ -319,6 +315,9 @@ def shifts_agree(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], un
     and its error differs between the halves; therefore each half is iterated to convergence. Shapes: luma (n_frames,
     height, width).
     """
+    # Difference of the shifts measured in the two halves of the background, over their sum, below which the
+    # camera is taken to have shaken
+    half_disagreement = 0.7
     shifts, errors = [], []
     for half in halves:
         shift, sd = np.zeros((len(luma), 2)), np.zeros(len(luma))
@@ -333,7 +332,7 @@ def shifts_agree(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], un
     difference, total = np.hypot(*(first - second).T), np.hypot(*(first + second).T)
     strongest = difference + total >= np.quantile(difference + total, 0.75)
     sd_sum = float(np.median(errors[0] + errors[1]))
-    return float(np.mean(difference[strongest])) < max(HALF_DISAGREEMENT * float(np.mean(total[strongest])), 2 * sd_sum)
+    return float(np.mean(difference[strongest])) < max(half_disagreement * float(np.mean(total[strongest])), 2 * sd_sum)
 
 
 def _reference_at_whole_pixels(
@@ -477,15 +476,16 @@ def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: f
     has shape (n_frames, n_pixels), `basis` (4, n_pixels). Returns the coefficients, shape (n_frames, 4), and the
     standard error of the third, shape (n_frames,).
     """
+    median_every = 4  # Stride of the pixels used for medians (derived)
     n, count = data.shape
     out, error = np.zeros((n, 4)), np.full(n, np.inf)
     residuals, inlier = np.empty(count), np.ones(count)
     normal_matrix, bins_per_unit = basis @ basis.T + ridge, unit * BINS_PER_LEVEL
     # A sample of the pixels suffices for the median of the residuals.
-    n_sampled = (count + MEDIAN_EVERY - 1) // MEDIAN_EVERY
+    n_sampled = (count + median_every - 1) // median_every
     sampled, sampled_inlier, all_sampled = np.empty(n_sampled), np.empty(n_sampled), np.ones(n_sampled)
     for k in range(n_sampled):
-        sampled[k] = basis[0, k * MEDIAN_EVERY]
+        sampled[k] = basis[0, k * median_every]
     reference_median = max(median(sampled, all_sampled, bins_per_unit), 1e-9)
     for t in range(n):
         inlier[:] = 1.0
@@ -503,16 +503,16 @@ def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: f
             for k in range(count):
                 residuals[k] = abs(values[k] - a * basis[0, k] - b * basis[1, k] - c * basis[2, k] - d * basis[3, k])
             for k in range(n_sampled):
-                sampled[k], sampled_inlier[k] = residuals[k * MEDIAN_EVERY], inlier[k * MEDIAN_EVERY]
+                sampled[k], sampled_inlier[k] = residuals[k * median_every], inlier[k * median_every]
             scale = 1.4826 * median(sampled, sampled_inlier, bins_per_unit) + 0.3
             out[t, 0], out[t, 1], out[t, 2], out[t, 3] = a, b, c, d
             error[t] = scale * np.sqrt(max(inverse[2, 2], 0.0))
             if iteration == 0:
                 for k in range(n_sampled):
-                    sampled[k] = values[k * MEDIAN_EVERY]
+                    sampled[k] = values[k * median_every]
                 gain = median(sampled, all_sampled, bins_per_unit) / reference_median
                 for k in range(n_sampled):
-                    sampled[k] = abs(values[k * MEDIAN_EVERY] - gain * basis[0, k * MEDIAN_EVERY])
+                    sampled[k] = abs(values[k * median_every] - gain * basis[0, k * median_every])
                 gain_only_scale = 1.4826 * median(sampled, all_sampled, bins_per_unit) + 0.3
                 if gain_only_scale < scale:
                     scale = gain_only_scale

@@ -372,9 +372,6 @@ def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
 SETTINGS = "experiment.yaml"
 
 
-MOST_LOOKS = 12  # Most recordings that are tracked, a second or two each (chosen)
-
-
 class Surveyor:
     """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial. `looked_into` are the
     trials whose recordings were tracked.
@@ -416,14 +413,15 @@ class Surveyor:
 
 def _one_per_condition(trials: list[Trial]) -> list[Trial]:
     """The recordings to look into: all of a few, else one of each condition, or of each vine where those are many."""
-    if len(trials) <= MOST_LOOKS:
+    most_looks = 12  # Most recordings that are tracked, a second or two each (chosen)
+    if len(trials) <= most_looks:
         return trials
     conditions = list({(trial.condition, trial.m_per_px): trial for trial in reversed(trials)}.values())[::-1]
-    if len(conditions) <= MOST_LOOKS:
+    if len(conditions) <= most_looks:
         return conditions
     vines = list({(trial.vine, trial.m_per_px): trial for trial in reversed(trials)}.values())[::-1]
     others = [trial for trial in conditions if trial not in vines]
-    return [*vines, *others][:MOST_LOOKS]
+    return [*vines, *others][:most_looks]
 
 
 def _stated_facts(

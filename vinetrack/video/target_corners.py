@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 # squares for the crossing, both slants, blur, contrast and ramp uses every pixel beside the edges. Symmetry alone
 # (OpenCV's `cornerSubPix`) leaves 0.03 px in the same pictures.
 
-HALF_WINDOW_PX = 12  # Half the side of the window (derived)
 EDGE_SHARE = 0.42  # Part of a square over which its edges are followed from the corner (chosen)
 
 
@@ -75,7 +74,8 @@ def _windows(
     pixel counts where, in steps of the pattern from the detected corner, it lies within EDGE_SHARE both ways and within
     `free_share`, less the blur, of one of the edges.
     """
-    reach = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1)
+    half_window_px = 12  # Half the side of the window (derived)
+    reach = np.arange(-half_window_px, half_window_px + 1)
     grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     nearest = np.rint(corners_px).astype(int)
     places = nearest[:, None, :] + grid[None]
@@ -415,8 +415,6 @@ def _no_checkerboard(grey: Grey, across: int, down: int) -> str:
 #
 # Sizes in millimetres cannot be seen; the ratio of a marker to its square can.
 
-MOST_SQUARES = 40  # Most squares along a side (chosen)
-
 
 @dataclass(frozen=True)
 class BoardSeen:
@@ -459,8 +457,9 @@ def _charuco(corners: Any, ids: NDArray[np.int32], family: str) -> BoardSeen | N
 
 def _layouts(n_markers: int) -> Iterator[tuple[int, int]]:
     """Squares across and down of the boards with this many markers, or a few more."""
-    for across in range(2, MOST_SQUARES + 1):
-        for down in range(2, MOST_SQUARES + 1):
+    most_squares = 40  # Most squares along a side (chosen)
+    for across in range(2, most_squares + 1):
+        for down in range(2, most_squares + 1):
             # 2: markers at the end of a board that may be hidden (chosen)
             if n_markers <= across * down // 2 <= n_markers + 2:
                 yield across, down

@@ -56,11 +56,6 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
 
-MOST_RECUTS = 3  # Most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
-# Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows or columns
-# (chosen)
-FIRST_SLOPE = 0.08
-
 
 def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tuple[Strip, Outline] | None:
     """Cut the strip about the tube that grows along an axis. An outline is found for anything that changes in order.
@@ -68,12 +63,17 @@ def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tu
     the middle shows. Returns the strip, centred on the tube, and the tube's outline in it; None where no single front
     passes along the axis, or, none along the middle of what it leaves behind.. Shapes: luma (n_frames, height, width).
     """
+    # Most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
+    most_recuts = 3
+    # Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows
+    # or columns (chosen)
+    first_slope = 0.08
     if front_share_of(axis) < LEAST_FRONT_SHARE:
         return None
-    strip = first = cut_along(luma, snap_to_grid(axis, FIRST_SLOPE * axis.width_px), 0.65 * axis.width_px + 3)
+    strip = first = cut_along(luma, snap_to_grid(axis, first_slope * axis.width_px), 0.65 * axis.width_px + 3)
     tube = outline(strip, outline_stretches(axis))
     try:
-        for _ in range(2 * MOST_RECUTS if axis.bends else MOST_RECUTS):
+        for _ in range(2 * most_recuts if axis.bends else most_recuts):
             before, strip = strip, recentred_strip(luma, strip, tube)
             if strip is before:
                 break
@@ -246,9 +246,6 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
 FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)
 
 GIVEN_AXIS_MARGIN = 0.08  # Width added to a given axis, as a fraction of its length (derived)
-# Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing moves
-# (chosen)
-MOSTLY_LOST = 0.5
 
 STABILISED_PX = 0.1  # Error left after a shaken camera was stabilised on the still background (measured)
 
@@ -414,9 +411,12 @@ def _slow_error(strip: Strip, followed: Positions) -> Floats:
 
 def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
     """The message for a recording in which no frame is moving."""
+    # Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing
+    # moves (chosen)
+    mostly_lost = 0.5
     outlying_px = np.minimum(np.hypot(total_px, quality.departure_px), LOST_SIGMA_PX)
     total_px = np.where(total_px < LOST_SIGMA_PX, outlying_px, total_px)
-    if np.mean(~(total_px < LOST_SIGMA_PX)) > MOSTLY_LOST:
+    if np.mean(~(total_px < LOST_SIGMA_PX)) > mostly_lost:
         return (
             "something moves, but its edge is too vague to be followed: film it nearer, with more light or"
             " contrast, or at more frames a second"
