@@ -22,7 +22,7 @@ from chrome import Chrome
 from served import Served, Visitor
 
 from vinetrack.pages.campaign import choice_in_use, predict_choice
-from vinetrack.pages.explorer_server import open_campaign
+from vinetrack.pages.page import open_campaign
 
 SIZE = "size_reservoir_depletion.gamma"
 

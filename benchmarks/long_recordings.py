@@ -38,7 +38,7 @@ from pathlib import Path
 from vinetrack.core.records import Trial
 from vinetrack.video.frames import DECODER_THREADS
 from vinetrack.video.track import track_recording
-from vinetrack.pages.clip_views import warm_up
+from vinetrack.pages.setup_server import warm_up
 def peak():
     # Of this process alone: what getrusage says includes the memory of the process that started it.
     lines = Path("/proc/self/status").read_text().splitlines()

@@ -30,7 +30,7 @@ _HOMES = {
     "fit": "vinetrack.interface.calls",
     "load": "vinetrack.interface.loaded",
     "make_model": "vinetrack.dynamics.model",
-    "planned_trial": "vinetrack.experiment.planned",
+    "planned_trial": "vinetrack.experiment.sheet",
     "power": "vinetrack.interface.calls",
     "predict": "vinetrack.inference.fit",
     "predict_vine": "vinetrack.planning.prediction",
@@ -38,7 +38,7 @@ _HOMES = {
     "read_experiment": "vinetrack.experiment.folder",
     "refit": "vinetrack.inference.fit",
     "simulate": "vinetrack.dynamics.simulate",
-    "tracks_from_frame": "vinetrack.interface.data_frames",
+    "tracks_from_frame": "vinetrack.interface.loaded",
 }
 
 __all__ = ["__version__", "effects", *_HOMES]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.core.yaml_document import parse_yaml, with_value
+from vinetrack.core.tables import parse_yaml, with_value
 from vinetrack.experiment.folder import save_model
 
 # A key is set in place, and nothing else of the file changes.

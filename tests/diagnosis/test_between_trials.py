@@ -11,15 +11,13 @@ from grown import Pairs, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.between_gain import Difference
 from vinetrack.diagnosis.between_trials import between_fits, confounded, differences, significant
-from vinetrack.diagnosis.likelihood_ratio import MAX_INFLATION, LikelihoodRatio, robust_ratio
+from vinetrack.diagnosis.likelihood_ratio import MAX_INFLATION, Difference, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit import fit, refit
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.parameters import EXPONENT
+from vinetrack.inference.fit_result import EXPONENT, Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 B = "eversion_damping.B"

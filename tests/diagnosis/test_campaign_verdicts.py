@@ -21,24 +21,30 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.core.units import with_error
 from vinetrack.diagnosis import likelihood_ratio
-from vinetrack.diagnosis.between_gain import film_gain
 from vinetrack.diagnosis.candidate_fits import distinct_starts, start_values
-from vinetrack.diagnosis.candidates import (
+from vinetrack.diagnosis.likelihood_ratio import (
+    LikelihoodRatio,
+    _compatible_with_none,
+    answer_set,
+    film_gain,
+    in_sigmas,
+    sizes_of,
+)
+from vinetrack.diagnosis.misfit_tests import noise_in_motion_p
+from vinetrack.diagnosis.remarks import Remark
+from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
+from vinetrack.diagnosis.score_test import (
     RANGE_SHARE_BESIDE_SLIP,
     effect_sensitivities,
     is_plausible,
     shapes_of,
     slip_of,
 )
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_none, answer_set, in_sigmas, sizes_of
-from vinetrack.diagnosis.misfit_tests import noise_in_motion_p
-from vinetrack.diagnosis.remarks import Remark
-from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
 from vinetrack.effects import catalogue
 from vinetrack.experiment.schema import with_names
+from vinetrack.inference.fit import values_for_trial
+from vinetrack.inference.fit_result import group_names, groups_of, make_layout
 from vinetrack.inference.optimiser import variance_floor
-from vinetrack.inference.parameters import group_names, groups_of, make_layout
-from vinetrack.inference.prediction_band import values_for_trial
 from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.laboratory.tracks import Vine
 from vinetrack.laboratory.tracks import campaign as laboratory_campaign

@@ -15,20 +15,19 @@ import vinetrack as vt
 import vinetrack.inference.fit
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis import candidate_fits
-from vinetrack.diagnosis import candidates as hypotheses
+from vinetrack.diagnosis import score_test as hypotheses
 from vinetrack.diagnosis.candidate_fits import SubsetFitter, full_fit, with_curves, without_curves
-from vinetrack.diagnosis.candidates import whole_shapes
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.remarks import Remark
+from vinetrack.diagnosis.score_test import whole_shapes
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, pushes, select_effects, slack_fit
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.fit_result import YIELD_PRESSURE, Fit
 from vinetrack.inference.optimiser import relative_residual
-from vinetrack.inference.parameters import YIELD_PRESSURE
 from vinetrack.inference.solving import solve_onward
 from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 

@@ -21,8 +21,8 @@ from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
 from vinetrack.diagnosis.missing_force import RankedLaw
-from vinetrack.diagnosis.odd_trials import LostFrames, with_lost_frames
 from vinetrack.diagnosis.remarks import remark
+from vinetrack.diagnosis.replicates import LostFrames, with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
 from vinetrack.diagnosis.selection import contradictions
 from vinetrack.effects import EffectError, own_effects

@@ -13,13 +13,13 @@ from hidden_truth import Pairs, grown, sheet
 from scipy.stats import chi2, norm
 
 import vinetrack as vt
-from vinetrack.diagnosis import effect_sets, selection
-from vinetrack.diagnosis.effect_sets import EffectSets
+from vinetrack.diagnosis import selection
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
 from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.diagnosis.score_test import FamilyTest
+from vinetrack.diagnosis.selection import EffectSets
 from vinetrack.effects import find_effect
 
 NAMES = ("air_drag", "leak", "tail_friction")
@@ -53,7 +53,7 @@ def pairs(worth: float) -> list[LikelihoodRatio]:
 def no_refit_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Likelihoods and scatter are given; some tests replace this, and campaigns, made once, come before it."""
     monkeypatch.setattr(EffectSets, "_refitted", lambda *_: None)
-    monkeypatch.setattr(effect_sets, "robust_ratio", lambda *_: 1.0)
+    monkeypatch.setattr(selection, "robust_ratio", lambda *_: 1.0)
 
 
 @pytest.mark.parametrize(("worth", "enough"), [(3.0, False), (5.9, False), (6.1, True)])
@@ -89,7 +89,7 @@ def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(gai
 def test_a_larger_set_must_gain_more_where_the_size_it_adds_scatters_more_widely(
     scattered: int, gain: float, better: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(effect_sets, "robust_ratio", lambda _, names: 2.0 if NAMES[scattered] in names else 1.0)
+    monkeypatch.setattr(selection, "robust_ratio", lambda _, names: 2.0 if NAMES[scattered] in names else 1.0)
     sets = sets_of([of(NAMES[:1], TRIPLE - 50)], {NAMES[1]: 5.0})
     assert sets.is_better(of(NAMES[:2], TRIPLE - 50 + gain**2 / 2, inflation=4.0)) == better
 
@@ -133,7 +133,7 @@ def test_a_smaller_set_that_is_better_than_all_of_its_size_is_followed(monkeypat
         return of(tuple(effect.name for effect in effects), fit.log_likelihood)
 
     monkeypatch.setattr(EffectSets, "_refitted", refitted)
-    monkeypatch.setattr(effect_sets, "likelihood_ratio", ratio)
+    monkeypatch.setattr(selection, "likelihood_ratio", ratio)
     sets = sets_of([of(NAMES[:2], TRIPLE - 40.0)])
     assert sets.prune(of(NAMES, TRIPLE))
     assert set(sets.of_size(2)[0].names) == set(NAMES[1:])
@@ -155,7 +155,7 @@ def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(
         return of(tuple(effect.name for effect in effects), fit.log_likelihood)
 
     monkeypatch.setattr(EffectSets, "_refitted", refitted)
-    monkeypatch.setattr(effect_sets, "likelihood_ratio", ratio)
+    monkeypatch.setattr(selection, "likelihood_ratio", ratio)
     assert bool(sets_of(pairs(30.0)).superfluous(of(NAMES, TRIPLE))) != needed
 
 

@@ -17,7 +17,16 @@ from scipy.stats import multivariate_normal
 import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
+    CONSTANT_AT_START,
+    KEPT_VARIANCE,
+    LENGTH_SCALES,
+    RELATIVE_AMPLITUDES,
     SDIRK_GAMMA,
+    ZERO_AT_START,
+    Domain,
+    SmoothForce,
+    candidate_domains,
+    covariance_modes,
     force_sensitivities,
     integrate_responses,
     motions_of,
@@ -26,17 +35,6 @@ from vinetrack.diagnosis.force_inversion import (
     uniform_splines,
 )
 from vinetrack.diagnosis.force_laws import Law, SearchPoint, _with_updated_motions, normal_equations
-from vinetrack.diagnosis.force_surface import (
-    CONSTANT_AT_START,
-    KEPT_VARIANCE,
-    LENGTH_SCALES,
-    RELATIVE_AMPLITUDES,
-    ZERO_AT_START,
-    Domain,
-    SmoothForce,
-    candidate_domains,
-    covariance_modes,
-)
 from vinetrack.diagnosis.learned_force import (
     LEARNED_COLUMNS,
     NEGLIGIBLE_LOG_RATIO,

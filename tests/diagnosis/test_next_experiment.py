@@ -13,7 +13,7 @@ import pytest
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
+from vinetrack.diagnosis.further_trials import Limits, NextExperiment, next_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow

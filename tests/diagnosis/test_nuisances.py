@@ -16,9 +16,8 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import vinetrack as vt
-from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis import misfit_tests as questions
-from vinetrack.diagnosis.effect_sets import confounders_of, size_not_excluded
+from vinetrack.diagnosis import score_test as hypotheses
 from vinetrack.diagnosis.ladder import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
@@ -28,6 +27,7 @@ from vinetrack.diagnosis.misfit_tests import (
 )
 from vinetrack.diagnosis.result import Confounder
 from vinetrack.diagnosis.score_test import fit_columns, levers_of
+from vinetrack.diagnosis.selection import confounders_of, size_not_excluded
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit

@@ -15,7 +15,6 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis import misfit_tests, score_test
-from vinetrack.diagnosis.candidates import CandidateShape, EffectSensitivities, is_plausible
 from vinetrack.diagnosis.likelihood_ratio import (
     LikelihoodRatio,
     answer_set,
@@ -33,10 +32,18 @@ from vinetrack.diagnosis.misfit_tests import (
     Structure,
     structure_from_scores,
 )
-from vinetrack.diagnosis.score_test import Scores, _marginalisation, _marginalised, family_test
+from vinetrack.diagnosis.score_test import (
+    CandidateShape,
+    EffectSensitivities,
+    Scores,
+    _marginalisation,
+    _marginalised,
+    family_test,
+    is_plausible,
+)
 from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference.fit_result import Number
-from vinetrack.inference.mixed_effects import FitState
+from vinetrack.inference.marginal_likelihood import FitState
 
 QUIET = Structure(0.0, 0, 1.0, 0.0)
 

@@ -9,7 +9,7 @@ import pytest
 from hand_sheet import GOOD, two_vines, write
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.experiment.planned import planned_sheet, planned_trial
+from vinetrack.experiment.sheet import planned_sheet, planned_trial
 
 VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
 

@@ -11,8 +11,8 @@ from pydantic import BaseModel
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
+from vinetrack.core.tables import read_yaml
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.core.yaml_document import read_yaml
 from vinetrack.experiment.reference import (
     column_entries,
     picture_entries,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import toeplitz
 
-from vinetrack.inference.mixed_effects import FitState, MixedProblem
+from vinetrack.inference.marginal_likelihood import FitState, MixedProblem
 
 RHO, SIGMA = 0.45, 0.3
 

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from lsoda_vine import as_track
 
-from vinetrack.inference.gauge_noise import DenoisedTrace, Growth, denoised_traces, gauge_clocks
-from vinetrack.inference.gauge_readings import gauge_readings, noise_correlation, noise_of_traces, white_noise_sd
+from vinetrack.inference.gauge_noise import (
+    DenoisedTrace,
+    Growth,
+    denoised_traces,
+    gauge_clocks,
+    gauge_readings,
+    noise_correlation,
+    noise_of_traces,
+    white_noise_sd,
+)
 
 TIMES_S = np.arange(0.0, 0.6, 1e-3)
 LET_DOWN = np.interp(TIMES_S, [0.1, 0.12, 0.2, 0.5], [16e3, 3e3, 3e3, 16e3])

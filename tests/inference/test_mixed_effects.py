@@ -14,18 +14,16 @@ from scipy.stats import multivariate_normal
 
 from vinetrack.inference.fit_result import _deviate
 from vinetrack.inference.marginal_likelihood import (
+    FitState,
+    MixedProblem,
+    at_zero_deviations,
     bounded_solve,
+    decrease_within_bounds,
     deviance,
     estimate_between_trial_sd,
     estimate_noise,
     levenberg_marquardt_step,
     marginal,
-)
-from vinetrack.inference.mixed_effects import (
-    FitState,
-    MixedProblem,
-    at_zero_deviations,
-    decrease_within_bounds,
     normal_equations_without_deviations,
     sum_matrix_blocks,
     trial_deviation_sd,

@@ -13,7 +13,6 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
-from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import Fit
@@ -22,6 +21,7 @@ from vinetrack.inference.robust_covariance import recorded_pressures, systematic
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
 from vinetrack.inference.solving import (
     as_recorded,
+    assemble,
     solve_onward,
     trace_error_penalty,
     trace_error_step,

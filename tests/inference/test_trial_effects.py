@@ -11,10 +11,10 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference import trial_effects
-from vinetrack.inference.assemble import log_likelihood
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import FixedTerms, solve
+from vinetrack.inference.solving import log_likelihood
 from vinetrack.inference.trial_effects import (
     products_at_releases,
     residuals_in,

@@ -96,7 +96,7 @@ def test_the_worst_condition_is_one(loaded: LoadedResults, diagnosis: Diagnosis,
 
 
 def test_the_explorer_starts_from_the_same_numbers_and_floors(small_run: Path, loaded: LoadedResults) -> None:
-    from vinetrack.pages.explorer_server import open_campaign
+    from vinetrack.pages.page import open_campaign
 
     campaign = open_campaign(small_run)
     assert dict(campaign.numbers) == {entry.name: entry.value for entry in loaded.fit.numbers}

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import vinetrack as vt
-from vinetrack.interface.plotting import figure_of
+from vinetrack.interface.loaded import figure_of
 
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     name: getattr(vt, name) for name in vt.__all__ if callable(getattr(vt, name))

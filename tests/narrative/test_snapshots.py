@@ -14,7 +14,7 @@ from hand_diagnosis import diagnosis
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.remarks import remark
 from vinetrack.diagnosis.result import VERDICTS, Diagnosis
-from vinetrack.narrative.power_text import further_lines
+from vinetrack.narrative.diagnosis_text import further_lines
 from vinetrack.narrative.verdict_text import summary_facts, verdict_meaning, verdict_sentence
 
 

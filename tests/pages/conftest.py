@@ -9,7 +9,7 @@ from explorer_campaign import SMALL, make_experiment, make_results
 from plain_scene import Plan, plain_scene, write_video
 
 from vinetrack.pages.campaign import Campaign
-from vinetrack.pages.explorer_server import open_campaign
+from vinetrack.pages.page import open_campaign
 
 CLIPS = ("d15 24kPa 1.mp4", "d15 30kPa 1.mp4")
 

@@ -14,8 +14,7 @@ from chrome import Chrome, find_chrome
 from explorer_campaign import film_of, make_experiment, make_results
 from served import Served, Visitor
 
-from vinetrack.core.tables import read_table
-from vinetrack.core.yaml_document import read_yaml
+from vinetrack.core.tables import read_table, read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.pages.setup_server import start_server
 from vinetrack.video.curved_axis import CurvedAxis, axis_from_entry

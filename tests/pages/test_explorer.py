@@ -41,9 +41,9 @@ from vinetrack.pages.campaign import (
     predict_choice,
     slider_range,
 )
-from vinetrack.pages.explorer_server import address as where
-from vinetrack.pages.explorer_server import open_campaign, start_server
 from vinetrack.pages.film_panel import DecodedRecording, RecordingView, recording_view
+from vinetrack.pages.page import address as where
+from vinetrack.pages.page import open_campaign, start_server
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.video.axis import Axis
 

@@ -24,7 +24,7 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_result import Fit
 from vinetrack.pages import controls
 from vinetrack.pages.campaign import BackgroundFit, Campaign
-from vinetrack.pages.explorer_server import open_campaign
+from vinetrack.pages.page import open_campaign
 from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
 

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.core.tables import list_recordings, read_table
-from vinetrack.core.yaml_document import parse_yaml
+from vinetrack.core.tables import list_recordings, parse_yaml, read_table
 from vinetrack.pages.draft_files import (
     SHARED_ROW,
     columns_from_names,

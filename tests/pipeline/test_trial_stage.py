@@ -18,8 +18,7 @@ from plain_scene import Plan, plain_scene, write_video
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
-from vinetrack.pipeline.kept import Kept, packed, unpacked
-from vinetrack.pipeline.trials import analyse_trials, map_unordered
+from vinetrack.pipeline.trials import Kept, analyse_trials, map_unordered, packed, unpacked
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import Tracking, in_metres

@@ -14,13 +14,18 @@ from test_pipeline import write_campaign
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import workflow
-from vinetrack.pipeline.run_stage import RunError, RunPaths, check_before_run, run_chain, run_lines, run_paths
 from vinetrack.pipeline.stages import STAGES
 from vinetrack.pipeline.workflow import (
+    RunError,
+    RunPaths,
     begin_run,
+    check_before_run,
     claim_results,
     command_for_results,
     make_plan,
+    run_chain,
+    run_lines,
+    run_paths,
     shell_prefix,
 )
 
@@ -124,7 +129,7 @@ def test_programs_of_this_python_come_first_without_an_environment_activated() -
 
 @pytest.mark.parametrize("name", ["a{b}", "<b>x"])
 def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path: Path, name: str) -> None:
-    from vinetrack.pipeline.run_stage import check_folder
+    from vinetrack.pipeline.workflow import check_folder
 
     (tmp_path / name).mkdir()
     (tmp_path / name / "trials.csv").write_text("trial\n")

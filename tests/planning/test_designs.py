@@ -12,22 +12,23 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import simulate
-from vinetrack.experiment.planned import planned_trial
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
+from vinetrack.experiment.sheet import planned_trial
 from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
-from vinetrack.planning.fastest_vine import (
+from vinetrack.planning.prediction import (
     GAMMAS,
     Room,
     chamber_for,
     fastest,
+    final_speeds,
     final_with,
     gauge_loss,
+    predict_vine,
     supplied_chamber,
     supplied_loss,
     swept_m3,
 )
-from vinetrack.planning.prediction import final_speeds, predict_vine
 from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
 # The fastest vine: what the laws of scaling say of it, and that a search by brute force finds nothing faster.

@@ -17,7 +17,7 @@ from vinetrack.core import published
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import simulate
-from vinetrack.experiment.planned import planned_trial
+from vinetrack.experiment.sheet import planned_trial
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.prediction import (
     EDGE,

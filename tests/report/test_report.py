@@ -34,9 +34,14 @@ from vinetrack.report.build import (
     build_report,
     speed_sparkline,
 )
-from vinetrack.report.diagnosis_section import DiagnosisResult, diagnosis_section, moved_table, upper_limit_table
-from vinetrack.report.paper_section import paper_section
-from vinetrack.report.section import inline_picture
+from vinetrack.report.section import (
+    DiagnosisResult,
+    diagnosis_section,
+    inline_picture,
+    moved_table,
+    paper_section,
+    upper_limit_table,
+)
 
 # The report, from tables written by hand: its first screen, a single file, and no external requests.
 

@@ -14,8 +14,7 @@ from scipy.signal import savgol_filter
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.tracks.position_noise import ar1_noise
-from vinetrack.tracks.smoothed_positions import detect_smoothing
+from vinetrack.tracks.position_noise import ar1_noise, detect_smoothing
 
 TIME_S = np.arange(150) / 1000.0
 TRIAL = Trial(name="t", capture_fps=1000.0)

@@ -13,11 +13,14 @@ from scipy.special import ndtr
 from vinetrack.experiment.settings import Charuco, Checkerboard, TwoPoints
 from vinetrack.laboratory.filming import render_calibration_clip, render_recording, render_target
 from vinetrack.laboratory.scene import Camera, Target, Tube, preset
-from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_pictures, fit_planes
-from vinetrack.video.target_corners import (
+from vinetrack.video.calibration import (
+    CalibrationError,
+    calibrate,
+    calibrate_pictures,
     charuco_corners,
     checkerboard_corners,
     find_board,
+    fit_planes,
     refine_saddles,
 )
 

@@ -23,8 +23,7 @@ from vinetrack.laboratory.scene import Camera
 from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video.axis import Axis
 from vinetrack.video.edge import outline
-from vinetrack.video.frame_faults import torn_frames
-from vinetrack.video.frames import Frames, RecordingError, read_frames, slots_from_times
+from vinetrack.video.frames import Frames, RecordingError, read_frames, slots_from_times, torn_frames
 from vinetrack.video.strip import Strip
 from vinetrack.video.track import track_frames, track_recording
 
@@ -193,7 +192,7 @@ GIVEN_UP = """
 import sys
 from pathlib import Path
 import numpy as np
-from vinetrack.video.decoding import decode_container
+from vinetrack.video.frames import decode_container
 
 class GivenUp(Exception):
     pass

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import ndtr
 
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge_repair import (
+from vinetrack.video.edge import (
     BANDS,
     BLUR_SIGMA_PART,
     band_disagreement,

@@ -11,9 +11,8 @@ from camera_files import write_cine
 from plain_scene import Plan, Scene, plain_scene, write_video
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.video import decoding, small_pictures
-from vinetrack.video.decoding import packet_index
-from vinetrack.video.frames import inspect_recording, read_frames
+from vinetrack.video import frames, small_pictures
+from vinetrack.video.frames import inspect_recording, packet_index, read_frames
 from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.track import track_recording
 
@@ -104,7 +103,7 @@ def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scen
 @pytest.mark.slow
 @pytest.mark.usefixtures("bracketed")
 def test_a_frame_without_a_time_is_left_out_of_the_event(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames_of, without_time = decoding._frames_of, packet_index(film).pts[BEFORE + 20]
+    frames_of, without_time = frames._frames_of, packet_index(film).pts[BEFORE + 20]
 
     def nameless(*arguments):
         for frame in frames_of(*arguments):
@@ -112,9 +111,9 @@ def test_a_frame_without_a_time_is_left_out_of_the_event(film: Path, monkeypatch
             yield frame
 
     whole = read_event(inspect_recording(film), (BEFORE, BEFORE + 40))
-    monkeypatch.setattr(decoding, "_frames_of", nameless)
-    frames = read_event(inspect_recording(film), (BEFORE, BEFORE + 40))
-    assert frames.slot.tolist() == np.delete(whole.slot, np.flatnonzero(whole.slot == BEFORE + 20)).tolist()
+    monkeypatch.setattr(frames, "_frames_of", nameless)
+    event = read_event(inspect_recording(film), (BEFORE, BEFORE + 40))
+    assert event.slot.tolist() == np.delete(whole.slot, np.flatnonzero(whole.slot == BEFORE + 20)).tolist()
 
 
 @pytest.mark.slow

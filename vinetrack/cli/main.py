@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vinetrack.cli.command_frame import (
+from vinetrack.cli.commands import progress_line, register_diagnose, register_planning, register_start
+from vinetrack.cli.options import (
     MORE,
     ExperimentPath,
     JsonFile,
@@ -29,10 +30,6 @@ from vinetrack.cli.command_frame import (
     print_result,
     settings_from_json,
 )
-from vinetrack.cli.diagnose_commands import progress_line
-from vinetrack.cli.diagnose_commands import register as register_diagnose
-from vinetrack.cli.planning_commands import register as register_planning
-from vinetrack.cli.start_commands import register as register_start
 from vinetrack.pipeline.stages import STAGES, Job, Stage
 
 if TYPE_CHECKING:
@@ -186,8 +183,7 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
         log: LogPath = None,
     ) -> None:
         from vinetrack.experiment.folder import read_experiment
-        from vinetrack.pipeline.run_stage import RUN
-        from vinetrack.pipeline.workflow import find_experiment
+        from vinetrack.pipeline.workflow import RUN, find_experiment
 
         with errors_as_sentences(log), progress_line() as say:
             read = read_experiment(find_experiment(experiment))

@@ -26,5 +26,5 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = 
 
 def plot(shown: Any, name: str = "", **options: Any) -> Figure:
     """Draw an object as in the report."""
-    figure: Figure = import_module("vinetrack.interface.plotting").figure_of(shown, name, **options)
+    figure: Figure = import_module("vinetrack.interface.loaded").figure_of(shown, name, **options)
     return figure

@@ -20,15 +20,16 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.between_gain import (
+from vinetrack.diagnosis.likelihood_ratio import (
     Difference,
+    LikelihoodRatio,
     gain_p_value,
     gains_by_onset,
+    likelihood_ratio,
     linear_gain,
     with_shared_errors,
     with_trace_errors,
 )
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
@@ -45,9 +46,8 @@ from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, Number, groups_of
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm, groups_of
 from vinetrack.inference.position_errors import with_smooth_errors
 
 # ------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.candidates import shapes_of, testable
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
@@ -23,6 +22,7 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, Misf
 from vinetrack.diagnosis.power import Power, PowerInput, Rate, SimulatedRates
 from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.diagnosis.score_test import shapes_of, testable
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError

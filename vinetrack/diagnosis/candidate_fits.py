@@ -16,7 +16,6 @@ from typing import TypeVar
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidates import CandidateShape, is_plausible
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     MAX_INFLATION,
@@ -32,13 +31,13 @@ from vinetrack.diagnosis.misfit_tests import (
     MisfitTests,
     misfit_tests,
 )
+from vinetrack.diagnosis.score_test import CandidateShape, is_plausible
 from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
-from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, FitTrial
-from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.fit_result import EXPONENT, YIELD_PRESSURE, Fit, ParameterMap, make_layout
 from vinetrack.inference.marginal_likelihood import deviance, marginal
 from vinetrack.inference.optimiser import (
     POOR_FIT,
@@ -50,9 +49,8 @@ from vinetrack.inference.optimiser import (
     solve,
     track_correlation,
 )
-from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor, align, one_trial_per_condition
-from vinetrack.inference.solving import SLOW_NOISE, as_recorded
+from vinetrack.inference.solving import SLOW_NOISE, as_recorded, assemble
 
 # ------------------------------------------------------------------------------
 # Fits of hypotheses from several starts: a short fit to a subset of the trials, then a full fit to all of them.

@@ -17,19 +17,18 @@ import numpy as np
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.between_trials import between_candidates
-from vinetrack.diagnosis.candidates import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, testable
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.odd_trials import (
+from vinetrack.diagnosis.remarks import Remark, in_words, remark
+from vinetrack.diagnosis.replicates import (
     correct_dropped_frames,
     dropped_frames_in,
     odd_trials,
     with_lost_frames,
     with_odd_trials,
 )
-from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -44,6 +43,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
+from vinetrack.diagnosis.score_test import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, testable
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, contradictions, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
@@ -331,7 +331,7 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
         tied.insert(0, last.fit)
     if last.verdict not in (AMBIGUOUS, ARTEFACT) or len(tied) < 2:
         return result
-    from vinetrack.diagnosis.next_experiment import next_experiment
+    from vinetrack.diagnosis.further_trials import next_experiment
 
     report("looking for the next experiment")
     try:

@@ -42,8 +42,7 @@ from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import fit_subset, rest_is_seen
 from vinetrack.inference.fit_data import FitError, FitTrial
-from vinetrack.inference.fit_result import Fit, Number, TrialFit
-from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number, TrialFit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
 
 if TYPE_CHECKING:

@@ -18,20 +18,19 @@ from vinetrack.diagnosis.force_inversion import (
     FittedMotion,
     ForceEstimate,
     LinearInversion,
+    SmoothForce,
     acceleration_sensitivities,
     scaled_pseudo_inverse,
     trial_of_job,
     with_force,
     with_model_terms,
 )
-from vinetrack.diagnosis.force_surface import SmoothForce
 from vinetrack.diagnosis.remarks import remark
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import trial_effect_prior
-from vinetrack.inference.parameters import YIELD_PRESSURE
+from vinetrack.inference.fit_result import YIELD_PRESSURE, Fit
+from vinetrack.inference.marginal_likelihood import trial_effect_prior
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Job
 from vinetrack.inference.whitening import whiten
 

@@ -1,9 +1,9 @@
 """The missing force as a smooth function of one or two variables, estimated inside the trajectory fit.
 
 The force is a Gaussian process over growth, speed, time since release or pressure, or over two of them together
-(`vinetrack.diagnosis.force_surface`). Its coefficients are fitted to positions, through the response of the trajectory
-to a force, with B, n, yield pressures and the release, origin, pressure and B of every trial free, each under its own
-prior; positions are never differentiated. For each choice of variables
+(`vinetrack.diagnosis.force_inversion`). Its coefficients are fitted to positions, through the response of the
+trajectory to a force, with B, n, yield pressures and the release, origin, pressure and B of every trial free, each
+under its own prior; positions are never differentiated. For each choice of variables
 
     ln Z = −½ χ²(ĉ) − ½ ln |H| + ½ ln |K⁻¹|,   H = ∇∇ ½χ² + K⁻¹
 
@@ -21,15 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_inversion import FittedMotion, LinearInversion, motions_of, on_tracks
-from vinetrack.diagnosis.force_laws import (
-    CONVERGENCE_TOLERANCE,
-    NormalEquations,
-    SearchPoint,
-    normal_equations,
-    optimise_smooth_force,
-)
-from vinetrack.diagnosis.force_surface import (
+from vinetrack.diagnosis.force_inversion import (
     CONSTANT_AT_START,
     FREE_AT_START,
     LENGTH_SCALES,
@@ -37,9 +29,20 @@ from vinetrack.diagnosis.force_surface import (
     SEARCHED_VARIANCE,
     VARIABLES,
     Domain,
+    FittedMotion,
+    LinearInversion,
     SmoothForce,
     candidate_domains,
+    motions_of,
+    on_tracks,
     standard_error,
+)
+from vinetrack.diagnosis.force_laws import (
+    CONVERGENCE_TOLERANCE,
+    NormalEquations,
+    SearchPoint,
+    normal_equations,
+    optimise_smooth_force,
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.remarks import joined

@@ -20,19 +20,26 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidates import CandidateShape, effect_sensitivities, plausible_range
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
 from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.remarks import Remark, remark
-from vinetrack.diagnosis.score_test import Products, informations_at, products_of, projected, scores_of
+from vinetrack.diagnosis.score_test import (
+    CandidateShape,
+    Products,
+    effect_sensitivities,
+    informations_at,
+    plausible_range,
+    products_of,
+    projected,
+    scores_of,
+)
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import FitState, solve_per_trial, trial_effect_prior
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
+from vinetrack.inference.marginal_likelihood import FitState, solve_per_trial, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
-from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, systematics_of
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,

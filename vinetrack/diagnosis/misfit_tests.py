@@ -16,22 +16,20 @@ from functools import cached_property
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidates import (
+from vinetrack.diagnosis.score_test import (
     CandidateShape,
     EffectSensitivities,
-    effect_sensitivities,
-    plausible_range,
-    shapes_of,
-)
-from vinetrack.diagnosis.score_test import (
     FamilyTest,
     Products,
     Scores,
+    effect_sensitivities,
     family_test,
     fit_columns,
     linear_gains,
+    plausible_range,
     products_of,
     scores_of,
+    shapes_of,
 )
 from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect

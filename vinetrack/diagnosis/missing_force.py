@@ -29,10 +29,10 @@ from vinetrack.diagnosis.force_inversion import (
     force_sensitivities,
     motions_of,
     splines,
+    standard_error,
     uniform_splines,
 )
 from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid, refine_law
-from vinetrack.diagnosis.force_surface import standard_error
 from vinetrack.diagnosis.learned_force import LearnedForce, learned_force
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import SimulationError

@@ -29,10 +29,8 @@ from vinetrack.diagnosis.candidate_fits import (
     restart_without,
     start_values,
 )
-from vinetrack.diagnosis.candidates import shapes_of
-from vinetrack.diagnosis.force_inversion import uniform_splines
+from vinetrack.diagnosis.force_inversion import VARIABLES, Domain, uniform_splines
 from vinetrack.diagnosis.force_laws import EDGE_FRACTION
-from vinetrack.diagnosis.force_surface import VARIABLES, Domain
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
 from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce, variables_in_words
 from vinetrack.diagnosis.likelihood_ratio import (
@@ -45,6 +43,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
 from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, learn_missing_force, missing_force
 from vinetrack.diagnosis.remarks import Remark, joined, remark
+from vinetrack.diagnosis.score_test import shapes_of
 from vinetrack.diagnosis.selection import MAX_RESTARTS, MIN_LOG_LIKELIHOOD_GAIN
 from vinetrack.dynamics.model import Model, check_needs, make_model
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember

@@ -525,7 +525,7 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
     ends of the file are kept; other encodings are converted to UTF-8.
     """
-    from vinetrack.core.yaml_document import with_value
+    from vinetrack.core.tables import with_value
 
     path = folder / SETTINGS
     before = path.read_bytes() if path.exists() else b""

@@ -29,9 +29,8 @@ from pydantic import (
 
 from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
 from vinetrack.core.records import Bend
-from vinetrack.core.tables import Table, TableError, parse_number
+from vinetrack.core.tables import Table, TableError, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
-from vinetrack.core.yaml_document import YamlDocument, read_yaml
 from vinetrack.experiment.schema import (
     COLUMNS,
     LIMITED,

@@ -27,7 +27,7 @@ from vinetrack.figures.style import (
     plain_log_ticks,
     small_title,
 )
-from vinetrack.narrative.power_text import size_text
+from vinetrack.narrative.diagnosis_text import size_text
 from vinetrack.narrative.verdict_text import spaced_name
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.power import EffectPower, Power
-    from vinetrack.planning.fastest_vine import Choice
+    from vinetrack.planning.prediction import Choice
 
 _LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis
 

@@ -16,14 +16,15 @@ from vinetrack.core.problems import UserError
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
+    Smoothing,
     ar1_difference_gain,
     common_rounding_noise,
+    detect_smoothing,
     noise_shape,
     position_noise,
     rest_points,
     rough_noise,
 )
-from vinetrack.tracks.smoothed_positions import Smoothing, detect_smoothing
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment

@@ -17,12 +17,14 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.marginal_likelihood import (
+    FitState,
+    MixedProblem,
     estimate_between_trial_sd,
     estimate_noise,
     levenberg_marquardt_step,
     marginal,
+    shared_penalty,
 )
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, shared_penalty
 from vinetrack.inference.sensitivity import Predictor, initial_trial_effects
 from vinetrack.inference.trial_effects import (
     ReleaseSearch,

@@ -6,8 +6,8 @@ modelled by Legendre polynomials of order 1 to 4 over the growth, each minus its
 normal prior of standard deviation σ_s (`position_systematic_mm`).
 
 About a fit, r_i = X_i Δθ + Z_i u_i + D_i s + e_i with s ~ N(0, 1) and D_i the shapes times σ_s. With s among the free
-parameters this is the linear mixed model of `vinetrack.inference.mixed_effects` with four more columns and priors. Its
-likelihood compares hypotheses without crediting any of them with what a lens could explain.
+parameters this is the linear mixed model of `vinetrack.inference.marginal_likelihood` with four more columns and
+priors. Its likelihood compares hypotheses without crediting any of them with what a lens could explain.
 """
 
 from __future__ import annotations
@@ -23,20 +23,18 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.marginal_likelihood import (
+    DEVIATION_COLUMNS,
+    FitState,
     Marginal,
+    MixedProblem,
     deviance,
     estimate_between_trial_sd,
     estimate_noise,
+    inverse_of_block,
     levenberg_marquardt_step,
     marginal,
     normal_equations,
     trial_effect_step,
-)
-from vinetrack.inference.mixed_effects import (
-    DEVIATION_COLUMNS,
-    FitState,
-    MixedProblem,
-    inverse_of_block,
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import (

@@ -18,7 +18,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import TrialFit
-from vinetrack.inference.mixed_effects import inverse_of_block, sum_matrix_blocks, trial_effects_eliminated
+from vinetrack.inference.marginal_likelihood import inverse_of_block, sum_matrix_blocks, trial_effects_eliminated
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor, position_change

@@ -30,7 +30,7 @@ from vinetrack.dynamics.simulate import (
 )
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE, ParameterMap
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, ParameterMap
 from vinetrack.inference.whitening import all_products
 
 # ------------------------------------------------------------------------------

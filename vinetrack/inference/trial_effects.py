@@ -17,9 +17,14 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.marginal_likelihood import trial_effect_step
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effect_penalty, trial_effect_prior
-from vinetrack.inference.parameters import ParameterMap
+from vinetrack.inference.fit_result import ParameterMap
+from vinetrack.inference.marginal_likelihood import (
+    FitState,
+    MixedProblem,
+    trial_effect_penalty,
+    trial_effect_prior,
+    trial_effect_step,
+)
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,

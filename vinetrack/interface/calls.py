@@ -18,8 +18,7 @@ from vinetrack.experiment.folder import Experiment
 from vinetrack.inference.fit import fit as fit_pairs
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.interface.data_frames import Source, TrialSource, read_source
-from vinetrack.interface.loaded import LoadedResults
+from vinetrack.interface.loaded import LoadedResults, Source, TrialSource, read_source
 
 
 def fit(model: Model, source: Source, **options: Any) -> Fit:

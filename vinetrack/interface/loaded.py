@@ -2,23 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from vinetrack.core.notebook import html_table, plot
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.records import Kinematics, Track, Trial
+from vinetrack.core.tables import PROVENANCE
+from vinetrack.diagnosis.ladder import Comparison
+from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
+from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.schema import with_names
+from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
+from vinetrack.experiment.sheet import (
+    REQUIRED_FOR_PREDICTION,
+    check_pressures,
+    check_wall,
+    make_trial,
+    read_row,
+    table_of_texts,
+)
+from vinetrack.figures.prediction_figures import draw_power
+from vinetrack.figures.registry import campaign_figures, draw
+from vinetrack.inference.fit_data import Pairs
+from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from vinetrack.experiment.folder import Experiment
+    from vinetrack.figures.diagnosis_figures import DiagnosisTables
 
 
 class LoadedResults:
@@ -110,7 +134,6 @@ class LoadedResults:
     def _model(self, names: tuple[str, ...], values: Mapping[str, Any]) -> Model:
         from vinetrack.effects import catalogue
         from vinetrack.interface.calls import named_model
-        from vinetrack.interface.data_frames import TrialSource
 
         user_effects: Mapping[str, Any] = {}
         if not set(names) <= set(catalogue()):
@@ -177,3 +200,284 @@ def load(folder: Path | str) -> LoadedResults:
             f"{folder} is not a results folder, {what}: give the folder that a run made, such as results/demo"
         )
     return LoadedResults(folder)
+
+
+# ------------------------------------------------------------------------------
+# Trials and tracks from one pandas DataFrame with one row per point.
+
+POSITION_COLUMNS = ("lead_position_m", "position_m")
+ERROR_COLUMNS = ("lead_position_sigma_m", "lead_position_systematic_m")
+
+
+def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
+    """Return trials and tracks from a frame with one row per point.
+
+    Parameters
+    ----------
+    frame : columns `trial, time_s` and `lead_position_m` (or `position_m`); if known, `lead_position_sigma_m`,
+        `lead_position_systematic_m` and `flag`; and the columns of a trial sheet, constant within a trial:
+        `diameter_mm, thickness_um, length_mm, pressure_kPa, yield_pressure_kPa, …`, or in other units. A
+        `pressure_kPa` that changes within a trial is a measured trace, and its first value the set pressure.
+
+    Returns
+    -------
+    list of (Trial, Track), in the order of the frame
+
+    Raises
+    ------
+    ExperimentError
+        If a column is missing, or a value is refused as in a trial sheet.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> trial, track = vt.tracks_from_frame(vt.example_tracks())[0]
+    >>> f"{trial.name}: {1e3 * trial.diameter_m:g} mm, {track.time_s.size} points"
+    'P24_1: 24 mm, 224 points'
+    """
+    position = next((name for name in POSITION_COLUMNS if name in frame), "")
+    absent = [name for name in ("trial", "time_s") if name not in frame] + ([] if position else ["lead_position_m"])
+    if absent:
+        remedy = "a frame of tracks has trial, time_s, lead_position_m and the columns of a trial sheet"
+        raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
+    parts = [(str(name), part) for name, part in frame.groupby("trial", sort=False)]
+    trials = _trials([_cells(name, part) for name, part in parts])
+    return [(trial, _track(part, position)) for trial, (_, part) in zip(trials, parts, strict=True)]
+
+
+def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
+    """Return the cells that a trial sheet would have for a trial: all columns but those of the track, as text."""
+    cells = {"trial": name}
+    of_track = {"trial", "time_s", *POSITION_COLUMNS, *ERROR_COLUMNS, "flag", "edge_px", "frame"}
+    for column in part.columns:
+        first = part[column].iloc[0]
+        if column in of_track or _is_blank(first):
+            continue
+        if column != "pressure_kPa" and not _is_constant(part[column]):
+            message, remedy = f"changes within the trial {name}", "give it one value in all rows of the trial"
+            raise ExperimentError([Problem(message=message, file="the frame", column=str(column), remedy=remedy)])
+        cells[str(column)] = f"{first:.15g}" if isinstance(first, float | np.floating) else str(first)
+    return cells
+
+
+def _is_blank(value: Any) -> bool:
+    return value is None or value == "" or (isinstance(value, float | np.floating) and math.isnan(value))
+
+
+def _is_constant(column: pd.Series) -> bool:
+    first = column.iloc[0]
+    return bool(column.isna().all() if _is_blank(first) else (column == first).all())
+
+
+def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
+    table, _ = in_sheet_units(table_of_texts(rows), "the frame")
+    settings = ExperimentSettings()
+    problems: list[Problem] = []
+    trials = []
+    for i in range(len(rows)):
+        row = read_row(table, i, settings)
+        required = REQUIRED_FOR_PREDICTION if row.travel_ratio == 2 else REQUIRED_FOR_PREDICTION[:1]
+        row.add_blank(required, "give it as a column of the frame")
+        check_wall(row)
+        check_pressures(row)
+        problems += [replace(problem, file="the frame") for problem in row.problems]
+        if not row.failed:
+            # Marks the trial as a track measured elsewhere, which determines the default of its smooth errors.
+            row.values["track"] = row.name
+            trials.append(replace(make_trial(row, Path(), settings), track=None))
+    if any(problem.severity == "error" for problem in problems):
+        raise ExperimentError(problems)
+    return list(with_names(trials))
+
+
+def _track(part: pd.DataFrame, position: str) -> Track:
+    count = len(part)
+    unknown = np.full(count, math.nan)
+    sigma_m, systematic_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
+    flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(count, "", dtype=str)
+    traced = "pressure_kPa" in part and not _is_constant(part["pressure_kPa"])
+    return Track(
+        time_s=part["time_s"].to_numpy(dtype=float),
+        lead_position_m=part[position].to_numpy(dtype=float),
+        lead_position_sigma_m=sigma_m,
+        flag=flag,
+        edge_px=unknown,
+        pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
+        lead_position_systematic_m=systematic_m,
+    )
+
+
+# ------------------------------------------------------------------------------
+# Trials with their tracks from any source: a results folder, an experiment, a frame of tracks, or pairs.
+
+# Loaded results, a results folder, an experiment or its folder, a frame of tracks, or pairs of trial and track
+Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
+
+
+@dataclass(frozen=True)
+class TrialSource:
+    """Trials with their tracks, their experiment, and the reasons why trials were left out. `experiment` is None for a
+    frame and for pairs; `kinematics` are those of a results folder, by name of trial.
+    """
+
+    pairs: list[tuple[Trial, Track]]
+    experiment: Experiment | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    kinematics: Mapping[str, Kinematics] = field(default_factory=dict)
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """Tracks by name of trial."""
+        return {trial.name: track for trial, track in self.pairs}
+
+
+def read_source(source: Source) -> TrialSource:
+    """Read trials and tracks from any source."""
+    from vinetrack.inference.fit_data import pairs_of
+    from vinetrack.results.folder_layout import Results, measured_trials, read_source_experiment
+
+    if isinstance(source, LoadedResults):
+        source = source.folder
+    if isinstance(source, pd.DataFrame):
+        return TrialSource(tracks_from_frame(source))
+    if isinstance(source, (str, Path)) and (Path(source) / PROVENANCE).exists():
+        experiment = read_source_experiment(Path(source))
+        pairs, kinematics = measured_trials(experiment, Results(Path(source)))
+        return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out}, kinematics)
+    if isinstance(source, (str, Path)):
+        source = read_experiment(source)
+    pairs, left_out = pairs_of(source)
+    return TrialSource(pairs, source if isinstance(source, Experiment) else None, left_out)
+
+
+# ------------------------------------------------------------------------------
+# Figures of the report for objects in memory and for results folders, by name in the registry.
+
+
+def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
+    """Draw an object of the Python interface as in the report.
+
+    Parameters
+    ----------
+    shown : loaded results, a fit, a comparison, a diagnosis or a power.
+    name : name of the figure; blank for the main figure of the object.
+    trial : name of the trial, for figures of one trial.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ResultsError
+        If the object has no such figure.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> type(fit.plot("model_residuals")).__name__
+    'Figure'
+    """
+    if isinstance(shown, LoadedResults):
+        return _results_figure(shown, name, trial)
+    if isinstance(shown, Fit):
+        from vinetrack.interface.calls import compare
+
+        shown = compare(shown)
+    if isinstance(shown, Power):
+        return _with_content(draw_power(shown), "power")
+    if isinstance(shown, Comparison):
+        return _draw_figure(_comparison_tables(shown), name or "model_comparison")
+    return _draw_figure(_tables_in_memory(shown) if shown.rounds else None, name)
+
+
+def _draw_figure(tables: Any, name: str = "") -> Figure:
+    """Draw a figure, or the first with content."""
+    known = {one: entry for one, entry in campaign_figures().items() if all(hasattr(tables, t) for t in entry.reads)}
+    names = [name] if name else list(known)
+    return _with_content(next((drawn for one in names if one in known and (drawn := draw(one, tables))), None), name)
+
+
+def _with_content(drawn: Figure | None, name: str) -> Figure:
+    if drawn is None:
+        names = ", ".join(campaign_figures())
+        raise ResultsError(f"There is no figure {name!r} with content; figures are {names}, trial_motion and power.")
+    return drawn
+
+
+def _comparison_tables(shown: Comparison) -> SimpleNamespace:
+    from vinetrack.figures.registry import label_conditions
+
+    table = label_conditions(shown.table, _condition_labels([compared.trial for compared in shown.trials]))
+    return SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
+
+
+def _condition_labels(trials: list[Trial]) -> Any:
+    import pandas as pd
+
+    from vinetrack.figures.registry import describe_conditions
+
+    rows = pd.DataFrame(
+        {
+            "trial": [trial.name for trial in trials],
+            "vine": [trial.vine for trial in trials],
+            "condition": [trial.condition for trial in trials],
+            "status": "ok",
+        }
+    )
+    return describe_conditions(rows, tuple(trials))
+
+
+def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
+    import pandas as pd
+
+    from vinetrack.diagnosis.drift import drift_groups
+    from vinetrack.diagnosis.ladder import in_sample
+    from vinetrack.figures.diagnosis_figures import CURVE_COLUMNS, assemble_tables
+
+    nothing = pd.DataFrame()
+    if not shown.fits:
+        curves = pd.DataFrame(columns=list(CURVE_COLUMNS))
+        return assemble_tables(shown, _condition_labels([]), curves, nothing, nothing, nothing)
+    before, after = shown.fits[0], shown.fits[-1]
+    final = {motion.name: motion for motion in in_sample(after).trials} if after is not before else {}
+    parts = []
+    for motion in in_sample(before).trials:
+        final_m = final[motion.name].predicted_position_m if final else np.full(motion.time_s.size, math.nan)
+        positions = (motion.lead_position_m, motion.predicted_position_m, final_m)
+        columns = (
+            motion.name,
+            motion.trial.condition,
+            motion.time_s - motion.release_s,
+            *(y - motion.origin_m for y in positions),
+        )
+        parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True))))
+    located, drifting = nothing, nothing
+    if shown.failure is not None:
+        located = shown.failure.along_position
+        drifting = drift_groups(shown.failure.drift, after if final else None)
+    force = nothing if shown.force_table is None else shown.force_table
+    conditions = _condition_labels([fitted.trial for fitted in before.trials])
+    trials = pd.concat(parts, ignore_index=True)
+    return assemble_tables(shown, conditions, trials, located, drifting, force, shown.learned_table)
+
+
+def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
+    from vinetrack.figures.registry import FigureTables
+    from vinetrack.pipeline.trials import draw_trial
+
+    trials: tuple[Trial, ...] = ()
+    try:
+        trials = shown.experiment.trials
+    except Exception as error:  # without the sheet, the figures have simpler labels
+        if name == "trial_motion":
+            raise ResultsError(f"{error}") from None
+    tables = FigureTables(shown.folder, trials)
+    if name == "trial_motion":
+        names = list(shown.trials["trial"])
+        if trial not in names:
+            raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
+        stated = next((row for row in trials if row.name == trial), None)
+        return _with_content(draw_trial(tables.results, stated, trial), name)
+    return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))

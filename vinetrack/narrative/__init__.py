@@ -59,8 +59,7 @@ _NAMES: dict[Any, str] = {
 
 def in_words(told: Any) -> str:
     """Return a remark or a result of the diagnosis in words."""
-    from vinetrack.narrative.diagnosis_text import diagnosis_text
-    from vinetrack.narrative.power_text import power_lines
+    from vinetrack.narrative.diagnosis_text import diagnosis_text, power_lines
     from vinetrack.narrative.verdict_text import estimates_text, explain
 
     makers: dict[str, Callable[[Any], str]] = {

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.units import decimals, display_unit, number, with_error
-from vinetrack.diagnosis.candidates import slip_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND
 from vinetrack.diagnosis.remarks import joined
 from vinetrack.diagnosis.result import (
@@ -27,11 +26,11 @@ from vinetrack.diagnosis.result import (
     Confounder,
     left_open,
 )
+from vinetrack.diagnosis.score_test import slip_of
 from vinetrack.dynamics.model import base_model
 from vinetrack.experiment.folder import CONFOUNDING_CORRELATION, order_pressure_correlation, trial_order
-from vinetrack.inference.fit_result import Number
+from vinetrack.inference.fit_result import EXPONENT, Number
 from vinetrack.inference.fit_summary import FILM
-from vinetrack.inference.parameters import EXPONENT
 from vinetrack.inference.robust_covariance import FILM_ERROR
 
 if TYPE_CHECKING:
@@ -40,8 +39,8 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Trial
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.misfit_tests import MisfitTests
-    from vinetrack.diagnosis.odd_trials import OddTrial
     from vinetrack.diagnosis.remarks import Remark
+    from vinetrack.diagnosis.replicates import OddTrial
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep
 
@@ -365,7 +364,7 @@ def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
     """The false-alarm rate of such trials, and the effects that they could have detected."""
     if diagnosis.power is None:
         return []
-    from vinetrack.narrative.power_text import AT_LARGEST, detectable_count, percent, unseen
+    from vinetrack.narrative.diagnosis_text import AT_LARGEST, detectable_count, percent, unseen
 
     power = diagnosis.power
     alarm = Fact(

@@ -28,9 +28,8 @@ from vinetrack.dynamics.model import Model, Value, check_needs, host_for
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
-from vinetrack.inference.fit_result import Fit, Number, TrialFit
+from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
-from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, group_names
 from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.pages.local_page import THREAD_PREFIX
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result

@@ -24,12 +24,13 @@ from vinetrack.core.tables import (
     is_calibration,
     list_recordings,
     natural_order,
+    parse_yaml,
     read_table,
     read_text,
+    with_value,
     write_text,
 )
 from vinetrack.core.units import UNITS, convert, other_units, split_unit
-from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import SHEET

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Trial
-    from vinetrack.planning.fastest_vine import Chamber, Choice, Room
+    from vinetrack.planning.prediction import Chamber, Choice, Room
     from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 
@@ -85,7 +85,7 @@ def design_vine(
     from vinetrack.dynamics.simulate import SimulationError
     from vinetrack.effects import EffectError
     from vinetrack.inference.fit_data import FitError
-    from vinetrack.planning.fastest_vine import Room, fastest
+    from vinetrack.planning.prediction import Room, fastest
 
     check_figure(figure)
     basis = read_basis(request, needed=("pressure_kPa",))
@@ -220,7 +220,7 @@ def design_reservoir(
     """
     from vinetrack.core.terminal import waiting
     from vinetrack.effects import EffectError
-    from vinetrack.planning.fastest_vine import chambers
+    from vinetrack.planning.prediction import chambers
 
     required_for_reservoir = ("diameter_mm", "length_mm", "pressure_kPa")
     check_figure(figure)
@@ -249,7 +249,7 @@ def design_reservoir(
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
     from vinetrack.core.terminal import table
-    from vinetrack.planning.fastest_vine import GAMMAS, chambers, swept_m3
+    from vinetrack.planning.prediction import GAMMAS, chambers, swept_m3
 
     description = (
         describe_trial(trial)
@@ -273,7 +273,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
 
 
 def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
-    from vinetrack.planning.fastest_vine import GAMMAS
+    from vinetrack.planning.prediction import GAMMAS
 
     losses = [f"{100 * share:.1f}" for share in chamber.losses.values()]
     speeds = (
@@ -286,8 +286,7 @@ def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) 
 
 def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
     from vinetrack.dynamics.model import host_for
-    from vinetrack.planning.fastest_vine import final_with
-    from vinetrack.planning.prediction import final_m_s
+    from vinetrack.planning.prediction import final_m_s, final_with
 
     if math.isinf(volume_m3):
         return final_m_s(inputs, inputs.model, host_for(inputs.model), at_fraction)
@@ -295,7 +294,7 @@ def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction
 
 
 def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
-    from vinetrack.planning.fastest_vine import GAMMAS, supplied_chamber
+    from vinetrack.planning.prediction import GAMMAS, supplied_chamber
 
     volumes = {law.split(",")[0]: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
     needed = ", ".join(f"{format_volume(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
@@ -306,7 +305,7 @@ def _reservoir_picture(trial: Trial, loss: float) -> Figure:
     import numpy as np
 
     from vinetrack.figures.prediction_figures import draw_reservoir
-    from vinetrack.planning.fastest_vine import GAMMAS, chambers, gauge_loss, swept_m3
+    from vinetrack.planning.prediction import GAMMAS, chambers, gauge_loss, swept_m3
 
     swept, pressure_Pa, ambient_Pa = swept_m3(trial), trial.pressure_Pa, trial.ambient_pressure_Pa
     volumes = swept * np.geomspace(3.0, 300.0, 200)

@@ -19,8 +19,7 @@ from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.core.units import with_error
-from vinetrack.narrative.diagnosis_text import contradicted_in_words, sentences_of, to_go_on, verdict_line
-from vinetrack.narrative.power_text import power_brief
+from vinetrack.narrative.diagnosis_text import contradicted_in_words, power_brief, sentences_of, to_go_on, verdict_line
 from vinetrack.narrative.verdict_text import settled_rows, summary_facts
 from vinetrack.results.folder_layout import (
     Results,
@@ -93,7 +92,7 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     """
     from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
     from vinetrack.effects import own_effects
-    from vinetrack.inference.assemble import assemble
+    from vinetrack.inference.solving import assemble
     from vinetrack.pipeline.trials import model_of
 
     model, settings = model_of(experiment), experiment.settings

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.campaign_power import SimulatedDiagnosis
     from vinetrack.diagnosis.further_trials import InformativeTrials
     from vinetrack.effects import Effect
-    from vinetrack.experiment.planned import PlannedTrials
+    from vinetrack.experiment.sheet import PlannedTrials
     from vinetrack.inference.fit_data import Pairs
     from vinetrack.inference.fit_result import Fit
 
@@ -94,7 +94,7 @@ class MeasuredTrials:
 
 def campaign_of_target(request: PowerRequest) -> PowerCampaign:
     """Return the campaign of the measured trials of the target; without any, that of the planned trials."""
-    from vinetrack.experiment.planned import planned_sheet
+    from vinetrack.experiment.sheet import planned_sheet
 
     measured = trials_of_target(request)
     if measured is not None:
@@ -190,7 +190,7 @@ def _input_rows(
 def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCampaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     from vinetrack.effects import own_effects
-    from vinetrack.inference.parameters import DAMPING, EXPONENT
+    from vinetrack.inference.fit_result import DAMPING, EXPONENT
     from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
     default_noise_mm, default_capture_fps = 0.1, 1069.0  # Default noise of a position, and default frame rate (chosen)

@@ -12,8 +12,8 @@ from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, write_bytes, write_csv, write_json
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE
-from vinetrack.experiment.planned import PlannedTrials, planned_sheet, planned_trial
 from vinetrack.experiment.schema import option
+from vinetrack.experiment.sheet import PlannedTrials, planned_sheet, planned_trial
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
 
 if TYPE_CHECKING:
@@ -104,8 +104,8 @@ class PredictionBasis:
 
 def read_basis(request: PredictionRequest, needed: Sequence[str] | None = None) -> PredictionBasis:
     """Read the sheet or the options, the fit, and the requested effects."""
-    from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
     from vinetrack.experiment.settings import ExperimentSettings
+    from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION
     from vinetrack.planning.predictive_inputs import StatedValues, read_sizes
 
     if request.sheet is not None:

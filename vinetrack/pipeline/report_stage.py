@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from vinetrack.experiment.settings import FigureSettings
     from vinetrack.figures.diagnosis_figures import DiagnosisTables
     from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection, TrackedRecording
-    from vinetrack.report.diagnosis_section import DiagnosisResult
+    from vinetrack.report.section import DiagnosisResult
 
 
 # ------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
 
 def read_diagnosis_section(results: Results, experiment: Experiment) -> DiagnosisResult | None:
     """Return the content of the report's section on the diagnosis; None if there is no diagnosis."""
-    from vinetrack.report.diagnosis_section import DiagnosisResult
+    from vinetrack.report.section import DiagnosisResult
 
     diagnosis = stored_diagnosis(results)
     if diagnosis is None:
@@ -236,7 +236,7 @@ def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str
 
 
 def _paper_section(tables: FigureTables) -> ReportSection:
-    from vinetrack.report.paper_section import paper_section
+    from vinetrack.report.section import paper_section
 
     figures = [
         _figure(tables, one)

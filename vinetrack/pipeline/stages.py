@@ -82,7 +82,7 @@ def _figures(job: Job) -> list[str]:
 def _paper(job: Job) -> list[str]:
     """Compare with the published numbers and figures of the paper."""
     from vinetrack.pipeline.report_stage import compare_with_paper, draw_paper
-    from vinetrack.report.paper_section import tally
+    from vinetrack.report.section import tally
 
     table = compare_with_paper(job.experiment, job.results)
     draw_paper(job.results, job.settings.figures)

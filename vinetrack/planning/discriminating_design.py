@@ -26,10 +26,15 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import LARGEST_SPREAD, marginal, normal_equations
-from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, LEAST_BETWEEN_TRIAL_SD, solve_per_trial
-from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE, FreeParameter, ParameterMap
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, FreeParameter, ParameterMap
+from vinetrack.inference.marginal_likelihood import (
+    DEVIATION_COLUMNS,
+    LARGEST_SPREAD,
+    LEAST_BETWEEN_TRIAL_SD,
+    marginal,
+    normal_equations,
+    solve_per_trial,
+)
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,

@@ -25,7 +25,7 @@ from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit

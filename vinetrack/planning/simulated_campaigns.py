@@ -15,12 +15,12 @@ import numpy as np
 from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError, simulate_many
-from vinetrack.inference.assemble import log_likelihood
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.mixed_effects import FitState
+from vinetrack.inference.fit_result import DAMPING, ParameterMap
+from vinetrack.inference.marginal_likelihood import FitState
 from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
-from vinetrack.inference.parameters import DAMPING, ParameterMap
 from vinetrack.inference.sensitivity import Predictor, align, initial_trial_effects
+from vinetrack.inference.solving import log_likelihood
 from vinetrack.planning.discriminating_design import Condition, Hypothesis, TrackSampling, film_trials
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.tracks.position_noise import ar1_noise

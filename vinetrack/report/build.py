@@ -29,13 +29,14 @@ from vinetrack.narrative.diagnosis_text import (
     vines_without_law,
 )
 from vinetrack.narrative.verdict_text import bounds_text, is_finite, listed_names, settled_rows
-from vinetrack.report.diagnosis_section import DiagnosisResult, diagnosis_section
 from vinetrack.report.section import (
+    DiagnosisResult,
     ReportFigure,
     ReportSection,
     ReportTable,
     base64_uri,
     data_uri,
+    diagnosis_section,
     inline_picture,
 )
 

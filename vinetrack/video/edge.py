@@ -9,7 +9,9 @@ optical blur, the exposure and the light and shade that the tip carries with it 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,27 +20,15 @@ from vinetrack.core.records import Bools, Floats
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_repair import (
-    ASTRAY_PX,
-    GUESSED_PX,
-    NO_EDGE_PX,
-    band_disagreement,
-    disturbed_start,
-    dwell_error_px,
-    find_mouth,
-    hidden_errors,
-    leap_error_px,
-    noise_and_slow,
-    repair_jumps,
-    slow_error_px,
-)
 from vinetrack.video.edge_state import (
     ASSUMED_EXPOSURE,
     EARLY_FIT_ROUNDS,
     FIT_ROUNDS,
     OPTICAL_BLUR_PX,
+    START_CLEARANCE_PX,
     EdgeState,
     blur_lengths,
+    clear_of_start,
     core_frames,
     distance_sums,
     estimate_appearance,
@@ -50,11 +40,459 @@ from vinetrack.video.edge_state import (
     informative_frames,
     initial_state,
     moving_frames,
+    search_edges,
     seen_exposure,
 )
 from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.point_quality import growth_end
 from vinetrack.video.strip import Strip
+
+# ------------------------------------------------------------------------------
+# Repair of edge fits that break the motion, and errors of the edge by its bands.
+#
+# The fit of every frame is compared with the motion; where it breaks it, the edge is searched again where the motion
+# leads. The edge is also fitted in bands of rows, each alone: their disagreement is an error that needs no model of
+# noise, since film, tail, glints and a swinging door touch one band and not another.
+
+# ------------------------------------------------------------------------------
+# Slow errors of an edge: errors that neighbouring frames share, which neither roughness nor averaging reveals.
+#
+# Where film or background differ by G grey levels from their estimated pictures, an edge of contrast C is misplaced
+# by about G/C pixels for as long as it passes that place. Wrinkles and light displace the bands of an edge
+# differently for some frames, and their mean with them. Near the start a door or a mouth may hide the tip as well,
+# and where a shaken camera was stabilised the slow part of the shake stays.
+
+SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
+GUESS_RANDOM_PART = math.sqrt(0.5)  # The same for an edge that is a guess, since a door or the mouth hides it (chosen)
+ARRIVAL_PX = 1.0  # Slow error of a tip that sweeps and bends, tracked by when the picture changes for good (measured)
+
+
+def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats:
+    """Slow error of each frame's edge, one standard deviation. Shapes: edge_px (n_frames,); contrast (n_along,) →
+    (n_frames,).
+    """
+    from scipy.ndimage import median_filter
+
+    everywhere_px = float(np.hypot(SLOW_PX, shared_px))
+    finite = np.isfinite(contrast)
+    if not finite.any():
+        return np.full(len(edge_px), everywhere_px)
+    columns = np.arange(len(contrast))
+    # 21: columns over which the contrast at an edge is taken, px (chosen)
+    smooth_contrast = median_filter(np.interp(columns, columns[finite], np.abs(contrast[finite])), 21, mode="nearest")
+    local_contrast = np.interp(np.nan_to_num(edge_px), columns, smooth_contrast)
+    # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
+    # 1.0: least contrast, in grey levels (chosen)
+    return np.asarray(np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0)))
+
+
+def shared_disagreement(lead_px: Floats) -> float:
+    """Slow error of the mean of bands, from the part of their disagreement that lasts over several frames. Bands that
+    mirror each other about the axis are averaged first, since a tip that tilts moves one ahead and the other behind and
+    leaves the mean unchanged. What all frames share is the shape of the tip and is removed. Shapes: lead_px (n_frames,
+    n_bands).
+    """
+    lags = (1, 2)  # Lags, in frames, at which bands that still disagree alike share a cause (chosen)
+    frames, bands = lead_px.shape
+    if bands < 4 or frames < max(lags):
+        return 0.0
+    deviation = lead_px - lead_px.mean(axis=1, keepdims=True)
+    deviation = deviation - np.median(deviation, axis=0)
+    pairs = (deviation + deviation[:, ::-1])[:, : bands // 2] / 2
+    pairs = pairs - pairs.mean(axis=1, keepdims=True)
+    # 4: fewest pairs of frames at a lag (chosen)
+    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in lags if frames - lag >= 4]
+    if not products:
+        return 0.0
+    # The mean of a pair has half the variance of a band.
+    band_variance = 2 * float(np.mean(products)) / (bands // 2 - 1)
+    return float(np.sqrt(max(band_variance, 0.0) / bands))
+
+
+def noise_and_slow(bands_px: Floats, seen_px: Floats, apart_px: Floats) -> tuple[Floats, Floats]:
+    """Split what is added to the error of an edge into a random part and a slow part. Random errors are independent
+    between frames; slow ones are shared by neighbouring frames. Returns random and slow error, each of shape
+    (n_frames,), px; their sum in quadrature is `apart_px`. Shapes: bands_px, seen_px, apart_px (n_frames,).
+    """
+    start_random_part = 0.4  # Part of the error near the start that differs from frame to frame (measured)
+    near = np.sqrt(np.maximum(seen_px**2 - bands_px**2, 0.0))
+    guess = np.sqrt(np.maximum(apart_px**2 - seen_px**2, 0.0))
+    noise = np.sqrt(bands_px**2 + (start_random_part * near) ** 2 + (GUESS_RANDOM_PART * guess) ** 2)
+    slow = np.hypot(math.sqrt(1 - start_random_part**2) * near, math.sqrt(1 - GUESS_RANDOM_PART**2) * guess)
+    return noise, slow
+
+
+ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
+# Ratio by which the misfit of a fit that agrees with its neighbours may exceed that of one that does not (chosen)
+CONSISTENT_MISFIT_RATIO = 1.4
+# Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
+LEAST_FITTED_AMPLITUDE = 0.5
+
+
+def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
+    """Replace fits that break the motion or hardly fit by the best ones where the motion leads. Goes from the middle of
+    the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
+    more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
+    """
+    # Frames of rest, counted from the motion, within which a bad fit is searched again from many starts (chosen)
+    long_rest_frames = 8
+    moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
+    if len(moving) < 5:
+        return fit
+    out = fit.copy()
+    bad_misfit = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
+    decentrality = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
+    anchor = int(moving[np.argmin(decentrality + _is_rough(fit[moving, 0]) + (fit[moving, 2] > bad_misfit))])
+    first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
+    edge = out[:, 0].tolist()
+    for sense in (-1, 1):
+        resting = 0
+        for t in range(anchor + sense, first - 1 if sense < 0 else last + 1, sense):
+            previous, second, third = (edge[min(max(t - k * sense, 0), len(edge) - 1)] for k in (1, 2, 3))
+            # The larger of two steps, since a frame may repeat the one before it.
+            step = max(0.0 if math.isnan(gap) else abs(gap) for gap in (second - previous, third - second))
+            resting = resting + 1 if step < 0.3 else 0
+            reach = max(1.3 * step, step + 1.5)
+            low, high = (previous - reach, previous + 0.8) if sense < 0 else (previous - 0.8, previous + reach)
+            inside, faint = low <= edge[t] <= high, out[t, 3] < LEAST_FITTED_AMPLITUDE - 1
+            good_enough = (out[t, 2] <= bad_misfit or resting > long_rest_frames) and not faint
+            if not math.isfinite(previous) or (inside and good_enough):
+                continue
+            replacement = _best_between(strip, state, t, low, high, 1 if resting > long_rest_frames else 9)
+            if inside:
+                if replacement is not None and (faint or replacement[2] < out[t, 2]):
+                    out[t] = replacement
+            elif not faint and _spans_missing_frames(edge[t] - previous, step) and _good_and_better(
+                out[t], replacement, bad_misfit
+            ):  # fmt: skip
+                continue
+            elif replacement is None:
+                expected = previous if math.isnan(edge[t]) else edge[t]
+                out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0, 0)
+            else:
+                out[t] = replacement
+            edge[t] = float(out[t, 0])
+    return _repair_strays(strip, state, out, moving, bad_misfit)
+
+
+def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[np.int_], bad_misfit: float) -> Floats:
+    """Replace bad fits that stray from the parabola through two neighbours on each side by the best fit near it. A good
+    fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
+    """
+    out = fit.copy()
+    for t in moving[2:-2]:
+        around = out[[t - 2, t - 1, t + 1, t + 2], 0]
+        expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
+        bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
+        distance = abs(out[t, 0] - expected)
+        if not np.isfinite(distance) or out[t, 2] <= bad_misfit or distance < max(1.5, bend):
+            continue
+        reach = max(2.0, 0.3 * distance)
+        replacement = _best_between(strip, state, int(t), expected - reach, expected + reach, 9)
+        if replacement is not None and replacement[2] < CONSISTENT_MISFIT_RATIO * out[t, 2]:
+            out[t] = replacement
+    return out
+
+
+def _good_and_better(fit: Floats, other: Floats | None, bad_misfit: float) -> bool:
+    """Whether a fit is good, and better than another."""
+    return bool(fit[2] <= bad_misfit) and (other is None or bool(other[2] > fit[2]))
+
+
+def _spans_missing_frames(stride: float, step: float) -> bool:
+    """Whether a stride is two to four whole steps: frames are missing, and the point is right."""
+    ratio = abs(stride) / max(step, 1e-6)
+    return step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25
+
+
+def _is_rough(edge: Floats) -> NDArray[np.bool_]:
+    """Points further from the mean of their neighbours than a pixel and 0.15 of the step, (n,)."""
+    rough = np.ones(len(edge), dtype=bool)
+    step = np.abs(edge[2:] - edge[:-2]) / 2
+    rough[1:-1] = np.abs(edge[1:-1] - 0.5 * (edge[2:] + edge[:-2])) > 1.0 + 0.15 * step
+    return rough
+
+
+def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int) -> Floats | None:
+    """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
+    places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]
+    fits = search_edges(strip, state, np.full(len(places), t), places)
+    inside = (fits[:, 0] >= low - 0.5) & (fits[:, 0] <= high + 0.5) & (fits[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
+    inside &= np.isfinite(fits[:, 2])
+    return fits[inside][np.argmin(fits[inside, 2])] if inside.any() else None
+
+
+BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
+
+# Deviation of a band, in median absolute deviations of the bands of its frame, at which it is clipped (chosen)
+OUTLYING_BAND = 2.0
+BAND_OFFSET_PX = 50.0  # Growth over which the lead or lag of a band is taken as its usual offset (chosen)
+
+MEDIAN_TO_MEAN = 1.27  # Ratio of mean to median of χ² with three degrees of freedom (derived)
+
+
+def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
+    """Error of the edge from the disagreement of its bands, and the part of it that neighbouring frames share. The
+    weighted mean of K independent bands has the variance Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by for
+    long in the `core` frames is the shape of the tip, not an error. Returns standard error, shape (n_frames,), px;
+    zeros where there is one band only, slow error of all frames, px; see `slow_errors.shared_disagreement`. Shapes:
+    edge, core (n_frames,).
+    """
+    neighbours = 2  # Frames on each side over which the median disagreement is taken (chosen)
+    edges, sigmas = band_fits(strip, state, edge)
+    if edges.shape[1] < 2:
+        return np.zeros(len(edge)), 0.0
+    lead_px = np.nan_to_num(edges - edge[:, None])
+    slow = shared_disagreement(lead_px[core])
+    lead_px = lead_px - _band_offsets(lead_px, edge, np.flatnonzero(core))
+    weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
+    median_lead = np.median(lead_px, axis=1, keepdims=True)
+    limit = OUTLYING_BAND * np.median(np.abs(lead_px - median_lead), axis=1, keepdims=True) + 0.05
+    lead_px = median_lead + np.clip(lead_px - median_lead, -limit, limit)
+    total = weight.sum(axis=1)
+    mean = (weight * lead_px).sum(axis=1) / total
+    variance = (weight * (lead_px - mean[:, None]) ** 2).sum(axis=1) / (lead_px.shape[1] - 1) / total
+    padded = np.pad(variance, neighbours, mode="edge")
+    running_median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * neighbours + 1), axis=1)
+    return np.asarray(np.sqrt(MEDIAN_TO_MEAN * running_median)), slow
+
+
+# Part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
+BLUR_SIGMA_PART = 0.25
+
+
+def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
+    """Standard error of an edge that stops or starts within an exposure or next to it. The model's blur is that of
+    uniform motion at the mean of the speeds before and after. Where these differ by Δv, either may be the speed during
+    the exposure of τ frames, and the length of the blur is uncertain by τΔv/2. Shapes: edge (n_frames,) → (n_frames,).
+    """
+    if len(edge) < 3 or exposure_frames <= 0:
+        return np.zeros(len(edge))
+    steps = np.abs(np.diff(np.pad(np.nan_to_num(edge), 2, mode="edge")))
+    speed = np.maximum(steps[:-3], steps[3:])
+    from_middle = (steps[1:-2] + steps[2:-1]) / np.maximum(speed, 1e-9) - 1
+    within = np.maximum(exposure_frames / 2 - np.abs(from_middle), 0.0)
+    behind = speed * within**2 / (2 * exposure_frames)
+    return np.asarray(np.hypot(behind, BLUR_SIGMA_PART * exposure_frames / 4 * np.abs(steps[2:-1] - steps[1:-2])))
+
+
+def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Floats]:
+    """Fit the edge of each band of rows alone; NaN where a band shows none. The bands share the rows that are
+    informative about the edge evenly. Returns edge and its standard error, each of shape (n_frames, n_bands), px.
+    Shapes: edge (n_frames,).
+    """
+    rows = strip.values.shape[1]
+    contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)
+    contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
+    cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
+    limits = np.concatenate([[0], cuts, [rows]])
+    edges, sigmas = [], []
+    for low, high in pairwise(limits):
+        # 4: fewest rows of a band (chosen)
+        if high - low < 4:
+            continue
+        fit = fit_edges(strip, replace(state, edge=edge), rows=(int(low), int(high)))
+        edges.append(fit[:, 0])
+        sigmas.append(fit[:, 1])
+    return np.stack(edges, axis=1), np.stack(sigmas, axis=1)
+
+
+def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
+    """Median lead of each band over the core frames within BAND_OFFSET_PX, or the nearest few, (n_frames, n_bands)."""
+    # 7: fewest frames from which that offset is taken (chosen)
+    fewest = min(7, len(core))
+    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
+    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
+    out = np.empty((len(places), lead_px.shape[1]))
+    for i, place in enumerate(places):
+        distance = np.abs(edge[core] - place)
+        near = distance <= max(BAND_OFFSET_PX, float(np.partition(distance, fewest - 1)[fewest - 1]))
+        out[i] = np.median(lead_px[core[near]], axis=0)
+    return out[frame_places]
+
+
+# ------------------------------------------------------------------------------
+# Detect what hides the tip at the start: a door that stands or swings in front of it, or the mouth of a launcher.
+#
+# A door leaves. While it hides the tip, the picture resembles neither film nor background, and the misfit shows it. A
+# mouth stays: its border with the background looks like a tip at rest while the tip moves behind it. What the tip
+# leaves behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a
+# tip that came out of a mouth, the mouth's straight border stays where the edge rested.
+
+# Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
+# edge is a guess (chosen)
+HIDDEN_MISFIT = 3.2
+# Misfit above which nothing of the tip is visible, whatever its contrast (chosen)
+COVERED_MISFIT = 1.12 * HIDDEN_MISFIT
+# Ratio of the misfit to the median above which a frame differs from those clear of the start (chosen)
+UNUSUAL_MISFIT_RATIO = 2.0
+# Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
+# visible, and below which part of it is hidden (chosen)
+LEAST_AMPLITUDE, REDUCED_AMPLITUDE = 0.6, 0.75
+# Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it
+GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
+
+# Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
+BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
+# Least ratio of the border to the largest step between neighbouring columns of film further on (measured)
+BORDER_TO_FILM = 2.0
+FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed and acceleration are estimated (chosen)
+# Ratio of a change of the step to the largest of the next four, above which the hidden frames do not belong to the
+# motion that follows (chosen)
+LEAP_RATIO = 3.0
+LEAST_LEAP_PX = ASTRAY_PX  # Smallest change of the step that is a leap (chosen)
+
+
+@dataclass(frozen=True)
+class Mouth:
+    """A launcher's mouth at the start. `before`, shape (n_frames,), marks the frames in which the edge stands at a
+    border that stays after the tip has gone.
+    """
+
+    before: Bools
+    moved_behind: bool
+
+
+def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
+    """Look for a straight border that stays where the edge rested. Shapes: edge (n_frames,)."""
+    fewest_rest_frames = 3  # Fewest frames of rest from which the resting place is known (chosen)
+    film_range_px = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
+    search_px = 3  # Distance from the resting place within which a border is looked for (chosen)
+    none = Mouth(np.zeros(len(edge), dtype=bool), False)
+    first = int(np.flatnonzero(moving_frames(state.edge))[0])
+    if first < fewest_rest_frames:
+        return none
+    rest_px = float(np.median(edge[:first]))
+    exited = np.flatnonzero((edge > rest_px + START_CLEARANCE_PX) & (np.arange(len(edge)) >= first))
+    near = np.arange(round(rest_px) - search_px, round(rest_px) + search_px + 1)
+    # Not where the tip comes to rest: it is round.
+    later = np.arange(
+        near[-1] + film_range_px[0], min(near[-1] + film_range_px[1], int(edge.max() - START_CLEARANCE_PX))
+    )
+    if len(exited) < fewest_rest_frames or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < film_range_px[0]:
+        return none
+    beside = BORDER_GAP_PX + BORDER_SIDE_PX
+    film_picture = _middle_picture(strip, exited, slice(near[0] - beside, later[-1] + beside))
+    near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
+    borders = _borders(film_picture)
+    border_steps = borders[:, near - beside].T
+    border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
+    border_step = float(np.median(border))
+    film_step = float(np.abs(np.median(borders[:, film_columns - beside], axis=0)).max())
+    contrast = np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))[later]
+    straight = float(np.mean(np.sign(border) == np.sign(border_step)))
+    # 0.5: least ratio of the border to the film's contrast (measured)
+    least_step = max(BORDER_TO_FILM * film_step, 0.5 * float(np.median(contrast)))
+    # 0.95: part of the rows that must show the border with the same sign (measured)
+    if straight < 0.95 or abs(border_step) < least_step:
+        return none
+    clear_px = rest_px + 3 * state.blur + 1
+    exit_frame = first + int(np.argmax(edge[first:] > clear_px))
+    after_exit = edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT]
+    return Mouth(np.arange(len(edge)) < exit_frame, _moved_behind(after_exit, rest_px))
+
+
+def disturbed_start(strip: Strip, state: EdgeState) -> float:
+    """Share of the columns at the start that change before the edge reaches them: a door swings there."""
+    # First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
+    door_columns, door_frames = (6, 10), 15
+    begin, columns = state.edge[0], strip.values.shape[2]
+    column_range = np.arange(int(begin) + door_columns[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
+    moving = np.flatnonzero(moving_frames(state.edge))
+    if len(column_range) < door_columns[1] or moving[0] < 2:
+        return 0.0
+    first = max(0, int(moving[0]) - door_frames)
+    rising = np.maximum.accumulate(state.edge)
+    contrast = float(np.median(np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))))
+    changed = 0
+    for column in column_range:
+        arrival = int(np.searchsorted(rising, column - 5.0))
+        brightness = strip.values[first : max(arrival - 1, first + 1), :, column].mean(axis=1)
+        frames = slice(first, first + len(brightness))
+        change = np.ptp(brightness * strip.scale[frames] + strip.offset[frames])
+        # 0.25, 4.0: A door changes a column where its brightness varies by this part of the film's contrast
+        # and by so many grey levels (chosen)
+        changed += change > max(0.25 * contrast, 4.0)
+    return changed / len(column_range)
+
+
+def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Floats) -> Floats:
+    """Enlarge the errors of frames in which a door still hides the tip. There the edge is a guess; where the picture
+    differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames, 6);
+    misfit_ratio, edge, added_px (n_frames,) → (n_frames,).
+    """
+    near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
+    misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
+    large, raised = misfit > HIDDEN_MISFIT, misfit > HIDDEN_MISFIT / 2
+    no_edge = (misfit > COVERED_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE)
+    covered = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & no_edge
+    if covered.sum() > 1:
+        # A door leaves and does not come: in earlier frames the tip was hidden too.
+        earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
+        covered |= earlier & moving_frames(edge)
+        added_px = np.where(earlier, np.hypot(added_px, ASTRAY_PX), added_px)
+    unlike_model = large & (misfit_ratio > HIDDEN_MISFIT)
+    partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < REDUCED_AMPLITUDE)
+    guessed = near & (unlike_model | partly_hidden)
+    return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
+
+
+def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> NDArray[np.float32]:
+    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker, in some columns. The moving
+    tail averages out.
+    """
+    rows = strip.values.shape[1]
+    # 0.6: part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
+    edge_rows = round((1 - 0.6) / 2 * rows)
+    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, 15).astype(int))]
+    values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
+    level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
+    return np.asarray(np.median(level, axis=0), dtype=np.float32)
+
+
+def _borders(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Step of brightness across each column, by row; the first column is BORDER_GAP_PX + BORDER_SIDE_PX. Shape (n_rows,
+    n_columns).
+    """
+    sides = np.lib.stride_tricks.sliding_window_view(picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
+    apart = 2 * BORDER_GAP_PX + BORDER_SIDE_PX
+    return np.asarray(sides[:, apart:] - sides[:, :-apart], dtype=np.float32)
+
+
+def _moved_behind(edge: Floats, rest_px: float) -> bool:
+    """Whether a tip first seen at `edge` started further back than at `rest_px`. From rest under its present
+    acceleration a it would have come v²/2a, with v its present speed; this is compared with the distance from
+    `rest_px`. As much again, and 5 px, are allowed for an acceleration that falls.
+    """
+    if len(edge) < FRAMES_AFTER_EXIT:
+        return False
+    half_acceleration, speed, start_px = np.polyfit(np.arange(FRAMES_AFTER_EXIT), edge, 2)
+    run_up_px = speed**2 / (4 * half_acceleration) if half_acceleration > 0 else np.inf
+    return bool(run_up_px > 2 * (start_px - rest_px) + 5)
+
+
+def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
+    """Distance of hidden frames from the motion that follows, extrapolated backwards; 0 where they lead up to it. What
+    swings in front of the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
+    Shapes: edge (n_frames,) → (n_frames,).
+    """
+    speed_gain = 0.3  # Gain of speed over the next four frames (chosen)
+    out = np.zeros(len(edge))
+    if hidden.all():
+        return out
+    steps = np.diff(edge)
+    bends = np.diff(steps)  # bends[t] is the change between the steps from t and from t + 1
+    for t in range(int(np.argmin(hidden)) - 1, -1, -1):
+        later = bends[t + 1 : t + FRAMES_AFTER_EXIT]
+        if len(later) < FRAMES_AFTER_EXIT - 1 or not later.sum() > speed_gain * steps[t + 1]:
+            continue
+        if abs(bends[t]) <= max(LEAP_RATIO * np.abs(later).max(), LEAST_LEAP_PX):
+            continue
+        back = np.maximum(steps[t + 1] - max(float(later.mean()), 0.0) * np.arange(1, t + 2), 0.0)
+        out[t::-1] = np.abs(edge[t::-1] - (edge[t + 1] - np.cumsum(back)))
+        break
+    return np.nan_to_num(out)
+
 
 # ------------------------------------------------------------------------------
 # Initial path of the front through a strip, before film, background or the tip are known.

@@ -16,8 +16,17 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
-from vinetrack.video.decoding import PacketIndex, decode_packets, packet_index
-from vinetrack.video.frames import DECODER_THREADS, Frames, Recording, luma_plane, read_frames, slots_from_times
+from vinetrack.video.frames import (
+    DECODER_THREADS,
+    Frames,
+    PacketIndex,
+    Recording,
+    decode_packets,
+    luma_plane,
+    packet_index,
+    read_frames,
+    slots_from_times,
+)
 from vinetrack.video.kymograph import BINS_PER_LEVEL, block_means, largest_changes, largest_steps, median, ratio_medians
 
 SMALL_PX = 240  # Longer side of the pictures in which the axis is sought (chosen)

@@ -28,10 +28,8 @@ from vinetrack.video.curved_axis import (
     recentred_curve,
     shake_along,
 )
-from vinetrack.video.edge import Outline, outline
-from vinetrack.video.edge_repair import ARRIVAL_PX, SLOW_PX
-from vinetrack.video.frame_faults import odd_frames, repeated_frames
-from vinetrack.video.frames import Frames, RecordingError, inspect_recording
+from vinetrack.video.edge import ARRIVAL_PX, SLOW_PX, Outline, outline
+from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.point_quality import (
     FLOOR_PX,
@@ -190,7 +188,7 @@ def _arrival(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[St
 
 def _unsure(fit: EdgeFit) -> Bools:
     """Frames in which the fit of the edge is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain."""
-    from vinetrack.video.edge_repair import LEAST_AMPLITUDE
+    from vinetrack.video.edge import LEAST_AMPLITUDE
 
     median_misfit = float(np.nanmedian(fit.misfit))
     # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
