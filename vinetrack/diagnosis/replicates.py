@@ -44,8 +44,6 @@ from vinetrack.tracks.position_noise import FEWEST_POINTS, local_fit, rest_point
 Indices = NDArray[np.int_]
 
 
-LEAST_SCATTER = 0.02  # Lower limit of the scatter of ln F: the scatter of careful trials (chosen)
-
 CHANCE = 1e-4  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
 
 
@@ -91,7 +89,8 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     residual[driven] = np.log(force[driven]) - curves(np.log(speed[driven]), vine_index)
     # Fitted curves follow the trials: the scatter about them is smaller by the degrees of freedom that they take.
     median_deviation = float(np.median(np.abs(residual[driven]))) / 0.6745
-    scatter = max(median_deviation * math.sqrt(np.count_nonzero(driven) / remaining), LEAST_SCATTER)
+    # 0.02: lower limit of the scatter of ln F: the scatter of careful trials (chosen)
+    scatter = max(median_deviation * math.sqrt(np.count_nonzero(driven) / remaining), 0.02)
     allowed = _limit(len(data), remaining) * scatter
     replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
              for k, trial in enumerate(trials)]  # fmt: skip

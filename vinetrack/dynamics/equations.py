@@ -198,7 +198,6 @@ S = (
 )
 # Weights of the estimate of the local error, and the real eigenvalue of A⁻¹
 E = ((-13 - 7 * _ROOT) / 3, (-13 + 7 * _ROOT) / 3, -1 / 3)
-MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)
 
 
 class Stages(NamedTuple):
@@ -355,8 +354,9 @@ def _local_error(point, stages, scale, rtol):
     """Hairer's estimate of the local error of the speed, in units of the tolerance. Hairer filters it with (μ/h − J)⁻¹.
     This is omitted: the filter hides the error of a long stiff step at its far end.
     """
+    mu = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)
     h, z1, z2, z3 = stages
-    raw = (h * point.acceleration + E[0] * z1 + E[1] * z2 + E[2] * z3) / MU
+    raw = (h * point.acceleration + E[0] * z1 + E[1] * z2 + E[2] * z3) / mu
     # At least a tenth of the final speed: an error at the start affects the whole growth.
     weight = rtol * max(0.1 * scale, abs(point.v), abs(point.v + z3))
     return abs(raw) / weight

@@ -427,7 +427,6 @@ def _fixed_terms_of(fit: Fit, rows: Indices) -> FixedTerms:
 
 # Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined (chosen)
 LEAST_EIGENVALUE = 1e-4
-MOST_STEPS = 20  # Maximum number of Gauss–Newton steps for release and origin (chosen)
 FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
 
 
@@ -540,7 +539,8 @@ def _fit_release_and_origin(
     for i in np.flatnonzero(origin_fixed).tolist():
         trial_effects[i, ORIGIN] = data[i].rest_origin_m
     active = np.arange(len(data))
-    for _ in range(MOST_STEPS):
+    # 20: maximum number of Gauss–Newton steps for release and origin (chosen)
+    for _ in range(20):
         sums = _cross_products_of(predictor, trial_effects, active, rho)
         square[active] = sums[:, :2, :2]
         sums[origin_fixed[active], ORIGIN, :] = sums[origin_fixed[active], :, ORIGIN] = 0.0

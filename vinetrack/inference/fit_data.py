@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 FEWEST_POINTS = 5  # A trial with fewer points is refused (derived)
 
-FEWEST_MOVING = 4  # A trial with fewer points in motion is refused (derived)
-
 
 END_FRACTION = 0.95  # The growth beyond this fraction of the length is left out (chosen)
 
@@ -147,6 +145,7 @@ def prepare_trial(
     rounding_m: float = 0.0,
 ) -> FitTrial:
     """The data of one trial: its usable points, rest included, and the noise that they show."""
+    fewest_moving = 4  # A trial with fewer points in motion is refused (derived)
     usable = track.usable & ~_near_end_of_growth(trial, track)
     imprecise, imprecise_rest = _imprecise_points(track, usable)
     usable &= ~imprecise
@@ -181,9 +180,9 @@ def prepare_trial(
         raise FitError("its leading edge never moves forward beyond its noise")
     n_rest = 0 if imprecise_rest is not None else rest_points(position_m)
     moving = time_s.size - n_rest
-    if 0 < moving < FEWEST_MOVING:
+    if 0 < moving < fewest_moving:
         raise FitError(
-            f"{moving} usable point{'s' * (moving != 1)} in motion, at least {FEWEST_MOVING} are needed: film faster,"
+            f"{moving} usable point{'s' * (moving != 1)} in motion, at least {fewest_moving} are needed: film faster,"
             " or see in its overlay what hides the edge"
         )
     denoised = denoised or denoised_traces([track])[0]

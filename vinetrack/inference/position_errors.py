@@ -261,11 +261,6 @@ def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
     return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])
 
 
-# Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
-# comparison, where differences count from 1; and the maximum number of steps (measured)
-CONVERGED_DECREASE_SMOOTH, MOST_STEPS = 1e-2, 15
-
-
 @dataclass(frozen=True)
 class SmoothErrors:
     """A fit with smooth errors of position included. `solution` holds the free parameters of the fit and after them the
@@ -368,21 +363,24 @@ def _newton_on_fixed_columns(
     Steps are taken as long as they raise ln L. Two parameters that only rounding separates may get a step of any length
     along the direction in which they cancel; no trajectory is simulated here that would reject it.
     """
+    # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
+    # comparison, where differences count from 1; and the maximum number of steps (measured)
+    converged_decrease_smooth, most_steps = 1e-2, 15
     cross_products = predictor.products(columns)
     total_change = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
     state = _variances(predictor, problem, cross_products, state, solution, held)
     level = _log_likelihood(cross_products, problem, state, solution)
-    for _ in range(MOST_STEPS):
+    for _ in range(most_steps):
         step, own_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, 0.0)
         change = np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
         products = _products_after_step(cross_products, change)
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
         after = _variances(predictor, problem, products, before, solution, held)
         new_level = _log_likelihood(products, problem, after, solution)
-        if new_level < level - CONVERGED_DECREASE_SMOOTH:
+        if new_level < level - converged_decrease_smooth:
             break
         cross_products, total_change, state, level = products, total_change + change, after, new_level
-        if predicted_decrease < CONVERGED_DECREASE_SMOOTH and variance_change(before, state) < CONVERGED_VARIANCES:
+        if predicted_decrease < converged_decrease_smooth and variance_change(before, state) < CONVERGED_VARIANCES:
             break
     return state, cross_products, total_change, level
 

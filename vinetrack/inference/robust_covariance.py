@@ -254,9 +254,6 @@ FEWEST_CLUSTERS = 8  # Trials from which the sandwich is better than the model o
 
 FEWEST_DEGREES = 4  # Trials beyond the number of parameters that a sandwich needs (chosen)
 
-# Share of the information on a direction from which one trial is practically the only one to determine it (chosen)
-LARGEST_SHARE = 0.99
-
 
 def cluster_variance(single: Floats, degrees: float) -> Floats:
     """Variance of sums over trials, estimated from the scatter of single trials; 0 where they are too few. The
@@ -351,7 +348,9 @@ def _few_trial_variances(
     for single in information:
         share = root.T @ single[np.ix_(estimated, estimated)] @ root
         values, vectors = np.linalg.eigh(share)
-        below_limit = values < LARGEST_SHARE
+        # 0.99: share of the information on a direction from which one trial is practically the only one to
+        # determine it (chosen)
+        below_limit = values < 0.99
         adjustments.append(
             (vectors[:, below_limit] / np.sqrt(1 - np.maximum(values[below_limit], 0.0))) @ vectors[:, below_limit].T
         )

@@ -539,7 +539,6 @@ def _adapted_step(response: float, previous: float) -> float:
 # ------------------------------------------------------------------------------
 # Starting values of a fit: release and origin from the frames at rest, B and n from a coarse grid search.
 
-EXPONENTS = (0.15, 0.37, 0.65, 1.0)  # Exponents of the grid (chosen)
 
 # Factors of the grid, relative to the B that would balance the drive at the observed speed (chosen)
 DAMPING_FACTORS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.1)
@@ -615,7 +614,8 @@ def _scan_damping(
     key = layout.keys.index(DAMPING)
     damping_index = layout.index[:, key]
     starts = []
-    for n in EXPONENTS if free_n else (_fixed_exponent(layout),):
+    # (0.15, 0.37, 0.65, 1.0): exponents of the grid (chosen)
+    for n in (0.15, 0.37, 0.65, 1.0) if free_n else (_fixed_exponent(layout),):
         values = theta.copy()
         values[free_n] = [layout.free[k].to_scaled(n) for k in free_n]
         guess = {

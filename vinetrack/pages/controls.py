@@ -58,7 +58,6 @@ if TYPE_CHECKING:
     from vinetrack.pages.page import Page
 
 
-STEPS = 400  # Steps of a slider; chosen: about one per pixel
 HEADING = """
 :host { margin-top: .5rem; }
 .bk-btn { text-align: left; border: 0 !important; border-bottom: 1px solid var(--grid) !important; border-radius: 0; }
@@ -117,7 +116,8 @@ def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
 
 
 def _step(low: float, high: float) -> float:
-    return (high - low) / STEPS or 1.0
+    # 400: steps of a slider; chosen: about one per pixel
+    return (high - low) / 400 or 1.0
 
 
 def _opens(inside: UIElement, title: str, css: str, **keywords: Any) -> Toggle:
@@ -214,7 +214,6 @@ def _show_fitted_value(div: Div, size: SizeControl, fitted: Fitted | None) -> No
     div.update(text=text, visible=True)
 
 
-SMALL = ".bk-btn { font-size: 12px; padding: 2px 9px; }"
 CHIPS = """
 :host { max-height: 10.5rem; overflow-y: auto; }
 .bk-btn-group { display: flex; flex-wrap: wrap; gap: 4px; }
@@ -229,13 +228,14 @@ class TrialSelector:
     """Buttons to select conditions and trials; calls `on_change` when the selection changes."""
 
     def __init__(self, campaign: Campaign, on_change: Callable[[], None]) -> None:
+        small = ".bk-btn { font-size: 12px; padding: 2px 9px; }"
         self.campaign, self._on_change = campaign, on_change
         self._conditions = self._chips([campaign.labels[name] for name in campaign.conditions], "conditions")
-        self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", SMALL, visible=False)
+        self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", small, visible=False)
         tools = side_by_side(
-            button("all", "choose_all", self._all, css=SMALL),
-            button("none", "choose_none", self._none, css=SMALL),
-            _opens(self._trials, "single trials …", SMALL, name="single_trials"),
+            button("all", "choose_all", self._all, css=small),
+            button("none", "choose_none", self._none, css=small),
+            _opens(self._trials, "single trials …", small, name="single_trials"),
             css=":host { gap: 4px; }",
         )
         self.root = stacked(self._conditions, tools, self._trials, name="choose")

@@ -60,10 +60,6 @@ from vinetrack.pages.plots import (
 )
 from vinetrack.results.folder_layout import Results
 
-# Chosen: text follows a slider at reading speed, because each change makes the browser lay out the page again
-TEXT_DELAY_MS = 150
-
-
 # A swipe over a figure scrolls the page, as it does elsewhere
 LET_SCROLL = """
 for (const plot of plots) {
@@ -320,7 +316,9 @@ class Page:
     def _update_text_soon(self) -> None:
         if not self._text_pending:
             self._text_pending = True
-            self.document.add_timeout_callback(self._update_text, TEXT_DELAY_MS)
+            # 150: chosen: text follows a slider at reading speed, because each change makes the browser
+            # lay out the page again
+            self.document.add_timeout_callback(self._update_text, 150)
 
     def _predict(self, choice: ModelChoice) -> None:
         """Predict and draw a choice; if that fails, show the error and keep the former prediction."""

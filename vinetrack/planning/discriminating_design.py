@@ -627,9 +627,6 @@ def film_trials(
     return tracks
 
 
-POINTS = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
-
-
 @dataclass(frozen=True)
 class RefitTerms:
     """Quadratic form of −2 ln L of one hypothesis refitted to the trials so far and one trial of every condition. The
@@ -698,11 +695,12 @@ def _times(camera: TrackSampling, run: GrowthCourse) -> tuple[Floats, Floats]:
     """Times since release at which a condition is evaluated, and the number of frames that each represents. The first
     represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
     """
-    step_s = run.near_end_s / POINTS
-    moving = (np.arange(POINTS) + 0.5) * step_s
+    points = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
+    step_s = run.near_end_s / points
+    moving = (np.arange(points) + 0.5) * step_s
     ends_filmed = np.isfinite(run.ends_s) and camera.frames_behind_end > 0
     last_s = 1.05 * run.ends_s if ends_filmed else moving[-1] + step_s  # just past the end
-    weights = np.full(POINTS + 2, step_s / camera.frame_s)
+    weights = np.full(points + 2, step_s / camera.frame_s)
     weights[0], weights[-1] = camera.rest_frames, camera.frames_behind_end if ends_filmed else 0.0
     return np.concatenate([[-camera.frame_s], moving, [last_s]]), weights
 

@@ -34,8 +34,6 @@ from vinetrack.planning.predictive_inputs import (
     predictive_inputs,
 )
 
-LONGEST_S = 600.0  # Duration of a simulation, s (chosen)
-
 POINTS = 400  # Times at which each draw is evaluated (derived)
 
 
@@ -101,9 +99,10 @@ def grown(
     """Simulate every trial at `POINTS` times of its growth. Returns trajectories, end_s (inf where a vine does not
     reach its end). Shapes: rows (n_trials, n_parameters) → (n_trials,).
     """
-    until_longest = [np.array([0.0, LONGEST_S])] * len(trials)
+    longest_s = 600.0  # Duration of a simulation, s (chosen)
+    until_longest = [np.array([0.0, longest_s])] * len(trials)
     ends = simulate_many(model, trials, until_longest, parameters=rows, host=host)
-    stop_s = np.array([last.end_time_s if last.status in ("ended", "stalled") else LONGEST_S for last in ends])
+    stop_s = np.array([last.end_time_s if last.status in ("ended", "stalled") else longest_s for last in ends])
     # Just before the end: without payload the speed diverges there, and is 0 after it.
     times = [max(end, 1e-9) * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for end in stop_s]
     moved = simulate_many(model, trials, times, parameters=rows, host=host)
@@ -192,7 +191,6 @@ TIME, TO_THE_END = "time to get there", "time to the end"
 EDGE, TAIL = "speed of the leading edge", "speed of the tail"
 EJECTION = "ejection speed of the payload"
 TENSION, LEAST_TENSION = "tension of the tail", "least tension of the tail"
-STEADY = "steady tail speed, Eq. (3)"
 
 
 @dataclass(frozen=True)
@@ -324,6 +322,7 @@ def band(values: Floats) -> Floats:
 
 
 def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int) -> Iterator[Quantity]:
+    steady = "steady tail speed, Eq. (3)"
     hoop = "hoop stress PD/2t"
     r, at = inputs.trial.travel_ratio, float(along[place])
     speed = runs.lead_velocity_m_s[:, place]
@@ -340,7 +339,7 @@ def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int)
     yield quantity(TAIL, at, r * speed, "m/s")
     yield quantity(TIME, at, runs.time_s[:, place], "s")
     if not math.isnan(runs.steady_tail_m_s[0]):
-        yield quantity(STEADY, math.nan, runs.steady_tail_m_s, "m/s")
+        yield quantity(steady, math.nan, runs.steady_tail_m_s, "m/s")
     yield quantity(TENSION, at, runs.tension_N[:, place], "N")
     yield quantity(LEAST_TENSION, math.nan, runs.least_tension_N, "N")
     trial = inputs.trial

@@ -425,7 +425,6 @@ HALF_WIDTH = 6  # Neighbours on either side (chosen)
 
 LEAST_SHARE = 0.75  # Least share of the neighbours that must lie on the cubic (chosen)
 
-MOST_ROUNDS = 4  # Most rounds of rejection (measured)
 
 FEWEST_POINTS = 2 * HALF_WIDTH + 1  # Fewest points of a window: the point and its neighbours (derived)
 
@@ -508,13 +507,14 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
     """
     from scipy.stats import t
 
+    most_rounds = 4  # Most rounds of rejection (measured)
     n = time_s.size
     is_outlier = np.zeros(n, dtype=bool)
-    if n < FEWEST_POINTS + MOST_ROUNDS or not np.all(np.diff(time_s) > 0):
+    if n < FEWEST_POINTS + most_rounds or not np.all(np.diff(time_s) > 0):
         return is_outlier
     # Normal noise costs one track in a thousand a point; the local noise has 0.37 × 41 degrees of freedom.
     limit = float(t.isf(1e-3 / (2 * n), 15.0))
-    for _ in range(MOST_ROUNDS):
+    for _ in range(most_rounds):
         candidates = np.flatnonzero(~is_outlier)
         if candidates.size < FEWEST_POINTS:
             break

@@ -349,7 +349,6 @@ def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
 # ------------------------------------------------------------------------------
 # Whether the growth axes of recordings agree: vines filmed by one camera grow along one line of its picture.
 
-ASKEW_DEG = 10.0  # Angle between a recording's axis and that of most others above which the recording is named (chosen)
 FEWEST_ALIKE = 3  # Fewest recordings whose axes agree from which the others are judged (chosen)
 
 
@@ -362,10 +361,12 @@ def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
     """Recordings whose axis differs from that of most others, where most agree. Returns their names, and how many
     recordings agree; no names where fewer than FEWEST_ALIKE agree, or not most.
     """
+    # Angle between a recording's axis and that of most others above which the recording is named (chosen)
+    askew_deg = 10.0
     straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
-    agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
+    agreeing = [sum(_apart_deg(slope, other) < askew_deg for other in straight) for slope in straight]
     common = straight[int(np.argmax(agreeing))] if straight else 0.0
-    names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, common) < ASKEW_DEG]
+    names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, common) < askew_deg]
     agreed = len(slopes_deg) - len(names)
     return (names, agreed) if FEWEST_ALIKE <= agreed > len(names) else ([], agreed)
 

@@ -18,7 +18,6 @@ from vinetrack.core.records import Floats
 from vinetrack.video.strip import Strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
-MOST_STEPS = 8  # Most Gauss-Newton steps of a registration (chosen)
 
 
 POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
@@ -280,7 +279,8 @@ def _register(
     flat = weight.ravel().astype(float)
     sigma, correlation = np.nan, 0.0
     robust = flat
-    for _ in range(MOST_STEPS):
+    # 8: most Gauss-Newton steps of a registration (chosen)
+    for _ in range(8):
         patch = _patch(picture, place[0], place[1], half).ravel().astype(float)
         weighted = design * robust
         normal = weighted @ design.T + np.diag([1e-9, 1e-9, 1e-9, 1e-9])

@@ -41,9 +41,6 @@ from vinetrack.video.frames import RecordingError, inspect_recording, iterate_fr
 EDGE_SHARE = 0.42  # Part of a square over which its edges are followed from the corner (chosen)
 
 
-MOST_STEPS, SETTLED_PX = 20, 1e-4  # Most steps of the fit, and the step at which a corner has converged (chosen)
-
-
 def refine_saddles(
     picture: NDArray[np.uint8], corners_px: Floats, steps_px: Floats, free_share: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
@@ -54,7 +51,8 @@ def refine_saddles(
     values = _first_values(offsets, levels, weights, steps_px)
     model, slopes = _model(values, offsets)
     cost, damping = (weights * (levels - model) ** 2).sum(axis=1), np.full(len(values), 1e-3)
-    for _ in range(MOST_STEPS):
+    # 20, 1e-4: most steps of the fit, and the step at which a corner has converged (chosen)
+    for _ in range(20):
         weighted = slopes * weights[:, :, None]
         normal = np.swapaxes(weighted, 1, 2) @ slopes
         gradient = np.swapaxes(weighted, 1, 2) @ (levels - model)[:, :, None]
@@ -70,7 +68,7 @@ def refine_saddles(
         values[better], model[better], slopes[better] = trial[better], trial_model[better], trial_slopes[better]
         cost = np.minimum(trial_cost, cost)
         damping = np.where(better, damping / 5, damping * 8)
-        if (moved_px < SETTLED_PX).all() and (better | (damping > 1e3)).all():
+        if (moved_px < 1e-4).all() and (better | (damping > 1e3)).all():
             break
     crossings = np.rint(corners_px) + values[:, :2]
     usable = (weights.sum(axis=1) > 30) & (np.abs(values[:, 6]) > 3)

@@ -504,8 +504,6 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
 # frames late and ends up to three frames early, because several frames are averaged at either end. The path that
 # leaves the smaller residual sum is used.
 
-# Change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed (chosen)
-MIN_LOG_CHANGE = 5.0
 
 AVERAGED_FRAMES = 12  # Frames after and before the front over which film and background are averaged (derived)
 
@@ -575,7 +573,8 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> _FrontPath:
     # Length of a run of columns, and the fraction of it that must have changed for a front to have passed
     # (chosen)
     run_length_px, run_changed_part = 9, 0.6
-    strong = change > MIN_LOG_CHANGE
+    # 5.0: change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed (chosen)
+    strong = change > 5.0
     run = np.convolve(strong, np.ones(run_length_px) / run_length_px, mode="same") > run_changed_part
     if run.sum() < run_length_px:
         raise ValueError("nothing moves along the axis")

@@ -228,8 +228,6 @@ def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
 
 
 SHORTEST_BARE_PX = 10  # Fewest columns in a row that must show background again (chosen)
-# Parts of the columns passed, from the first, in at least one of which film is the majority (derived)
-FILM_PARTS = (0.7, 0.35, 0.175)
 
 
 @dataclass(frozen=True)
@@ -310,13 +308,15 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     backwards from the last column passed: first the flying object (no longer than the tube is wide), then columns that
     look as they did before anything came, then film. Shapes: path (n_frames,).
     """
+    # Parts of the columns passed, from the first, in at least one of which film is the majority (derived)
+    film_parts = (0.7, 0.35, 0.175)
     flight_speed_ratio = 1.35  # Ratio of the speeds after and before, below which the motion is still growth (chosen)
     columns, frames = np.arange(passed[0], passed[1]), len(path)
     if len(columns) < 5 * SHORTEST_BARE_PX or frames < 8:
         return passed[1]
     arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
     difference = _lasting_change(strip, columns, arrival)
-    film_difference = max(float(np.median(difference[: int(part * len(difference))])) for part in FILM_PARTS)
+    film_difference = max(float(np.median(difference[: int(part * len(difference))])) for part in film_parts)
     # 0.2: share of the film's median difference from the background (chosen)
     is_bare = difference < 0.2 * film_difference
     bare_from = _first_bare_column(is_bare, strip.values.shape[1])

@@ -34,8 +34,6 @@ MAX_FRAMES = 150  # Maximum number of frames in which it is sought, spread evenl
 # Score of a pixel (measured)
 MIN_GROWTH_SCORE = 0.4
 MIN_GROWN_PART = 0.16  # Part of all change that must pass MIN_GROWTH_SCORE (chosen)
-# Distance, in the small pictures, over which unchanged pixels define the surroundings of a pixel (chosen)
-SURROUNDINGS_PX = 4.0
 
 Pixels = tuple[Floats, Floats, Floats, Floats, int]  # Pixels that change: x, y, time of change and weight, shape
 
@@ -193,13 +191,15 @@ def _side_sums(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     """Sum the pixels left, right, above and below of each pixel; distant ones count where none is near."""
     import cv2
 
+    # Distance, in the small pictures, over which unchanged pixels define the surroundings of a pixel (chosen)
+    surroundings_px = 4.0
     out = [np.zeros_like(picture) for _ in range(4)]
     for share, reach in ((1.0, 1), (1e-2, 4), (1e-4, 16)):
         # Wider filters are applied to a picture shrunk by the same factor.
         height, width = picture.shape
         shrunk = cv2.resize(picture, (-(-width // reach), -(-height // reach)), interpolation=cv2.INTER_AREA)
-        size = 2 * min(round(3 * SURROUNDINGS_PX), max(shrunk.shape)) + 1
-        kernel = cv2.getGaussianKernel(size, SURROUNDINGS_PX, cv2.CV_32F).ravel()
+        size = 2 * min(round(3 * surroundings_px), max(shrunk.shape)) + 1
+        kernel = cv2.getGaussianKernel(size, surroundings_px, cv2.CV_32F).ravel()
         back, ahead = kernel.copy(), kernel.copy()
         back[size // 2 + 1 :] = ahead[: size // 2] = 0.0
         for side, (along, across) in zip(
