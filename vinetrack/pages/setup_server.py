@@ -131,7 +131,7 @@ class ClipStore:
 def _first_frame(path: Path) -> NDArray[Any]:
     frame = next(iterate_frames(inspect_recording(path)), None)
     if frame is None:
-        raise RecordingError(f"{path.name}: no frame can be decoded")
+        raise RecordingError("no frame can be decoded", name=path.name)
     return frame
 
 

@@ -42,7 +42,7 @@ class Axis:
     def __post_init__(self) -> None:
         if self.length_px < SHORTEST_AXIS_PX:
             raise RecordingError(
-                f"the growth axis is shorter than {SHORTEST_AXIS_PX} pixels; move from_px and to_px apart"
+                f"the growth axis is shorter than {SHORTEST_AXIS_PX} pixels", "move from_px and to_px apart"
             )
 
     @property
@@ -306,7 +306,7 @@ def _refine_once(
     along_unit = np.array([np.cos(angle), np.sin(angle)])
     on_front, _, _ = pixels_on_front(x, y, time, weight, n_times, angle, middle, band)
     if on_front.sum() < 8:
-        raise RecordingError("what moves in the picture follows no line; give the axis in the settings")
+        raise RecordingError("what moves in the picture follows no line", "give the axis in the settings")
     on_front_weight = weight[on_front]
     points = np.column_stack([x, y])[on_front]
     centre = np.average(points, axis=0, weights=on_front_weight)

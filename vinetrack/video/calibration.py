@@ -686,8 +686,8 @@ MOST_PICTURES_READ = 10  # Most pictures of a clip that are read (chosen)
 SEARCHED_FRAMES = 300
 
 
-class CalibrationError(ValueError):
-    """A calibration that cannot be made: what is wrong and what to do, in one sentence."""
+class CalibrationError(RecordingError):
+    """A calibration that cannot be made."""
 
 
 @dataclass(frozen=True)
@@ -783,8 +783,8 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
     if sizes_seen != {(width_px, height_px)}:
         sizes = " and ".join(f"{width} × {height}" for width, height in sorted(sizes_seen))
         raise CalibrationError(
-            f"{settings.image} is {sizes} pixels but the recordings are {width_px} × {height_px}; "
-            "film the target with the camera's settings of the trials, without cropping or resizing"
+            f"{settings.image} is {sizes} pixels but the recordings are {width_px} × {height_px}",
+            "film the target with the camera's settings of the trials, without cropping or resizing",
         )
     return calibrate_pictures(pictures, settings)
 
@@ -804,7 +804,7 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
         except CornersError as error:
             complaints.append(str(error))
     if not views:
-        raise CalibrationError(f"{board.image}: {complaints[0]}")
+        raise CalibrationError(complaints[0], name=board.image)
     height, width = pictures[0].shape
     notes = [f"{board.image}: the target is read in {len(views)} of {len(pictures)} pictures"] if complaints else []
     moved_px = _target_motion_px(views)
@@ -817,8 +817,10 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     fit = fit_planes([_median_corners(views)] if stationary else views, width, height)
     if fit.reprojection_px > largest_reprojection_px:
         raise CalibrationError(
-            f"{board.image}: corners lie {fit.reprojection_px:.1f} px from where a flat board of {board.squares[0]} × "
-            f"{board.squares[1]} squares has them; check `squares`, and that the board is flat"
+            f"corners lie {fit.reprojection_px:.1f} px from where a flat board of {board.squares[0]} × "
+            f"{board.squares[1]} squares has them",
+            "check `squares`, and that the board is flat",
+            board.image,
         )
     corners_px = _median_corners(views)[0] if stationary else views[0][0]
     notes += _coverage_note(corners_px, width, height, board.image)
@@ -847,9 +849,9 @@ def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
             if len(pictures) == MOST_PICTURES_READ or count >= SEARCHED_FRAMES:
                 break
     except RecordingError as error:
-        raise CalibrationError(f"calibration: {error}") from error
+        raise CalibrationError(error.what, error.remedy) from error
     if not pictures:
-        raise CalibrationError(f"calibration: {name} holds no picture that can be read; copy it from the camera again")
+        raise CalibrationError(f"{name} holds no picture that can be read", "copy it from the camera again")
     return pictures
 
 

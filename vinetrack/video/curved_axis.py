@@ -58,8 +58,8 @@ class CurvedAxis(Axis):
         points = np.array(self.through_px)
         if np.min(np.hypot(*np.diff(points, axis=0).T)) < SMALLEST_POINT_SPACING_PX:
             raise RecordingError(
-                f"two neighbouring points of the growth axis are less than {SMALLEST_POINT_SPACING_PX} pixels apart; "
-                "leave out one"
+                f"two neighbouring points of the growth axis are less than {SMALLEST_POINT_SPACING_PX} pixels apart",
+                "leave out one",
             )
         super().__post_init__()
 
@@ -372,7 +372,7 @@ def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
     """Refuse a curve that leaves the picture or bends more sharply than its strip is wide."""
     complaint = curve_problem(axis, half_px, (shape[1], shape[0]))
     if complaint is not None:
-        raise RecordingError(f"the growth axis {complaint[0]}; {complaint[1]}")
+        raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
 
 
 def outline_stretches(axis: Axis) -> int:

@@ -383,7 +383,12 @@ DECODER_THREADS = 2  # Decoder threads per recording (chosen)
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be used; the message is one sentence."""
+    """A recording that cannot be used: whose it is, what is wrong and what to do; together they are one sentence."""
+
+    def __init__(self, message: str, remedy: str = "", name: str = "") -> None:
+        self.message, self.remedy = message, remedy
+        self.what = f"{name}: {message}" if name else message
+        super().__init__(f"{self.what}; {remedy}" if remedy else self.what)
 
 
 @dataclass(frozen=True)
@@ -468,15 +473,15 @@ def inspect_recording(path: Path | str) -> Recording:
     try:
         size = 1 if path.is_dir() else file_size(path)
     except FileNotFoundError:
-        raise RecordingError(f"{path.name}: there is no such file or folder") from None
+        raise RecordingError("there is no such file or folder", name=path.name) from None
     except OSError as error:
-        raise RecordingError(f"{path.name}: cannot be read: {error.strerror}") from None
+        raise RecordingError(f"cannot be read: {error.strerror}", name=path.name) from None
     if path.is_dir() or path.suffix.lower() in IMAGES:
         from vinetrack.video.images import inspect_images
 
         return inspect_images(path)
     if size == 0:
-        raise RecordingError(f"{path.name}: the file is empty; copy it from the camera again")
+        raise RecordingError("the file is empty", "copy it from the camera again", path.name)
     if path.suffix.lower() in {".cine", ".mraw", ".cih", ".cihx"}:
         from vinetrack.video.images import inspect_cine, inspect_mraw
 
@@ -516,8 +521,9 @@ def read_frames(
 def too_large(recording: Recording) -> RecordingError:
     """Make the error for a recording that does not fit in memory."""
     return RecordingError(
-        f"{recording.path.name}: its frames of {recording.width} x {recording.height} px do not fit in the memory "
-        "of this machine; cut it to the growth, and to the part of the picture that shows it"
+        f"its frames of {recording.width} x {recording.height} px do not fit in the memory of this machine",
+        "cut it to the growth, and to the part of the picture that shows it",
+        recording.path.name,
     )
 
 
@@ -565,20 +571,20 @@ def _inspect_container(path: Path) -> Recording:
     try:
         with quiet_log() as messages, open_film(path) as container:
             if container.format.name in TEXT_FORMATS:
-                raise RecordingError(f"{path.name}: a text, not a recording; name a film, or a folder of pictures")
+                raise RecordingError("a text, not a recording", "name a film, or a folder of pictures", path.name)
             if not container.streams.video:
-                raise RecordingError(f"{path.name}: holds no video stream; name a video file")
+                raise RecordingError("holds no video stream", "name a video file", path.name)
             stream = container.streams.video[0]
             first = next(container.decode(stream), None)
             if first is None:
-                raise RecordingError(f"{path.name}: not one frame can be decoded; the file is damaged or empty")
+                raise RecordingError("not one frame can be decoded", "the file is damaged or empty", path.name)
             depth = first.format.components[0].bits
             declared = _declared_frames(stream, container)
             playback = float(stream.average_rate) if stream.average_rate else None
             return Recording(path, "container", first.width, first.height, depth, declared, playback_fps=playback)
     except (av.error.FFmpegError, UnicodeDecodeError) as error:
         # PyAV decodes names in a header as UTF-8, which fails for a damaged one.
-        raise RecordingError(_why_unreadable(path, messages, str(error))) from error
+        raise RecordingError(*_why_unreadable(path, messages, str(error)), path.name) from error
 
 
 def _declared_frames(stream: Any, container: Any) -> int | None:
@@ -595,13 +601,14 @@ def _declared_frames(stream: Any, container: Any) -> int | None:
     return max(round(seconds * float(stream.average_rate)), 0) or None
 
 
-def _why_unreadable(path: Path, messages: list[str], error: str) -> str:
+def _why_unreadable(path: Path, messages: list[str], error: str) -> tuple[str, str]:
+    """What is wrong with a file that cannot be opened, and what to do."""
     text = " ".join([*messages, error])
     if "moov atom not found" in text and _looks_like_mp4(path):
-        return f"{path.name}: cut short: the index that is written last is missing; copy the file again, or repair it"
+        return "cut short: the index that is written last is missing", "copy the file again, or repair it"
     if path.suffix.lower() not in CONTAINERS:
-        return f"{path.name}: not a video that can be read; save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
-    return f"{path.name}: not a video, or its beginning is damaged; copy it from the camera again"
+        return "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
+    return "not a video, or its beginning is damaged", "copy it from the camera again"
 
 
 def _looks_like_mp4(path: Path) -> bool:
@@ -613,7 +620,7 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
     n = len(decoded.times_s)
     name = recording.path.name
     if n == 0:
-        raise RecordingError(f"{name}: not one frame can be decoded; the file is damaged")
+        raise RecordingError("not one frame can be decoded", "the file is damaged", name)
     notes = list(recording.notes)
     there = n if index is None else len(index.pts)
     if recording.declared_frames is not None and there < recording.declared_frames:
@@ -777,7 +784,7 @@ def read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
     for n, picture in enumerate(raw.pictures(), 1):
         luma[n - 1] = picture[region.slices]
     if n == 0:
-        raise RecordingError(f"{name}: not one frame is in the file; copy it from the camera again")
+        raise RecordingError("not one frame is in the file", "copy it from the camera again", name)
     if recording.declared_frames is not None and n < recording.declared_frames:
         notes.append(
             f"{name}: the file holds {n} frames but declares {recording.declared_frames}: cut short; "

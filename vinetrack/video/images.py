@@ -38,17 +38,19 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
     if true_fps is not None:
         if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
             raise RecordingError(
-                f"{trial.name}: capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording; "
-                "correct the sheet"
+                f"capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording",
+                "correct the sheet",
+                trial.name,
             )
         return true_fps
     if not np.isfinite(stated):
-        raise RecordingError(f"{trial.name}: capture_fps is missing; the file knows its playback rate only")
+        raise RecordingError("capture_fps is missing", "the file knows its playback rate only", trial.name)
     playback = recording.playback_fps
     if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
         raise RecordingError(
-            f"{trial.name}: capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g}); "
-            "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
+            f"capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g})",
+            "write the rate of capture, or capture_fps_is_playback: yes where it plays as fast as it was captured",
+            trial.name,
         )
     return stated
 
@@ -61,8 +63,9 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
     # 0.02: relative difference within which exposures of sheet and recording are the same (chosen)
     if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > 0.02:
         raise RecordingError(
-            f"{trial.name}: exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording; "
-            "correct the sheet"
+            f"exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording",
+            "correct the sheet",
+            trial.name,
         )
     return true_s
 
@@ -111,10 +114,10 @@ def inspect_cine(path: Path) -> Recording:
                 "<2s3HiIiI3I", header[:36]
             )
             if kind != b"CI":
-                raise RecordingError(f"{name}: not a Phantom cine; name a film, or a folder of pictures")
+                raise RecordingError("not a Phantom cine", "name a film, or a folder of pictures", name)
             end = table + 8 * count
             if min(bitmap, setup, table) < 44 or count == 0 or end > size:
-                raise RecordingError(f"{name}: cut short, or its header is damaged; copy it from the camera again")
+                raise RecordingError("cut short, or its header is damaged", "copy it from the camera again", name)
             stream.seek(0)
             header = stream.read(max(end, setup + SETUP_BYTES))
             offsets = tuple(int(at) for at in np.frombuffer(header, "<i8", count, table))
@@ -124,7 +127,7 @@ def inspect_cine(path: Path) -> Recording:
     except (struct.error, ValueError, OSError) as error:
         if isinstance(error, RecordingError):
             raise
-        raise RecordingError(f"{name}: its header is damaged; copy it from the camera again") from None
+        raise RecordingError("its header is damaged", "copy it from the camera again", name) from None
     depth = struct.unpack_from("<I", setup_bytes, REAL_BITS_AT)[0]
     depth = 12 if frames.stored_bits in (10, 12) else depth if 0 < depth <= frames.stored_bits else frames.stored_bits
     return Recording(
@@ -142,13 +145,17 @@ def _cine_frames(
     _, width, height, _, bits, packing = struct.unpack_from("<IiiHHI", header, bitmap)
     mark, length = struct.unpack_from("<2sH", header, setup + MARK_AT)
     if mark != b"ST" or length < REAL_BITS_AT + 4:
-        raise RecordingError(f"{name}: its camera's settings are missing or of an unknown kind; save it anew")
+        raise RecordingError("its camera's settings are missing or of an unknown kind", "save it anew", name)
     filters = struct.unpack_from("<I", header, setup + COLOUR_FILTER_AT)[0]
     grey = compression == 0 or (compression == 2 and filters in {0} | BAYER_CODES)
     if not (version == 1 and grey and packing in PACKED_BITS and bits in (8, 16)):
         raise RecordingError(
-            f"{name}: a cine of version {version}, compression {compression}, packing {packing}, {bits} bits, "
-            f"colour filter {filters:#x} is not read; save it as raw cine or AVI"
+            (
+                f"a cine of version {version}, compression {compression}, packing {packing}, {bits} bits, colour "
+                f"filter {filters:#x} is not read"
+            ),
+            "save it as raw cine or AVI",
+            name,
         )
     packed = PACKED_BITS[packing]
     frames = RawFrames(
@@ -156,7 +163,7 @@ def _cine_frames(
         linearise=packed == 10, mosaic=compression == 2 and filters in BAYER_CODES,
     )  # fmt: skip
     if width <= 0 or height == 0 or (width * abs(height) * frames.stored_bits) % 8:
-        raise RecordingError(f"{name}: its header is damaged; copy it from the camera again")
+        raise RecordingError("its header is damaged", "copy it from the camera again", name)
     starts = []
     for at in offsets:
         if not 0 < at <= size - 8:
@@ -169,8 +176,12 @@ def _cine_frames(
             break
         if struct.unpack("<I", size_field)[0] != frames.frame_bytes:
             raise RecordingError(
-                f"{name}: a frame takes {struct.unpack('<I', size_field)[0]} bytes where {width} x {abs(height)} px of "
-                f"{frames.stored_bits} bits take {frames.frame_bytes}; it is not read"
+                (
+                    f"a frame takes {struct.unpack('<I', size_field)[0]} bytes where {width} x {abs(height)} px of "
+                    f"{frames.stored_bits} bits take {frames.frame_bytes}"
+                ),
+                "it is not read",
+                name,
             )
         starts.append(at + annotation)
     return replace(frames, offsets=tuple(starts))
@@ -231,20 +242,21 @@ def inspect_mraw(path: Path) -> Recording:
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
     if side is None:
         raise RecordingError(
-            f"{path.name}: its .cih or .cihx is missing, which describes the pictures; put it in the same folder"
+            "its .cih or .cihx is missing, which describes the pictures", "put it in the same folder", path.name
         )
     facts = read_side_file(side)
     if data is None:
-        raise RecordingError(f"{path.name}: its .mraw is missing, which holds the pictures; put it in the same folder")
+        raise RecordingError("its .mraw is missing, which holds the pictures", "put it in the same folder", path.name)
     grey = not facts.colour or facts.colour.lower().startswith("mono")
     if not (facts.file_format.lower() == "mraw" and grey and facts.stored_bits in (8, 12, 16)):
         raise RecordingError(
-            f"{side.name}: {facts.file_format or 'unknown'} pictures of {facts.stored_bits} bits ({facts.colour}) are "
-            "not read; save them as MRAW with 8, 12 or 16 bits of grey, or as AVI or TIFF"
+            f"{facts.file_format or 'unknown'} pictures of {facts.stored_bits} bits ({facts.colour}) are not read",
+            "save them as MRAW with 8, 12 or 16 bits of grey, or as AVI or TIFF",
+            side.name,
         )
     frames = RawFrames(data, (), facts.width, facts.height, facts.stored_bits)
     if min(facts.width, facts.height, facts.n_frames) < 1 or (facts.width * facts.height * facts.stored_bits) % 8:
-        raise RecordingError(f"{side.name}: size or number of frames is missing; copy it from the camera again")
+        raise RecordingError("size or number of frames is missing", "copy it from the camera again", side.name)
     present = min(facts.n_frames, file_size(data) // frames.frame_bytes)
     frames = replace(frames, offsets=range(0, present * frames.frame_bytes, frames.frame_bytes))
     depth = facts.depth if 0 < facts.depth <= facts.stored_bits else facts.stored_bits
@@ -279,7 +291,7 @@ def read_side_file(path: Path) -> SideFile:
             # 4_000_000: most bytes of a side file that are read (chosen)
             data = stream.read(4_000_000)
     except OSError as error:
-        raise RecordingError(f"{name}: cannot be read: {error.strerror}") from None
+        raise RecordingError(f"cannot be read: {error.strerror}", name=name) from None
     values = _cihx_values(name, data) if path.suffix.lower() == ".cihx" else _cih_values(data)
 
     def value(key: str) -> float:
@@ -337,7 +349,7 @@ def _cihx_values(name: str, data: bytes) -> dict[str, str]:
     except ElementTree.ParseError:
         root = None
     if root is None:
-        raise RecordingError(f"{name}: its XML is damaged; copy it from the camera again")
+        raise RecordingError("its XML is damaged", "copy it from the camera again", name)
     return {key: (root.findtext(place) or "").strip() for key, place in CIHX_PLACES.items()}
 
 
@@ -362,10 +374,10 @@ def inspect_images(path: Path) -> Recording:
         files, numbers, notes = (path,), (), ()
         kind = "stack"
         if path.stat().st_size == 0:
-            raise RecordingError(f"{path.name}: the file is empty; copy it from the camera again")
+            raise RecordingError("the file is empty", "copy it from the camera again", path.name)
     readable = next((p for p in map(_read_or_none, files[:3]) if p is not None), None)
     if readable is None:
-        raise RecordingError(f"{path.name}: {files[0].name} is not an image that can be read")
+        raise RecordingError(f"{files[0].name} is not an image that can be read", name=path.name)
     depth = 8 if readable.dtype == np.uint8 else 16
     fps, exposure = _dng_clock(files[0]) if files[0].suffix.lower() == ".dng" else (None, None)
     count = _pages(path) if kind == "stack" else len(files)
@@ -390,7 +402,7 @@ def read_images(recording: Recording, region: Region) -> Frames:
     else:
         pictures, damaged = _read_folder(recording, region)
     if not pictures or all(damaged):
-        raise RecordingError(f"{name}: not one picture can be read; the files are damaged")
+        raise RecordingError("not one picture can be read", "the files are damaged", name)
     if any(damaged):
         bad = [f.name for f, d in zip(recording.files, damaged, strict=True) if d]
         notes.append(
@@ -420,9 +432,9 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
     """Images of the folder in the order of their numbers; those not named like the majority are left out."""
     images = sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGES and not f.name.startswith("."))
     if not images:
-        raise RecordingError(f"{folder.name}: the folder holds no images; expected PNG, JPEG, TIFF or DNG frames")
+        raise RecordingError("the folder holds no images", "expected PNG, JPEG, TIFF or DNG frames", folder.name)
     if unreadable := next(filter(is_pipe_or_device, images), None):
-        raise RecordingError(f"{folder.name}: {unreadable.name} cannot be read: {NOT_A_FILE}")
+        raise RecordingError(f"{unreadable.name} cannot be read: {NOT_A_FILE}", name=folder.name)
     groups: dict[tuple[str, str], list[tuple[int, Path]]] = {}
     for file in images:
         match = re.fullmatch(r"(.*?)(\d+)\D*", file.stem)

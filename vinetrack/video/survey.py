@@ -78,13 +78,13 @@ def measure_recording(
     recording. `keep` returns the tracking in pixels that it keeps for these inputs, or makes it by the function given.
     """
     if trial.video is None:
-        raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
+        raise RecordingError("no recording is named", "fill in the column video", trial.name)
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording)
     calibration = calibration_of(trial, settings, folder, recording)
     if calibration is None and not math.isfinite(trial.m_per_px):
         raise RecordingError(
-            f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
+            "there is no scale", "give `calibration` in experiment.yaml, or mm_per_px in the sheet", trial.name
         )
     m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
     axis = given_axis(trial, settings, m_per_px)
@@ -121,7 +121,7 @@ def calibration_of(
     try:
         return _calibrated(settings.calibration, folder, recording.width, recording.height, state)
     except CalibrationError as error:
-        raise RecordingError(f"calibration: {error}") from error
+        raise RecordingError(error.what, error.remedy, "calibration") from error
 
 
 @lru_cache(maxsize=8)
@@ -392,7 +392,9 @@ class Surveyor:
                 opened[trial] = recording = inspect_recording(trial.video or Path())
                 of_trial = _recording_problems(trial, recording)
             except (RecordingError, OSError) as error:
-                of_trial = [_unusable_recording(error, trial.video.name if trial.video else "")]
+                what, remedy = (str(error), "") if isinstance(error, OSError) else (error.message, error.remedy)
+                name = trial.video.name if trial.video else ""
+                of_trial = [Problem(message=f"cannot be used: {what}", column="video", value=name, remedy=remedy)]
             if all(problem.severity != "error" for problem in of_trial):
                 sound.append(trial)
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
@@ -451,8 +453,7 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
         try:
             clock(trial, recording)
         except RecordingError as error:
-            message, _, remedy = str(error).removeprefix(f"{trial.name}: {column} ").rpartition("; ")
-            return [Problem(message=message or remedy, column=column, remedy=remedy if message else "")]
+            return [Problem(message=error.message.removeprefix(f"{column} "), column=column, remedy=error.remedy)]
     problems = [
         Problem(message=f"is odd: {note.removeprefix(f'{recording.path.name}: ')}", severity="warning", **place)
         for note in recording.notes
@@ -558,15 +559,7 @@ def _calibration_problems(
             calibration = calibrate(settings.calibration, folder, width_px, height_px)
             calibrations[width_px, height_px] = calibration
         except CalibrationError as error:
-            message, _, remedy = str(error).removeprefix("calibration: ").rpartition("; ")
-            return [Problem(message=f"cannot be used: {message or remedy}", remedy=remedy if message else "", **place)]
+            return [Problem(message=f"cannot be used: {error.what}", remedy=error.remedy, **place)]
         if image is not None:
             notes |= dict.fromkeys(calibration.notes)
     return [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
-
-
-def _unusable_recording(error: Exception, name: str) -> Problem:
-    """The problem of a recording that cannot be used, from the message of its error."""
-    message, _, remedy = str(error).removeprefix(f"{name}: ").rpartition("; ")
-    words = f"cannot be used: {message or remedy}"
-    return Problem(message=words, column="video", value=name, remedy=remedy if message else "")

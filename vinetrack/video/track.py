@@ -141,6 +141,8 @@ def follow(
         if trial.travel_ratio == 1:
             return _body(luma, axis, exposure_frames)
         return _edge(luma, axis, exposure_frames, front_share_of) or _arrival(luma, axis, exposure_frames)
+    except RecordingError:
+        raise
     except ValueError as error:
         raise RecordingError(str(error)) from error
 
@@ -233,8 +235,9 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
         count = int(damaged.sum())
         problem = f"{count} of {int(allowed.sum())} frames are damaged" if count else "frames are missing"
         raise RecordingError(
-            f"{frames.recording.path.name}: {problem} and only {len(longest)}{where} follow each other without damage: "
-            "copy it from the camera again, or name sound ones in frames_used"
+            f"{problem} and only {len(longest)}{where} follow each other without damage",
+            "copy it from the camera again, or name sound ones in frames_used",
+            frames.recording.path.name,
         )
     mask = np.zeros(len(frames), dtype=bool)
     mask[longest] = True
@@ -284,7 +287,7 @@ def track_recording(
 ) -> Tracking:
     """Track the leading edge of one recording, or the body where the travel ratio is 1. Shapes: position_m (n, 2)."""
     if trial.video is None:
-        raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
+        raise RecordingError("no recording is named", "fill in the column video", trial.name)
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording)
     frames = read_event(recording, trial.frames_used)
@@ -321,14 +324,14 @@ def track_pixels(
         axis, front_share_of = locate_axis(luma, axis, trial, diameter_px)
         strip, followed = follow(luma, trial, axis, exposure_s * capture_fps, front_share_of)
     except RecordingError as error:
-        raise RecordingError(f"{name}: {error}") from error
+        raise RecordingError(error.what, error.remedy, name) from error
     random_px, total_px = _edge_errors(strip, followed, trial)
     quality = assess_points(
         followed.edge_px, total_px, frames.slot[rows], number, unsure=followed.unsure,
         repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
     )  # fmt: skip
     if quality.last_moving < 0:
-        raise RecordingError(f"{name}: {_why_motionless(total_px, quality)}")
+        raise RecordingError(f"{_why_motionless(total_px, quality)}", name=name)
     errors_px = _random_error(random_px, followed, quality), _slow_error(strip, followed)
     notes, ending = _notes(frames, selection, luma, trial, strip, followed, quality, axis_given)
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
@@ -357,13 +360,13 @@ def _select_frames(frames: Frames, trial: Trial) -> _Selection:
     """Frames that the sheet allows, of the longest undamaged stretch, without odd ones at the start."""
     name = frames.recording.path.name
     if len(frames) < FEWEST_FRAMES:
-        raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
+        raise RecordingError(f"only {len(frames)} frames can be decoded", f"at least {FEWEST_FRAMES} are needed", name)
     odd = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
     first, last = trial.frames_used or (0, frames.n_recorded - 1)
     number = frames.first + np.arange(len(frames))
     allowed: Bools = (number >= first) & (number <= last)
     if allowed.sum() < FEWEST_FRAMES:
-        raise RecordingError(f"{name}: frames_used leaves {int(allowed.sum())} of {len(frames)} frames; widen it")
+        raise RecordingError(f"frames_used leaves {int(allowed.sum())} of {len(frames)} frames", "widen it", name)
     sound = sound_stretch(frames, allowed)
     odd &= sound
     rows = np.flatnonzero(sound & ~odd)
