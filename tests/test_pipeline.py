@@ -245,6 +245,7 @@ def test_one_trial_gives_everything_but_a_law_and_says_why(tmp_path: Path) -> No
     assert law["refused"] in (tmp_path / "results" / "report.html").read_text().replace("&#39;", "'")
 
 
+@pytest.mark.slow
 def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_path: Path) -> None:
     folder, results = tmp_path / "v", tmp_path / "results"
     write_track(folder / "a.csv", 12, 20, 7)

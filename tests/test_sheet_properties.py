@@ -265,6 +265,7 @@ def test_every_float_is_read_back(value: float) -> None:
     assert parse_table(f"x;y\n{text.replace('.', ',')};0,5\n").numbers("x")[0] == value
 
 
+@pytest.mark.slow
 @REPEATABLE
 @given(st.text(alphabet=st.sampled_from("ab./\\: C~\x00\n\u2028é"), max_size=14) | st.text(max_size=20))
 def test_no_path_escapes(relative: str) -> None:

@@ -116,6 +116,7 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials: list[Trial
     assert size["day 2"] - size["day 3"] == pytest.approx(np.log(1.05 / 0.96), abs=0.025)
 
 
+@pytest.mark.slow
 def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> None:
     """Where nothing differs, a change may begin anywhere: what is worth as much as one chance in a thousand is rare."""
     pairs = made(trials, range(len(trials)), lambda _, __: 1.0, seed=9)

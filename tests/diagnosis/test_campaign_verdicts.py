@@ -453,6 +453,7 @@ def test_a_loaded_vine_tells_that_its_angle_is_wrong(stated_deg: float, true_deg
     assert abs(slip.value - 1) < 4 * slip.sigma < 0.4
 
 
+@pytest.mark.slow
 def test_a_bare_vine_of_light_film_cannot_tell() -> None:
     told = asked_of_angle(filmed(Vine(12, 100, 140), (24, 30, 38, 48), 0, 90, 0))
     assert told.verdict == "adequate"

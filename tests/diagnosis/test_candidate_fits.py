@@ -52,6 +52,7 @@ def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
         assert abs(found[key].value - size) < 4 * found[key].sigma
 
 
+@pytest.mark.slow
 def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_found(monkeypatch):
     """A friction at rest beside the yield pressure that was found without it would hold the vine back altogether."""
     begun = []

@@ -74,6 +74,7 @@ def largest() -> float:
     return next(o for o in nothing.rounds[0].ranking if o.effect == "tail_friction").largest["tail_friction.mu_w"]
 
 
+@pytest.mark.slow
 def test_a_size_well_beyond_what_could_hide_would_have_been_seen(largest: float) -> None:
     """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
     hidden = grown({"tail_friction.mu_w": 4 * largest}, seed=7000, trials=sheet()[::2])
@@ -222,6 +223,7 @@ def test_an_unknown_candidate_is_an_error_that_suggests(depleted_pairs: Pairs) -
         vt.diagnose(depleted_pairs, candidates=["air_drage"])
 
 
+@pytest.mark.slow
 def test_a_measured_pressure_already_holds_what_happens_in_the_chamber() -> None:
     pairs = [
         (trial, replace(track, pressure_Pa=np.full(track.time_s.size, trial.pressure_Pa)))
@@ -268,11 +270,13 @@ def test_a_model_that_holds_is_not_contradicted(plain: Fit) -> None:
     assert contradictions((plain,), (), None) == ()
 
 
+@pytest.mark.slow
 def test_n_that_differs_between_vines_contradicts_an_adequate_model() -> None:
     found = fit(vt.base_model(), exponents_apart(0.06), profile=False)
     assert {told.code for told in contradictions((found,), (), None)} == {"still_drifts"}
 
 
+@pytest.mark.slow
 def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain: Fit) -> None:
     steps, pressure_step = plain.predictor.steps.copy(), plain.predictor.pressure_step.copy()
     theta = plain.solution.state.theta.copy()

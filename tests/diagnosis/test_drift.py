@@ -39,6 +39,7 @@ def stretching() -> Drift:
     return drift(fitted(pairs_of(grown(sheet(), 51, ["wall_stretch"]))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [52, 53, 54])
 def test_where_nothing_is_missing_nothing_drifts(seed: int) -> None:
     found = drift(fitted(pairs_of(grown(sheet(), seed))))
@@ -54,12 +55,14 @@ def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure(stretching
     assert row["change"] > 5 * row["change_sigma"] > 0
 
 
+@pytest.mark.slow
 def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(depleting: Drift) -> None:
     rows = depleting.table[depleting.table["against"] == "growth"]
     assert rows["significant"].all()
     assert (rows["to_level"] > rows["from_level"]).all()
 
 
+@pytest.mark.slow
 def test_the_tables_have_their_columns_and_the_most_significant_first(depleting: Drift) -> None:
     assert tuple(depleting.table.columns) == DRIFT_COLUMNS
     assert tuple(depleting.groups.columns) == GROUP_COLUMNS
@@ -81,6 +84,7 @@ def test_every_trial_finds_the_b_it_was_grown_with() -> None:
     assert np.std(values.deviation) > 0.015
 
 
+@pytest.mark.slow
 def test_vines_of_different_exponents_are_told() -> None:
     trials = sheet()
     one = [trial for trial in trials if trial.diameter_m < 0.02]
@@ -108,11 +112,13 @@ def complete() -> list[Failure]:
     return [locate(fitted(pairs_of(grown(sheet(), 72 + k, **more)))) for k, more in enumerate(nuisances)]
 
 
+@pytest.mark.slow
 def test_where_nothing_is_missing_it_fails_nowhere(complete: list[Failure]) -> None:
     for found in complete:
         assert not found.fails
 
 
+@pytest.mark.slow
 def test_errors_of_the_mean_residual_are_as_large_as_replicates_make_them(complete: list[Failure]) -> None:
     """Not the smaller one of a thousand independent frames: with that, these would stray by 20 of them."""
     for name in ("along_time", "along_position", "along_speed"):
@@ -121,6 +127,7 @@ def test_errors_of_the_mean_residual_are_as_large_as_replicates_make_them(comple
         assert np.mean(np.abs(z) > 3) < 0.02
 
 
+@pytest.mark.slow
 def test_an_emptying_chamber_makes_it_fail(failing: Failure) -> None:
     assert failing.fails
     worst = failing.by_condition.iloc[0]
@@ -128,6 +135,7 @@ def test_an_emptying_chamber_makes_it_fail(failing: Failure) -> None:
     assert failing.by_condition["z"].max() > 3.5
 
 
+@pytest.mark.slow
 def test_the_tables_have_their_columns(failing: Failure) -> None:
     assert tuple(failing.by_condition.columns) == CONDITION_COLUMNS
     assert tuple(failing.along_time.columns) == TIME_COLUMNS
@@ -138,6 +146,7 @@ def test_the_tables_have_their_columns(failing: Failure) -> None:
     assert together["n_trials"].max() == 12
 
 
+@pytest.mark.slow
 def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign() -> None:
     """Eight millimetres ahead in the middle of the growth of one condition, by hand."""
     pairs = pairs_of(grown(sheet((4,)), 77, damping_scatter=0.005, pressure_scatter=0.002))

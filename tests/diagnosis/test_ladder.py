@@ -105,6 +105,7 @@ def test_in_sample_error_and_floor_are_those_of_the_comparison(fits: tuple[Fit, 
     assert errors.floor[0] == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
 
 
+@pytest.mark.slow
 def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(fits: tuple[Fit, Fit]) -> None:
     names = sorted(trial.name for trial in fits[1].trials)
     assert sorted(trial.name for trial in left_out(fits[1]).trials) == names
@@ -118,6 +119,7 @@ def test_the_highest_pressure_is_that_of_each_vine(pairs: Pairs) -> None:
     assert sorted(one.trial.name for one in highest_pressure(found).trials) == ["R2_48kPa_1", "R4_38kPa_1"]
 
 
+@pytest.mark.slow
 def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pairs) -> None:
     single = [pair for pair in pairs if pair[0].name.startswith("R2") or "_38kPa" in pair[0].name]
     found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, single, profile=False)
@@ -134,6 +136,7 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pai
     assert told.notes == tuple(table.attrs["notes"])
 
 
+@pytest.mark.slow
 def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(
     fits: tuple[Fit, Fit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,6 +164,7 @@ def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:
     assert table.attrs["notes"]
 
 
+@pytest.mark.slow
 def test_without_replicates_there_is_no_floor(pairs: Pairs) -> None:
     found = vt.fit(vt.base_model(), pairs[::3], profile=False)
     assert math.isnan(in_sample(found).floor[0])

@@ -301,6 +301,7 @@ def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> Non
     assert found.laws["amplitude_N"].iloc[0] == pytest.approx(0.5, abs=0.07)
 
 
+@pytest.mark.slow
 def test_a_friction_that_falls_with_speed_is_identified(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "stribeck", -1.5, 93))
     assert found.laws["law"].iloc[0] in ("falling_with_speed", "inverse_speed")
@@ -441,6 +442,7 @@ def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditio
     assert best.rms_left_out_m < proposal.rms_left_out_m
 
 
+@pytest.mark.slow
 def test_nothing_is_proposed_where_nothing_is_missing() -> None:
     proposal = propose(vt.base_model(), pairs_of(grown(sheet((4,)), 102)), lambda _: None)
     assert not proposal.tied

@@ -99,6 +99,7 @@ def test_a_doubt_shared_by_trials_is_no_missing_effect(make):
     assert not asked(make()).rejects_model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 @pytest.mark.usefixtures("without_doubts")
 def test_unless_it_is_left_out(make):

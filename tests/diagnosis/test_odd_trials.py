@@ -93,6 +93,7 @@ def test_a_diagnosis_without_a_cause_names_the_row(campaign):
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
 
 
+@pytest.mark.slow
 def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
     result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
     assert result.verdict == "adequate"
@@ -102,6 +103,7 @@ def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
     assert outcome.notes[-1] == remark("odd_trials", odd=odd_ones, count=12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("others_say", ["tail_friction", "air_drag", "nothing"])
 def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they_do_not(campaign, others_say):
     result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)

@@ -95,6 +95,7 @@ def test_detectable_sizes_follow_the_normal_distribution(six: MisfitTests, power
     assert entry.size_at(0.5) / sigma >= six.family.threshold("tail_friction") - 0.1
 
 
+@pytest.mark.slow
 def test_four_times_the_trials_halve_the_detectable_size(power: Power) -> None:
     # Where scatter of trials alone is in the way, and positions are known as good as exactly.
     few = power_of(planned_tests(planned(4))[0])["leak"].size_at(0.5)
@@ -287,6 +288,7 @@ def sizes_with(design: CampaignDesign, settings: list[tuple[float, float]]) -> n
     return np.array([power.size_at(0.9) for power in powers if power is not None])
 
 
+@pytest.mark.slow
 def test_the_promised_sizes_are_those_of_a_sheet_with_these_trials(
     one_connector: CampaignDesign, informative: InformativeTrials
 ) -> None:
@@ -296,6 +298,7 @@ def test_the_promised_sizes_are_those_of_a_sheet_with_these_trials(
     assert promised == pytest.approx(sizes_with(one_connector, settings).tolist(), rel=0.03)
 
 
+@pytest.mark.slow
 def test_what_is_recommended_reveals_more_than_repeats_do(
     one_connector: CampaignDesign, informative: InformativeTrials
 ) -> None:

@@ -219,6 +219,7 @@ def true_model() -> Comparison:
     return vt.compare(vt.fit(vt.base_model(), pairs, profile=False))
 
 
+@pytest.mark.slow
 def test_a_model_that_lacks_nothing_stands_at_the_floor(true_model: Comparison) -> None:
     table = true_model.table
     together = np.sqrt(np.mean(table["rms_position_m"] ** 2) / np.mean(table["replicate_floor_m"] ** 2))
@@ -226,12 +227,14 @@ def test_a_model_that_lacks_nothing_stands_at_the_floor(true_model: Comparison) 
     assert table["ratio"].max() < 2.0
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_a_condition_and_the_columns_of_the_file(true_model: Comparison) -> None:
     assert tuple(true_model.table.columns) == COMPARISON_COLUMNS
     assert len(true_model.table) == 8
     assert list(true_model.trajectories) == true_model.table["condition"].tolist()
 
 
+@pytest.mark.slow
 def test_a_prediction_has_a_release_and_an_origin_of_its_own_and_nothing_else(true_model: Comparison) -> None:
     assert {(trial.pressure_deviation, trial.damping_deviation) for trial in true_model.trials} == {(0.0, 0.0)}
 

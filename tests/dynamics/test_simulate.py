@@ -86,6 +86,7 @@ def test_linear_damping_relaxes_exponentially() -> None:
 # ---- SciPy, another formulation ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trial", PROTOCOL[::5], ids=lambda trial: trial.name)
 def test_the_protocol_from_rest_to_a_millionth(trial: Trial) -> None:
     check_against(trial, PAPER_B[round(trial.diameter_m / 6e-3)])

@@ -148,6 +148,7 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice() -> None:
     np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delta", [-20e-3, -LOADED.payload], ids=["in part", "all of it"])
 def test_what_a_payload_lacks_is_not_taken_from_the_film(delta: float) -> None:
     vine = LOADED

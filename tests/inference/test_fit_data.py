@@ -151,6 +151,7 @@ def test_the_sensitivity_is_zero_after_the_end_of_growth(step_m_s: float):
     np.testing.assert_array_equal(change[~growing], 0.0)
 
 
+@pytest.mark.slow
 def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials():
     # A payload that rubs and a pressure that is lower move one trial in exactly the same way. The jump at the end of
     # growth, different for the two as their steps have different signs, once passed for knowledge of μ_p to 1e-4.

@@ -57,6 +57,7 @@ def emptied(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return pressure_Pa, pressure_Pa + noise_Pa, growth_m + noise_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_frames", [0, 12, -12])
 def test_the_growth_shows_where_a_chamber_begins_to_empty_at_any_clock_offset(late_frames: int):
     # What moves a vine is the time integral of the pressure. That of the noise wanders by σ √n = 1.2 kPa samples

@@ -81,6 +81,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make: Callab
     assert 0.5 < stated < 1.3
 
 
+@pytest.mark.slow
 def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of bent pictures the first campaign's trials scatter 1.6 times as widely in one number as the noise says.
 
@@ -96,6 +97,7 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch: pyt
     assert np.all(stated / np.diag(known.covariance) >= 0.99 * robust / plain)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trials", [2, 4, 7])
 def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials: int) -> None:
     """Each pulls the mean towards itself by 1/N: what is left of them has the variance (1 − 1/N)σ², degrees N − 1."""
@@ -274,6 +276,7 @@ def test_the_band_of_drops_that_agree_is_their_noise() -> None:
     assert np.median(band_m) == pytest.approx(1.96 * 2e-3, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_band_of_a_campaign_follows_its_between_trial_scatter() -> None:
     pairs, _ = small_campaign(67)
     trial = next_of(pairs, vt.base_model(), 5)

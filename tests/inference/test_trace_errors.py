@@ -95,6 +95,7 @@ def test_estimated_errors_enter_the_likelihood(fit: vt.Fit):
     assert trace_error_penalty(fit.predictor.data) > 1.0
 
 
+@pytest.mark.slow
 def test_the_recorded_pressure_is_kept(fit: vt.Fit):
     recorded, _ = prepare(fit.pairs)
     for told, before in zip(map(as_recorded, fit.predictor.data), recorded, strict=True):

@@ -41,6 +41,7 @@ def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion: Fit) -
     assert only_in_motion["n"].sigma < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("early_frames", [5, 20, 45])
 def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion: Fit, early_frames: int) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor

@@ -92,6 +92,7 @@ def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_press
     assert track.pressure_Pa[0] == pytest.approx(24e3)
 
 
+@pytest.mark.slow
 def test_a_fit_of_a_frame_is_that_of_its_pairs(fit: Fit) -> None:
     again = vt.fit(vt.base_model(), vt.tracks_from_frame(vt.example_tracks()), profile=False)
     pd.testing.assert_frame_equal(again.table(), fit.table())

@@ -184,6 +184,7 @@ def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors() -> None:
     assert abs(n[0] - unweighted) > 1e-3
 
 
+@pytest.mark.slow
 def test_scatter_of_the_vines_flattens_log_log_and_not_both_axes() -> None:
     """σ(ln F) of 3 % B and 1 % P against var(ln F): the mean over 60 campaigns, good to 0.0005."""
     slopes = {method: [] for method in METHODS}
@@ -333,6 +334,7 @@ def test_the_published_rule_is_fitted_from_its_own_columns() -> None:
         assert fits["paper"]["vines"][vine]["B"] == pytest.approx(truth / 1.2**N, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_of_ten_points_intervals_hold_n_as_often_as_of_many() -> None:
     """Ten points resampled scatter by 10/8 less in variance about two numbers than they err, with eight degrees."""
     held = [
@@ -403,6 +405,7 @@ def worst_B(law: DampingLaw, method: str) -> float:
     return max(abs(vine["B"] / PAPER_B[round(vine["diameter_mm"] / 6)] - 1) for vine in vines)
 
 
+@pytest.mark.slow
 def test_b_and_n_come_home_with_the_pressure_of_the_model(before: DampingLaw, after: DampingLaw) -> None:
     """With the set pressure nothing is steady and our rules refuse; the published rule goes on, and is wrong."""
     assert before.laws["both_axes"]["refused"]
@@ -413,6 +416,7 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model(before: DampingLaw, af
     assert low < PAPER_N < high
 
 
+@pytest.mark.slow
 def test_it_is_what_a_run_with_that_model_gives(
     pairs: list[tuple[Trial, Track]], before: DampingLaw, after: DampingLaw
 ) -> None:

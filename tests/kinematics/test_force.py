@@ -171,6 +171,7 @@ def test_onset_is_found_to_within_frames(vine, noise_m, frames):
     assert np.sqrt(np.mean(np.square(off))) < frames
 
 
+@pytest.mark.slow
 def test_origin_is_within_its_error():
     pulls = []
     for seed in range(1000, 1060):

@@ -130,6 +130,7 @@ def test_drift_interval_covers_the_truth():
     assert 88 <= covered <= 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_error_of_the_speed_is_honest_at_constant_speed(rho):
     time_s, pulls = np.arange(200) / 1069, []
@@ -236,6 +237,7 @@ def test_a_measured_pressure_makes_a_point_of_a_speed_that_never_settles() -> No
     assert result.point["force_N"] == pytest.approx(B * float(result.point["x_ss_m_s"]) ** N, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_pressure_of_the_model_in_use_does_as_well_as_a_measured_one() -> None:
     traced = analysed(vine(20), seed=1001, traced=True)
     modelled = analysed(vine(20), seed=1001, traced=False, effects=("reservoir_depletion",))

@@ -49,6 +49,7 @@ def test_stated_error_holds_within_a_factor_of_two_from_four_frames_after_releas
     assert np.mean(np.abs(pull) > 3) < 0.1
 
 
+@pytest.mark.slow
 def test_free_fall_has_the_acceleration_of_gravity():
     time_s = np.arange(300) / 1000
     found = []
@@ -134,6 +135,7 @@ def test_even_spacing_is_savitzky_golay():
     np.testing.assert_allclose(velocity, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 @pytest.mark.parametrize("time_s", [EVEN, GAPPED], ids=["even", "gapped"])
 def test_stated_error_is_that_of_many_draws(time_s, rho):

@@ -54,6 +54,7 @@ def length_from_area(levels: np.ndarray, rows: slice) -> float:
     return float(((levels[rows].astype(float).mean(axis=0) - BEHIND) / (FILM - BEHIND)).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exposure_s", [1e-6, 9.9e-4])
 def test_tip_is_where_the_area_says_at_any_exposure(exposure_s):
     scene = replace(CLEAN, camera=SMALL)
@@ -117,6 +118,7 @@ def test_distorted_and_tilted_tip_is_where_opencv_projects_it():
     assert np.column_stack([truth.tip_x_px, truth.tip_y_px]) == pytest.approx(expected[:, 0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_everted_wall_stays_where_it_is():
     tube = Tube(opacity=0.6, tail_opacity=0.0, texture=0.3)
     scene = replace(CLEAN, camera=SMALL, subject=tube)
@@ -128,6 +130,7 @@ def test_everted_wall_stays_where_it_is():
     assert np.abs(early - late).max() <= 1
 
 
+@pytest.mark.slow
 def test_tail_moves_at_twice_the_speed_of_the_tip():
     tube = Tube(opacity=0.0, brightness=0.8, tail_opacity=0.9, tail_texture=0.4, texture=0, specular=0, tip_glow=0)
     scene = replace(CLEAN, camera=SMALL, subject=replace(tube, length_m=0.16))
@@ -210,6 +213,7 @@ def test_lamps_flicker_by_what_is_left_after_the_exposure():
     assert np.delete(spectrum, 10).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_same_seed_same_pictures_other_seed_others():
     scene = replace(preset("demo"), camera=SMALL)
     one, again, other = (renderer(scene, seed=seed).frame(20) for seed in (4, 4, 5))
@@ -250,6 +254,7 @@ def test_h264_holds_every_frame_at_the_rendered_levels_in_the_limited_range(tmp_
     assert 10 * np.log10(219**2 / (error**2).mean()) > 36
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bit_depth", [8, 16])
 def test_ffv1_and_pictures_lose_nothing(tmp_path, bit_depth):
     scene = replace(DEMO, sensor=Sensor(bit_depth=bit_depth), encoding=Encoding(codec="ffv1"))
@@ -303,6 +308,7 @@ def crossings(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_corners_of_a_checkerboard_are_where_opencv_projects_them():
     expected = corners_by_opencv(CHECKER, CAMERA)
     measured = crossings(render_target(CHECKER, SCENE), expected + 0.3)
@@ -310,6 +316,7 @@ def test_corners_of_a_checkerboard_are_where_opencv_projects_them():
     assert np.abs((measured - expected).mean(axis=0)).max() < 0.01
 
 
+@pytest.mark.slow
 def test_every_marker_of_a_charuco_board_can_be_read():
     target = Target(squares=(12, 5), square_m=0.022, marker_m=0.016)
     words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
@@ -330,6 +337,7 @@ def test_board_is_black_and_white_as_stated_and_has_its_border():
     assert picture[160, int(left - 0.8 * square_px)] < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shake_px", [0.0, 0.5])
 def test_target_in_a_trials_recording_hangs_where_it_is_told(shake_px):
     target = replace(CHECKER, squares=(11, 3), square_m=0.02)

@@ -175,6 +175,7 @@ class RecordedCallbacks:
         )  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted) -> None:
     recorded = RecordedCallbacks()
     job = recorded.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
@@ -203,6 +204,7 @@ def test_a_cancelled_job_calls_no_callback() -> None:
     assert not recorded.reasons
 
 
+@pytest.mark.slow
 def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:
     background = BackgroundFit(campaign)
     news: list[bool] = []

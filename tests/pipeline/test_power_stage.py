@@ -49,6 +49,7 @@ def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder
         assert corrected[name].size_at(0.9) < 0.9 * uncorrected[name].size_at(0.9)
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> None:
     file, figure = tmp_path / "power.json", tmp_path / "power.png"
     arguments = ["power", str(folder), "--effect", "leak", "--json", str(file), "--figure", str(figure)]

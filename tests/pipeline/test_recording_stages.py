@@ -56,6 +56,7 @@ def refused(*arguments: object) -> str:
     return sentence
 
 
+@pytest.mark.slow
 def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, clip: Path, tmp_path: Path) -> None:
     done = track(clip, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
@@ -75,6 +76,7 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, cli
         assert sum(1 for _ in container.decode(video=0)) > 20
 
 
+@pytest.mark.slow
 def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_path: Path) -> None:
     done = track(
         clip, "--capture-fps", 2000, "--exposure-us", 100, "--mm-per-px", 0.25, "--out", tmp_path, "--json", "-"
@@ -91,6 +93,7 @@ def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_pa
     assert np.allclose(table["systematic_m"], 0.25e-3 * table["edge_systematic_px"])
 
 
+@pytest.mark.slow
 def test_scale_is_that_of_the_settings_of_an_experiment(clip: Path, tmp_path: Path) -> None:
     (tmp_path / "experiment.yaml").write_text(
         "calibration: {kind: two_points, from_px: [10, 20], to_px: [410, 20], length_mm: 200}\n"

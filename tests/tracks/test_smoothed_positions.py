@@ -62,6 +62,7 @@ def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path: Path) -> None:
     assert detect_smoothing([]) is None
 
 
+@pytest.mark.slow
 def test_a_model_is_smoothed_as_its_positions_were(tmp_path: Path) -> None:
     """Each release is rounded off by half a millimetre and more, ten times the noise."""
     shot = campaign("smoothed", 20616, (8, 8), weighed=False)

@@ -64,6 +64,7 @@ def scale_error(found, camera: Camera = CAMERA, ends=AXIS) -> tuple[float, float
 # --- targets in any pose
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2000, 2005))
 @pytest.mark.parametrize("kind", ["charuco", "checkerboard"])
 def test_scale_of_a_random_pose_is_within_a_thousandth_and_its_stated_error(kind, seed):
@@ -159,6 +160,7 @@ def test_board_printed_by_old_opencv_with_markers_in_the_other_squares():
     assert found.n_corners == 45
 
 
+@pytest.mark.slow
 def test_a_small_target_states_a_larger_error():
     small = replace(BOARD, squares=(6, 5), centre_m=(-0.09, 0))
     wide = calibrate_pictures([picture()], charuco())
@@ -299,6 +301,7 @@ def crossing(centre, angles_deg, size=41, sigma=0.7, low=40.0, high=200.0) -> np
 STEPS = np.array([[[15.0, 0.0], [0.0, 15.0]]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("target", "seed"), [(CORNER_BOARD, 3000), (CORNER_CHECKER, 3001)])
 def test_corners_are_found_to_a_fiftieth_of_a_pixel(target, seed):
     picture = render_target(target, SCENE, seed=seed)
@@ -349,6 +352,7 @@ def test_a_charuco_board_is_named(squares: tuple[int, int], name: str) -> None:
     assert seen.marker_share == pytest.approx(0.75, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_checkerboard_is_named() -> None:
     squares = np.kron(np.indices((6, 9)).sum(axis=0) % 2, np.ones((36, 36)))
     picture = np.pad((60 + 150 * squares).astype(np.uint8), 50, constant_values=210)

@@ -91,6 +91,7 @@ def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip: Clip
         track_recording(replace(clip.trial, video=path))
 
 
+@pytest.mark.slow
 def test_only_the_sound_frames_of_a_damaged_recording_are_tracked(clip: Clip, tmp_path: Path) -> None:
     track = track_recording(replace(clip.trial, video=clip.damaged_at(tmp_path, 62))).track
     assert np.isfinite(track.edge_px[20:62]).all()

@@ -101,6 +101,7 @@ def test_a_given_axis_two_degrees_off_is_centred():
     assert error.std() < 0.2
 
 
+@pytest.mark.slow
 def test_compressed_as_cameras_do(tmp_path):
     plan = Plan(seed=204, **SHORT)
     scene = plain_scene(plan)
@@ -324,6 +325,7 @@ def ok(track: Track) -> np.ndarray:
     return track.usable & ~with_flag(track.flag, "doubtful")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grey", [20.0, 110.0, 200.0])
 @pytest.mark.parametrize(("speed", "rise"), [(20.0, 8.0), (6.0, 20.0)], ids=["fast", "slow"])
 def test_a_tip_in_the_mouth_of_a_launcher_is_never_ok(speed, rise, grey):

@@ -52,6 +52,7 @@ def grown_px(frames: np.ndarray, start_px: float = 60.0, rest: int = 12, speed: 
     return start_px + speed * np.maximum(frames - rest, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -77,6 +78,7 @@ def test_stated_errors_match_the_true_errors(changes: dict[str, float]) -> None:
     assert 0.6 < np.sqrt(np.mean(np.concatenate(pulls) ** 2)) < 1.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
 def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods: tuple[int, int]) -> None:
     """By root mean squares over three draws: that of one, with four bands of which two mirror two, is known to half.
@@ -137,6 +139,7 @@ def test_an_edge_that_stops_within_an_exposure_has_the_error_of_its_dwell() -> N
     assert sigma[16 : last - 4].max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_noisier_picture_has_a_larger_error() -> None:
     """Every fourth picture has five times the noise, as where a coder spares bits."""
     frames = np.arange(95.0)
@@ -218,6 +221,7 @@ def test_each_band_finds_its_own_edge():
     assert np.abs(edges - own).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd_px", [0.2, 0.6])
 def test_disagreement_is_the_error_of_the_mean(sd_px):
     strip, state, own = jittered(sd_px)

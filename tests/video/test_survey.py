@@ -145,6 +145,7 @@ def test_a_curve_within_the_picture_is_accepted(folder: Path) -> None:
     assert not [problem for problem in check(folder, "a.mp4", settings=settings) if problem.column == "axis"]
 
 
+@pytest.mark.slow
 def test_fifty_recordings_take_twenty_lines_however_many_are_bad(folder: Path) -> None:
     write_clip(folder / "a.mp4")
     names = [f"v{i}.mp4" for i in range(50)]
@@ -280,6 +281,7 @@ def surveyed(clip: Path, folder: Path, row: str, settings: str) -> tuple[list[st
     return [f"{p.severity} {p.column}" for p in check_experiment(folder, surveyor)], surveyor
 
 
+@pytest.mark.slow
 def test_check_reports_the_facts_of_a_correct_recording(clip: Path, tmp_path: Path) -> None:
     problems, surveyor = surveyed(clip, tmp_path / "v", "a,a.mp4,12,100,140,36,3\n", SETTINGS)
     assert problems == []
