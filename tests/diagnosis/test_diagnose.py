@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from hidden_truth import Pairs, grown, sheet
-from lsoda_vine import as_track
+from lsoda_vine import as_track, small_campaign
 from own_effect import NAME, write_effect
 
 import vinetrack as vt
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
@@ -29,6 +29,7 @@ from vinetrack.effects import EffectError, own_effects
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
+from vinetrack.tracks.importers import flag_end_of_motion
 
 FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
 
@@ -335,6 +336,38 @@ def test_the_drag_of_falling_balls_is_named(balls: list[tuple[Trial, Track]], mo
     assert drag.sigma < 0.03 * DRAG
     untried = {row.effect for row in found.rounds[0].ranking if row.status == "not testable here"}
     assert untried >= TUBES_ALONE
+
+
+@pytest.mark.slow
+def test_vines_that_a_wall_stops_half_way_lack_nothing() -> None:
+    draw, stopped = np.random.default_rng(1), []
+    for trial, track in small_campaign(3)[0]:
+        wall_m = track.lead_position_m[0] + 0.8 * np.ptp(track.lead_position_m)
+        moving = int(np.argmax(track.lead_position_m > wall_m))
+        time_s = np.concatenate([track.time_s[:moving], track.time_s[moving] + np.arange(15) / 1069])
+        stands_m = wall_m + draw.normal(0, np.std(track.lead_position_m[:5]), 15)
+        ended = plain_track(time_s, np.concatenate([track.lead_position_m[:moving], stands_m]))
+        stopped.append((trial, flag_end_of_motion(trial, ended)))
+    assert vt.diagnose(stopped, ladder=False, advice=False).verdict == "adequate"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "verdict"), [(["gravity"], "missing"), (["gravity", "air_drag"], "adequate")])
+def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_model(
+    model: list[str], verdict: str
+) -> None:
+    time_s = np.arange(-8, 60) / 15
+    drops = []
+    for seed in (10, 11):
+        (trial, _), noise_m = dropped(f"d{seed}", seed, 0.074, 0.145), np.random.default_rng(seed).normal(0, 5e-3, 68)
+        limit_m_s = math.sqrt(2 * 0.145 * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * 0.5))
+        fallen_m = limit_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * np.maximum(time_s, 0) / limit_m_s))
+        seen, part = fallen_m < 47, 2 * fallen_m / 47 - 1
+        lens_m = 0.018 * (part**3 - 0.6 * part) + 0.01 * (part**2 - 1)
+        drops.append((trial, plain_track(time_s[seen], (fallen_m + lens_m + noise_m)[seen])))
+    found = vt.diagnose(drops, model=vt.make_model(model), ladder=False, advice=False)
+    assert found.verdict == verdict
+    assert abs(found.fits[-1]["C_D"].value - 0.5) < 3 * found.fits[-1]["C_D"].sigma
 
 
 @pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")

@@ -42,6 +42,15 @@ def test_a_rest_without_visible_noise_counts_as_one_point():
         assert each.noise_m >= 0.999 * STEP_M / np.sqrt(12)
 
 
+def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_travel():
+    pairs, _ = small_campaign(1)
+    longest_m = max(np.ptp(track.lead_position_m) for _, track in pairs)
+    stated = [(replace(pairs[0][0], position_systematic_m=2.5e-4), pairs[0][1]), *pairs[1:]]
+    first, *others = prepare(stated)[0]
+    assert first.position_systematic_m == 2.5e-4
+    assert {each.position_systematic_m for each in others} == {pytest.approx(4e-4 * longest_m)}
+
+
 def test_a_rest_with_visible_noise_is_kept_despite_rounding():
     assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
 

@@ -17,7 +17,7 @@ from vinetrack.core.records import Track, Trial, with_flag
 from vinetrack.tracks.importers import (
     TrackError,
     attach_pressure,
-    flag_end_of_body,
+    flag_end_of_motion,
     load_track,
     read_pressure_trace,
     read_track,
@@ -340,7 +340,9 @@ NOISE_M = 2e-4
 
 def ended(position_m: np.ndarray, seed: int = 620):
     noise = np.random.default_rng(seed).normal(0, NOISE_M, position_m.size)
-    track = flag_end_of_body(make_track(CLOCK_S[: position_m.size], position_m + noise))
+    track = flag_end_of_motion(
+        Trial(name="ball", travel_ratio=1.0), make_track(CLOCK_S[: position_m.size], position_m + noise)
+    )
     return np.flatnonzero(with_flag(track.flag, "after_end")), track.notes
 
 
@@ -359,6 +361,16 @@ def test_a_bounce_or_an_abrupt_stop_ends_the_motion(restitution):
     impact = int(np.argmax(np.sqrt(2 * 0.7 / 9.81) < CLOCK_S))
     assert after[-1] == 119
     assert abs(after[0] - impact) <= 2
+
+
+@pytest.mark.parametrize(("length_m", "is_cut"), [(0.4, True), (0.3, True), (0.2, False)])
+def test_an_abrupt_stop_ends_the_motion_of_a_vine_unless_it_is_the_end_of_its_length(length_m: float, is_cut: bool):
+    position_m = np.minimum(np.maximum(CLOCK_S - 0.05, 0.0), 0.2)
+    noise_m = np.random.default_rng(625).normal(0, NOISE_M, position_m.size)
+    track = flag_end_of_motion(Trial(name="vine", length_m=length_m), make_track(CLOCK_S, position_m + noise_m))
+    after = np.flatnonzero(with_flag(track.flag, "after_end"))
+    assert after.size == (CLOCK_S > 0.25 - 1e-9).sum() * is_cut
+    assert len(track.notes) == is_cut
 
 
 @pytest.mark.parametrize("seed", range(621, 625))

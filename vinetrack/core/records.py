@@ -45,7 +45,7 @@ class Correction:
     edge_px: float = math.nan
 
 
-POSITION_SYSTEMATIC_M = 1e-4  # Standard deviation of smooth position errors if lens distortion is unknown
+SYSTEMATIC_OF_TRAVEL = 4e-4  # Smooth position error where the lens is unknown, part of the longest travel (chosen)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Trial:
     mass_loss: str = "geometric"
     tail_slack: str = "taut"
     tail_store: str = "body"
-    position_systematic_m: float = math.nan  #: standard deviation of smooth position errors; NaN: the default
+    position_systematic_m: float = math.nan  #: standard deviation of smooth position errors; NaN: the lens is unknown
     specimen: str = ""
     day: str = ""
     order: float = math.nan

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, Problem, did_you_mean
-from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
+from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
 from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, read_cell, unusual_value_hint, with_names
 from vinetrack.experiment.settings import (
@@ -258,15 +258,14 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
 
 
 def expected_systematic_m(settings: ExperimentSettings, scaled_elsewhere: bool = False) -> float:
-    """Standard deviation of smooth position errors, m: as stated, else by whether lens distortion was corrected. A
-    target with many corners reveals the distortion, hence 0. Two points, a scale, a scale of the trial's own and
-    positions measured elsewhere (`scaled_elsewhere`) do not show whether it was corrected, hence the default.
+    """Standard deviation of smooth position errors, m: as stated; 0 with a target, whose many corners reveal the
+    distortion; else NaN. Two points, a scale, a scale of the trial's own and positions measured elsewhere
+    (`scaled_elsewhere`) do not show whether it was corrected: a fit then allows for a part of the longest travel.
     """
     if settings.position_systematic_mm is not None:
         return settings.position_systematic_mm / 1e3
-    if scaled_elsewhere:
-        return POSITION_SYSTEMATIC_M
-    return 0.0 if isinstance(settings.calibration, (Charuco, Checkerboard)) else POSITION_SYSTEMATIC_M
+    known = isinstance(settings.calibration, (Charuco, Checkerboard)) and not scaled_elsewhere
+    return 0.0 if known else math.nan
 
 
 # ------------------------------------------------------------------------------

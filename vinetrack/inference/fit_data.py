@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
+from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
     Smoothing,
@@ -143,8 +143,11 @@ def prepare_trial(
     denoised: DenoisedTrace | None = None,
     smoothing: Smoothing | None = None,
     rounding_m: float = 0.0,
+    longest_travel_m: float = 0.0,
 ) -> FitTrial:
-    """The data of one trial: its usable points, rest included, and the noise that they show."""
+    """The data of one trial: its usable points, rest included, and the noise that they show. Where nothing knows the
+    lens, its smooth errors are a part of `longest_travel_m`.
+    """
     fewest_moving = 4  # A trial with fewer points in motion is refused (derived)
     usable = track.usable & ~_near_end_of_growth(trial, track)
     imprecise, imprecise_rest = _imprecise_points(track, usable)
@@ -204,7 +207,9 @@ def prepare_trial(
         trace_errors_Pa=None if extended is None or not extended.errors_Pa.size else extended.errors_Pa,
         trace_is_curve=extended is not None and extended.is_curve,
         imprecise_rest=imprecise_rest,
-        position_systematic_m=_position_systematic_m(trial),
+        position_systematic_m=trial.position_systematic_m
+        if math.isfinite(trial.position_systematic_m)
+        else SYSTEMATIC_OF_TRAVEL * max(longest_travel_m, moved_m),
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
         smoothing=smoothing,
@@ -221,13 +226,6 @@ def _slow_error(track: Track, usable: NDArray[np.bool_]) -> Floats | None:
             stated = usable & np.isfinite(slow_m)
             return np.interp(np.flatnonzero(usable), np.flatnonzero(stated), slow_m[stated])
     return None
-
-
-def _position_systematic_m(trial: Trial) -> float:
-    """Standard deviation of a trial's smooth position error, m: as stated, else that of imported tracks."""
-    if math.isfinite(trial.position_systematic_m):
-        return trial.position_systematic_m
-    return POSITION_SYSTEMATIC_M if trial.video is None else 0.0
 
 
 def _gauge_error(denoised: DenoisedTrace, moving_s: Floats) -> float:
@@ -375,9 +373,11 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
     smoothing = detect_smoothing(pairs, rounding_m)
+    seen = [track.lead_position_m[track.usable] for _, track in pairs]
+    longest_m = max((float(np.ptp(position_m)) for position_m in seen if position_m.size), default=0.0)
     for (trial, track), denoised in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
         try:
-            data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m))
+            data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m, longest_m))
         except FitError as error:
             left_out[trial.name] = str(error)
     return _with_weighted_points(data) if weighted else data, left_out

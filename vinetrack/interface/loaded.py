@@ -38,6 +38,7 @@ from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.tracks.importers import flag_end_of_motion
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -242,7 +243,8 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
         raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
     parts = [(str(name), part) for name, part in frame.groupby("trial", sort=False)]
     trials = _trials([_cells(name, part) for name, part in parts])
-    return [(trial, _track(part, position)) for trial, (_, part) in zip(trials, parts, strict=True)]
+    tracks = [_track(part, position) for _, part in parts]
+    return [(trial, flag_end_of_motion(trial, track)) for trial, track in zip(trials, tracks, strict=True)]
 
 
 def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:

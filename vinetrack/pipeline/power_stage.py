@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import (
@@ -206,7 +207,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     noise = _stated(request.noise, (default_noise_mm / 1e3, 0.0))
     noise_m, correlation = noise or (default_noise_mm / 1e3, 0.0)
     spreads = _stated(request.spreads, first.spreads)
-    systematic_m, systematic_origin = _planned_systematic(request, settings)
+    systematic_m, systematic_origin = _planned_systematic(request, settings, planned.trials)
     trials = tuple(
         replace(_with_yield(trial, by_vine[trial.vine].trial), position_systematic_m=systematic_m)
         for trial in planned.trials
@@ -238,14 +239,19 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     return PowerCampaign(design_power(design, inputs), design, settings.limits)
 
 
-def _planned_systematic(request: PowerRequest, settings: ExperimentSettings) -> tuple[float, str]:
+def _planned_systematic(
+    request: PowerRequest, settings: ExperimentSettings, trials: Sequence[Trial]
+) -> tuple[float, str]:
     """Return the systematic error of positions of planned trials, m, and where it comes from."""
     if math.isfinite(request.systematic_mm):
         return request.systematic_mm / 1e3, "stated"
     systematic_m = expected_systematic_m(settings)
     if settings.position_systematic_mm is not None:
         return systematic_m, "experiment.yaml"
-    return systematic_m, "guess: positions by a scale, lens uncorrected" if systematic_m else "lens known from a target"
+    if math.isfinite(systematic_m):
+        return systematic_m, "lens known from a target"
+    longest_m = max((trial.length_m for trial in trials if math.isfinite(trial.length_m)), default=0.0)
+    return SYSTEMATIC_OF_TRAVEL * longest_m, "guess: positions by a scale, lens uncorrected"
 
 
 def _fps_origin(request: PowerRequest, trials: Sequence[Trial]) -> str:

@@ -20,7 +20,7 @@ from vinetrack.core.problems import InputError
 from vinetrack.core.records import Floats, Track, Trial, join_flags, plain_track
 from vinetrack.core.tables import Table, TableError, file_size, parse_table, read_text
 from vinetrack.core.units import convert, split_unit
-from vinetrack.tracks.position_noise import rough_noise
+from vinetrack.tracks.position_noise import rest_points, rough_noise
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -432,25 +432,32 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
 
 
 # ------------------------------------------------------------------------------
-# Find where the motion of a body in an imported track ends: it turns back (a bounce) or stops abruptly.
+# Find where the motion in an imported track ends: a body turns back (a bounce), or it stops abruptly, a vine short of
+# its length. What slows down to rest may obey the model to the end.
 
 
-def flag_end_of_body(track: Track) -> Track:
-    """Flag points after the end of the body's motion `after_end`, and report the end in the notes."""
+def flag_end_of_motion(trial: Trial, track: Track) -> Track:
+    """Flag points after the end of motion `after_end`, and report the end in the notes; nothing where the user has
+    chosen frames.
+    """
     rows = np.flatnonzero(track.usable)
     y = track.lead_position_m[rows]
-    if rows.size <= FEWEST_POINTS:
+    if rows.size <= FEWEST_POINTS or trial.frames_used is not None:
         return track
-    noise_m = rough_noise(y)
-    end, what = _turns_back(y, noise_m), "turns back"
+    noise_m, is_vine, what = rough_noise(y), trial.travel_ratio != 1, "turns back"
+    end = None if is_vine else _turns_back(y, noise_m)
     if end is None:
         end, what = _stops_dead(y, noise_m), "stops"
+    if end is not None and is_vine:
+        # Where 95 % of its length has grown the fit leaves out the end itself; before it, the model goes on.
+        end = end - 1 if np.median(y[-3:]) - np.median(y[:3]) < 0.95 * trial.length_m else None
     if end is None or end + 1 < FEWEST_POINTS:
         return track
     flag = track.flag.astype("<U80")
     for row in rows[end + 1 :]:
         flag[row] = join_flags(str(flag[row]), "after_end")
-    note = f"the body {what} after {track.time_s[rows[end]]:.5g} s: the end of its motion; later points are not used"
+    who = "vine" if is_vine else "body"
+    note = f"the {who} {what} after {track.time_s[rows[end]]:.5g} s: the end of its motion; later points are not used"
     return replace(track, flag=flag, notes=(*track.notes, note))
 
 
@@ -463,21 +470,20 @@ def _turns_back(y: Floats, noise_m: float) -> int | None:
 
 
 def _stops_dead(y: Floats, noise_m: float) -> int | None:
-    """First point of a standstill that lasts to the end and begins within a frame; None where there is none."""
-    # Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop (chosen)
-    still_sigmas, fewest_still = 5.0, 3
-    tolerance_m = max(still_sigmas * noise_m, 1e-9)
-    moving = np.flatnonzero(np.abs(y - np.median(y[-fewest_still:])) > tolerance_m)
-    if not moving.size or y.size - moving[-1] - 1 < fewest_still or moving[-1] < FEWEST_POINTS:
+    """First point of a standstill that lasts to the end and begins abruptly; None where there is none. At constant
+    speed the last ten standard deviations of travel take half as long as the twenty before them; what slows down to
+    rest takes longer.
+    """
+    at_rest = rest_points(-y[::-1])
+    first = y.size - at_rest
+    if at_rest < 3 or first < FEWEST_POINTS:
         return None
-    last = int(moving[-1])
-    median_step = float(np.median(np.diff(y[last - FEWEST_POINTS : last + 1])))
-    last_step = float(y[last] - y[last - 1])
-    # Last step before an abrupt stop, as a part of the median step, above which the stop is abrupt.
-    return last + 1 if median_step > tolerance_m and last_step > 0.5 * median_step else None
-
-
-__all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
+    reach_m = 10 * max(noise_m, 1e-10)
+    behind_m = float(np.median(y[first:])) - y[:first]
+    far, near = np.flatnonzero(behind_m > 3 * reach_m), np.flatnonzero(behind_m > reach_m)
+    if not far.size:
+        return None
+    return first if first - near[-1] <= 0.75 * (near[-1] - far[-1]) + 2 else None
 
 
 def load_track(trial: Trial) -> Track:
@@ -485,8 +491,7 @@ def load_track(trial: Trial) -> Track:
     if trial.track is None:
         raise TrackError("is blank", "this trial has a video, not a track")
     track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
-    if trial.travel_ratio == 1 and trial.frames_used is None:
-        track = flag_end_of_body(track)
+    track = flag_end_of_motion(trial, track)
     if trial.pressure_trace is None:
         return track
     try:
