@@ -206,6 +206,7 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("place", PLACES)
 def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(checked: Path, place: str, kind: str) -> None:

@@ -111,6 +111,7 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
     assert any(name.endswith(".nbc") for name, _ in compiled[0])
 
 
+@pytest.mark.slow
 def test_all_together() -> None:
     names = [name for name, effect in catalogue().items() if effect.kind != "base" and name != "supply_refill"]
     model = whole_catalogue({key: size for name in names for key, size in sizes_of(name).items()})

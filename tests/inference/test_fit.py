@@ -46,7 +46,13 @@ def ball(seed: int, first_frame: int = 0, count: int = 120) -> tuple[Trial, Trac
     """A ball let go at 51.3 ms, filmed at 240 fps with 0.2 mm of noise; g = 9.80665."""
     draw = np.random.default_rng(seed)
     trial = Trial(
-        name=f"ball{seed}", vine="ball", travel_ratio=1.0, pressure_Pa=0.0, yield_pressure_Pa=0.0, payload_kg=2.7e-3
+        name=f"ball{seed}",
+        vine="ball",
+        travel_ratio=1.0,
+        pressure_Pa=0.0,
+        yield_pressure_Pa=0.0,
+        payload_kg=2.7e-3,
+        position_systematic_m=1e-4,
     )
     time_s = np.arange(first_frame, first_frame + count) / 240
     fallen = 0.5 * 9.80665 * np.maximum(time_s - 0.0513, 0) ** 2

@@ -36,7 +36,7 @@ def test_a_sheet_without_recordings_says_what_was_guessed(folder: Path) -> None:
     assert origins["noise of a position"] == ("0.2 mm, correlation 0.00", "stated")
     assert origins["spread of B from trial to trial"][1].startswith("guess")
     assert origins["frame rate"][1] == "guess"
-    assert origins["systematic error of positions"] == ("0.1 mm", "guess: positions by a scale, lens uncorrected")
+    assert origins["systematic error of positions"] == ("0.08 mm", "guess: positions by a scale, lens uncorrected")
     assert [entry.effect for entry in power.effects] == ["leak", "air_drag"]
     assert list(power.not_testable) == ["payload_drag"]
 
