@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# What commands share: their arguments, errors as sentences, the spinner, the log, and settings given as JSON.
-
-# ------------------------------------------------------------------------------
 # Output of commands: lines for the user, or with `--json` the same content for a program.
 
 START, MORE = "Start here", "More"  # Panels of the help; the first lists the commands that a new user needs

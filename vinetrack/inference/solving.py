@@ -481,9 +481,6 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
 
 
 # ------------------------------------------------------------------------------
-# Assemble a `Fit` from a solution: values with errors and intervals, trial effects, messages.
-
-# ------------------------------------------------------------------------------
 # Messages of a fit: warnings on its numbers, and notes on what was done to its data.
 
 

@@ -37,6 +37,7 @@ from vinetrack.figures.registry import campaign_figures, draw
 from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.results import folder_layout
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 from vinetrack.tracks.importers import flag_end_of_motion
 
@@ -68,9 +69,7 @@ class LoadedResults:
     @cached_property
     def experiment(self) -> Experiment:
         """The experiment that the results were made from; raises a ResultsError if it has moved."""
-        from vinetrack.results.folder_layout import read_source_experiment
-
-        return read_source_experiment(self.folder)
+        return folder_layout.read_source_experiment(self.folder)
 
     @cached_property
     def trials(self) -> pd.DataFrame:
@@ -243,8 +242,7 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
         raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
     parts = [(str(name), part) for name, part in frame.groupby("trial", sort=False)]
     trials = _trials([_cells(name, part) for name, part in parts])
-    tracks = [_track(part, position) for _, part in parts]
-    return [(trial, flag_end_of_motion(trial, track)) for trial, track in zip(trials, tracks, strict=True)]
+    return [(trial, _track(trial, part, position)) for trial, (_, part) in zip(trials, parts, strict=True)]
 
 
 def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
@@ -292,13 +290,12 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
     return list(with_names(trials))
 
 
-def _track(part: pd.DataFrame, position: str) -> Track:
-    count = len(part)
-    unknown = np.full(count, math.nan)
+def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
+    unknown = np.full(len(part), math.nan)
     sigma_m, systematic_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
-    flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(count, "", dtype=str)
+    flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(len(part), "", dtype=str)
     traced = "pressure_kPa" in part and not _is_constant(part["pressure_kPa"])
-    return Track(
+    track = Track(
         time_s=part["time_s"].to_numpy(dtype=float),
         lead_position_m=part[position].to_numpy(dtype=float),
         lead_position_sigma_m=sigma_m,
@@ -307,6 +304,7 @@ def _track(part: pd.DataFrame, position: str) -> Track:
         pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
         lead_position_systematic_m=systematic_m,
     )
+    return flag_end_of_motion(trial, track)
 
 
 # ------------------------------------------------------------------------------
@@ -336,15 +334,14 @@ class TrialSource:
 def read_source(source: Source) -> TrialSource:
     """Read trials and tracks from any source."""
     from vinetrack.inference.fit_data import pairs_of
-    from vinetrack.results.folder_layout import Results, measured_trials, read_source_experiment
 
     if isinstance(source, LoadedResults):
         source = source.folder
     if isinstance(source, pd.DataFrame):
         return TrialSource(tracks_from_frame(source))
     if isinstance(source, (str, Path)) and (Path(source) / PROVENANCE).exists():
-        experiment = read_source_experiment(Path(source))
-        pairs, kinematics = measured_trials(experiment, Results(Path(source)))
+        experiment = folder_layout.read_source_experiment(Path(source))
+        pairs, kinematics = folder_layout.measured_trials(experiment, Results(Path(source)))
         return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out}, kinematics)
     if isinstance(source, (str, Path)):
         source = read_experiment(source)

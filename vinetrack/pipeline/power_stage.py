@@ -22,7 +22,7 @@ from vinetrack.diagnosis.campaign_power import (
 )
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.effects import BASE_EFFECTS
-from vinetrack.experiment.settings import ExperimentSettings, Limits
+from vinetrack.experiment.settings import Limits
 from vinetrack.experiment.sheet import expected_systematic_m
 from vinetrack.pipeline.trials import map_unordered
 from vinetrack.planning.simulated_campaigns import FilmingPlan, joint_model
@@ -207,7 +207,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     noise = _stated(request.noise, (default_noise_mm / 1e3, 0.0))
     noise_m, correlation = noise or (default_noise_mm / 1e3, 0.0)
     spreads = _stated(request.spreads, first.spreads)
-    systematic_m, systematic_origin = _planned_systematic(request, settings, planned.trials)
+    systematic_m, systematic_origin = _planned_systematic(request, planned)
     trials = tuple(
         replace(_with_yield(trial, by_vine[trial.vine].trial), position_systematic_m=systematic_m)
         for trial in planned.trials
@@ -239,18 +239,14 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     return PowerCampaign(design_power(design, inputs), design, settings.limits)
 
 
-def _planned_systematic(
-    request: PowerRequest, settings: ExperimentSettings, trials: Sequence[Trial]
-) -> tuple[float, str]:
+def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[float, str]:
     """Return the systematic error of positions of planned trials, m, and where it comes from."""
     if math.isfinite(request.systematic_mm):
         return request.systematic_mm / 1e3, "stated"
-    systematic_m = expected_systematic_m(settings)
-    if settings.position_systematic_mm is not None:
-        return systematic_m, "experiment.yaml"
+    systematic_m, stated_mm = expected_systematic_m(planned.settings), planned.settings.position_systematic_mm
     if math.isfinite(systematic_m):
-        return systematic_m, "lens known from a target"
-    longest_m = max((trial.length_m for trial in trials if math.isfinite(trial.length_m)), default=0.0)
+        return systematic_m, "lens known from a target" if stated_mm is None else "experiment.yaml"
+    longest_m = max((trial.length_m for trial in planned.trials if math.isfinite(trial.length_m)), default=0.0)
     return SYSTEMATIC_OF_TRAVEL * longest_m, "guess: positions by a scale, lens uncorrected"
 
 

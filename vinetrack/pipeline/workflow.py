@@ -379,9 +379,6 @@ def shell_prefix() -> str:
 
 
 # ------------------------------------------------------------------------------
-# The command `vinetrack run`: run the Snakefile of the package on one experiment.
-
-# ------------------------------------------------------------------------------
 # The command `vinetrack check`: facts about the recordings of an experiment, and all problems, before any analysis.
 
 

@@ -55,9 +55,8 @@ def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
     # -101.4: least gauge pressure that is accepted; sensors do read a little below zero (derived)
     wrong = np.flatnonzero((pressure_kPa > largest_pressure_kpa) | (pressure_kPa < -101.4))
     if len(wrong):
-        i = int(wrong[0])
-        value = float(pressure_kPa[i])
-        where = f"line {lines[i]}, column pressure_kPa: {value:g}"
+        value = float(pressure_kPa[wrong[0]])
+        where = f"line {lines[wrong[0]]}, column pressure_kPa: {value:g}"
         if value < 0:
             raise TrackError(f"{where} is below vacuum", "gauge pressure in kPa is wanted")
         hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1000 * largest_pressure_kpa else ""
@@ -437,9 +436,7 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
 
 
 def flag_end_of_motion(trial: Trial, track: Track) -> Track:
-    """Flag points after the end of motion `after_end`, and report the end in the notes; nothing where the user has
-    chosen frames.
-    """
+    """Flag points after the end of motion `after_end`, with a note; none where the user has chosen frames."""
     rows = np.flatnonzero(track.usable)
     y = track.lead_position_m[rows]
     if rows.size <= FEWEST_POINTS or trial.frames_used is not None:
@@ -456,8 +453,8 @@ def flag_end_of_motion(trial: Trial, track: Track) -> Track:
     flag = track.flag.astype("<U80")
     for row in rows[end + 1 :]:
         flag[row] = join_flags(str(flag[row]), "after_end")
-    who = "vine" if is_vine else "body"
-    note = f"the {who} {what} after {track.time_s[rows[end]]:.5g} s: the end of its motion; later points are not used"
+    who, end_s = "vine" if is_vine else "body", track.time_s[rows[end]]
+    note = f"the {who} {what} after {end_s:.5g} s: the end of its motion; later points are not used"
     return replace(track, flag=flag, notes=(*track.notes, note))
 
 
@@ -470,20 +467,17 @@ def _turns_back(y: Floats, noise_m: float) -> int | None:
 
 
 def _stops_dead(y: Floats, noise_m: float) -> int | None:
-    """First point of a standstill that lasts to the end and begins abruptly; None where there is none. At constant
-    speed the last ten standard deviations of travel take half as long as the twenty before them; what slows down to
-    rest takes longer.
+    """First point of a standstill that lasts to the end and begins abruptly: at constant speed the last ten standard
+    deviations of travel take half as long as the twenty before them. None where there is none.
     """
-    at_rest = rest_points(-y[::-1])
-    first = y.size - at_rest
-    if at_rest < 3 or first < FEWEST_POINTS:
+    first = y.size - rest_points(-y[::-1])
+    if not FEWEST_POINTS <= first <= y.size - 3:
         return None
     reach_m = 10 * max(noise_m, 1e-10)
     behind_m = float(np.median(y[first:])) - y[:first]
     far, near = np.flatnonzero(behind_m > 3 * reach_m), np.flatnonzero(behind_m > reach_m)
-    if not far.size:
-        return None
-    return first if first - near[-1] <= 0.75 * (near[-1] - far[-1]) + 2 else None
+    is_abrupt = far.size and first - near[-1] <= 0.75 * (near[-1] - far[-1]) + 2
+    return first if is_abrupt else None
 
 
 def load_track(trial: Trial) -> Track:
