@@ -533,14 +533,15 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
 
 
 def run_lines(results: Path) -> list[str]:
-    """Summarise finished results for the terminal: failed trials, path of the report, reasons, and last the verdict."""
+    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last."""
     from vinetrack.pipeline.model_stage import diagnosis_lines
     from vinetrack.results.folder_layout import Results, read_result
 
     trials = read_result(Results(results).trials)
     failed = trials[trials["status"] == "failed"]
-    lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(5).itertuples()]
-    if len(failed) > 5:
-        lines.append(f"… and {len(failed) - 5} more trial{'s' if len(failed) > 6 else ''} failed")
+    lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
+    lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
     verdict, *reasons = diagnosis_lines(results)
-    return [*lines, f"Report: {Results(results).report}", *reasons, verdict]
+    told = [line for line in reasons if line.startswith("  ")]
+    more = [f"  … {len(told) - 2} more reasons in the report"] if len(told) > 3 else told[2:]
+    return [*lines, f"Report: {Results(results).report}", *told[:2], *more, *reasons[len(told) :][:3], verdict]

@@ -124,6 +124,14 @@ class Results:
         return self.folder / "diagnosis" / name
 
 
+def _missing(path: Path) -> ResultsError:
+    """What to say of a file that is not in its results folder: an experiment may have been named instead."""
+    if (path.parent / "experiment.yaml").exists():
+        named = f"{path.parent} is an experiment, not its results"
+        return ResultsError(f"{named}: give the folder that its run made, such as results/{path.parent.name}")
+    return ResultsError(f"{path} does not exist: give a results folder, or write it with vinetrack run or snakemake")
+
+
 def read_result(path: Path) -> pd.DataFrame:
     """Read a table that a stage wrote: text stays text, numbers are floats, truth values are bool."""
     import pandas as pd
@@ -139,7 +147,7 @@ def read_result(path: Path) -> pd.DataFrame:
             na_values={column: ["", "NaN"] for column in numbers},
         )
     except FileNotFoundError:
-        raise ResultsError(f"{path} does not exist: run the stage that writes it, or all with snakemake") from None
+        raise _missing(path) from None
     except (OSError, ValueError) as error:
         raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
     for column in TRUTH_COLUMNS.intersection(columns):
@@ -148,13 +156,11 @@ def read_result(path: Path) -> pd.DataFrame:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that a stage wrote; see `read_result`. Returns content : SI units; None for an
-    unknown number.
-    """
+    """Read a JSON file that a stage wrote; see `read_result`. SI units; None for an unknown number."""
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ResultsError(f"{path} does not exist: run the stage that writes it, or all with snakemake") from None
+        raise _missing(path) from None
     except (OSError, ValueError) as error:
         raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
     return content
@@ -214,13 +220,8 @@ def read_source_experiment(folder: Path, experiment: Path | None = None) -> Expe
     from vinetrack.experiment.folder import read_experiment
 
     results = Results(folder)
-    if not folder.is_dir():
-        raise ResultsError(f"{folder} is not a folder: give the results folder of a run, such as results/NAME")
     if not results.provenance.exists():
-        raise ResultsError(
-            f"{folder} is not a results folder, because it has no {results.provenance.name}: run vinetrack run or "
-            "snakemake first"
-        )
+        raise _missing(results.provenance)
     path = experiment or Path(str(read_json(results.provenance)["experiment"]))
     if not path.is_dir():
         raise ResultsError(
