@@ -127,8 +127,7 @@ class Results:
 def _missing(path: Path) -> ResultsError:
     """What to say of a file that is not in its results folder: an experiment may have been named instead."""
     if (path.parent / "experiment.yaml").exists():
-        named = f"{path.parent} is an experiment, not its results"
-        return ResultsError(f"{named}: give the folder that its run made, such as results/{path.parent.name}")
+        return ResultsError(f"{path.parent} is an experiment: give its results, such as results/{path.parent.name}")
     return ResultsError(f"{path} does not exist: give a results folder, or write it with vinetrack run or snakemake")
 
 
