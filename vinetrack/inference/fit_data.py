@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial
+from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
     Smoothing,
@@ -296,7 +296,7 @@ def _cannot_be_driven(trial: Trial) -> bool:
 def _near_end_of_growth(trial: Trial, track: Track) -> NDArray[np.bool_]:
     """Frames on the last twentieth of the growth, and the first two after its end."""
     excluded = np.zeros(track.time_s.size, dtype=bool)
-    points = np.flatnonzero(track.usable)
+    points = np.flatnonzero(track.usable if trial.video else track.usable | with_flag(track.flag, "after_end"))
     if not np.isfinite(trial.length_m) or points.size < FEWEST_POINTS:
         return excluded
     y = track.lead_position_m[points]

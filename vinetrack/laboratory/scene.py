@@ -78,7 +78,7 @@ class Camera:
         """Newton's method on the radius r(1 + k1 r² + k2 r⁴) = r_bent."""
         distorted_radius = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
         radius = distorted_radius.copy()
-        # 10: newton steps of the inverse of the distortion (chosen)
+        # 10: Newton steps of the inverse of the distortion (chosen)
         for _ in range(10):
             excess = radius * (1 + self.k1 * radius**2 + self.k2 * radius**4) - distorted_radius
             radius -= excess / (1 + 3 * self.k1 * radius**2 + 5 * self.k2 * radius**4)
