@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 from explorer_campaign import FEW_CANDIDATES, SETTINGS, SMALL, make_experiment, make_results, run
 
+pytestmark = pytest.mark.slow
+
 LEFT_OUT = "d24_36kPa_2"
 """The second replicate of its condition, so that the condition stays."""
 
@@ -51,7 +53,6 @@ def film(experiment: Path, folder: Path) -> None:
         table.assign(lead_position_systematic_m=slow_m).to_csv(path, index=False)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_a_command_answers_for_every_kind_of_results(command: tuple[str, ...], results: Path, tmp_path: Path) -> None:
     written = tmp_path / "answer.json"
@@ -59,7 +60,6 @@ def test_a_command_answers_for_every_kind_of_results(command: tuple[str, ...], r
     assert json.loads(written.read_text())
 
 
-@pytest.mark.slow
 def test_a_diagnosis_asked_for_again_writes_all_that_the_run_wrote(results: Path) -> None:
     files = {path: path.read_bytes() for path in [results / "diagnosis.json", *(results / "diagnosis").glob("*.csv")]}
     assert results / "diagnosis" / "damping_laws.csv" in files

@@ -19,6 +19,8 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
+pytestmark = pytest.mark.slow
+
 Pairs = list[tuple[Trial, Track]]
 
 HOST = vt.make_model(
@@ -105,7 +107,6 @@ def measured(found: NextExperiment) -> set[str]:
     return {effect.name for effect in found.measurement.facts["effects"]}
 
 
-@pytest.mark.slow
 def test_another_connector_separates_drag_from_inlet_loss_without_a_new_vine(advised: NextExperiment) -> None:
     assert not any(trial["new_vine"] for trial in advised.trials)
     assert {trial["inlet_mm"] for trial in advised.trials} - {8.0}
@@ -114,13 +115,11 @@ def test_another_connector_separates_drag_from_inlet_loss_without_a_new_vine(adv
     assert advised.advice.code == "trials_to_make"
 
 
-@pytest.mark.slow
 def test_the_predicted_separation_agrees_with_the_simulated_one(advised: NextExperiment) -> None:
     (sigma,), ((mean, _),) = advised.separation_sigma.values(), advised.simulated_sigma.values()
     assert sigma == pytest.approx(mean, rel=0.2)
 
 
-@pytest.mark.slow
 def test_the_predicted_separation_agrees_with_that_of_the_trials_once_made(
     dragged: tuple[Pairs, list[Fit]], advised: NextExperiment
 ) -> None:
@@ -130,7 +129,6 @@ def test_the_predicted_separation_agrees_with_that_of_the_trials_once_made(
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
-@pytest.mark.slow
 def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(
     dragged: tuple[Pairs, list[Fit]],
 ) -> None:
@@ -143,7 +141,6 @@ def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
-@pytest.mark.slow
 def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
     limits = Limits(
         trials=3,
@@ -169,7 +166,6 @@ def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
     assert sum(entry["replicates"] for entry in found.trials) == 3
 
 
-@pytest.mark.slow
 def test_tied_measurement_errors_call_for_a_measurement_instead_of_trials(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(fits_of(dragged[0], "length_scale", "time_base"))
     assert found.trials == ()

@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from notebook import run
 
+pytestmark = pytest.mark.slow
+
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "python.ipynb"
 
 
@@ -27,7 +29,6 @@ def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
     return [sorted(one.get("data", one)) for one in outputs]
 
 
-@pytest.mark.slow
 def test_every_cell_runs_and_shows_what_kind_of_thing_is_stored(
     shown: list[dict[str, Any]], stored: list[dict[str, Any]]
 ) -> None:
@@ -35,7 +36,6 @@ def test_every_cell_runs_and_shows_what_kind_of_thing_is_stored(
     assert sum("image/png" in kind for kind in kinds(shown)) == 3
 
 
-@pytest.mark.slow
 def test_objects_and_words_are_those_stored(shown: list[dict[str, Any]], stored: list[dict[str, Any]]) -> None:
     texts = [["".join(one["data"]["text/plain"]) for one in each if "data" in one] for each in (shown, stored)]
     objects = [[text for text in each if text.startswith(("Fit(", "Diagnosis("))] for each in texts]

@@ -1,4 +1,4 @@
-"""The commands about vines and trials that do not exist yet: `predict`, `design vine`, `design reservoir`, `power`."""
+"""The commands that set up, run, explore and diagnose an experiment, and those about vines that do not exist yet."""
 
 from __future__ import annotations
 
@@ -148,32 +148,12 @@ def _explore(
         explore(results, experiment, typer.echo, port, browser=browser)
 
 
-def register_start(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    commands: dict[str, Callable[..., None]] = {
-        "setup": _setup,
-        "track": _track,
-        "check": _check,
-        "run": _run,
-        "explore": _explore,
-    }
-    for name, command in commands.items():
-        app.command(name, rich_help_panel=START)(command)
-
-
 # ------------------------------------------------------------------------------
 # Commands of the diagnosis: `diagnose`, `add` and `propose`.
 
 Moved = Annotated[
     Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
 ]
-
-
-def register_diagnose(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("diagnose", rich_help_panel=MORE)(_diagnose)
-    app.command("add", rich_help_panel=MORE)(_add)
-    app.command("propose", rich_help_panel=MORE)(_propose)
 
 
 def _diagnose(
@@ -410,8 +390,11 @@ design_app.command("vine")(_vine)
 design_app.command("reservoir")(_reservoir)
 
 
-def register_planning(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command("power", rich_help_panel=MORE)(_power)
-    app.command("predict", rich_help_panel=MORE)(_predict)
+    start = (_setup, _track, _check, _run, _explore)
+    more = (_diagnose, _add, _propose, _power, _predict)
+    for panel, commands in ((START, start), (MORE, more)):
+        for command in commands:
+            app.command(command.__name__.removeprefix("_"), rich_help_panel=panel)(command)
     app.add_typer(design_app, rich_help_panel=MORE)

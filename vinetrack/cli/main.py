@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vinetrack.cli.commands import progress_line, register_diagnose, register_planning, register_start
+from vinetrack.cli.commands import progress_line, register
 from vinetrack.cli.options import (
     MORE,
     ExperimentPath,
@@ -95,7 +95,7 @@ def _options(
     """See the commands below."""
 
 
-register_start(app)
+register(app)
 
 
 @app.command("settings", rich_help_panel=MORE)
@@ -167,10 +167,6 @@ def _overlay(
         with activity_sign(f"drawing over {trial}", None):
             path = overlay_one(results, trial, experiment, seconds)
         print_result([f"Clip: {path}"], {"clip": path}, json_file)
-
-
-register_diagnose(app)
-register_planning(app)
 
 
 def _stage_command(stage: Stage) -> Callable[..., None]:

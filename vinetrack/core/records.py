@@ -45,6 +45,7 @@ class Correction:
     edge_px: float = math.nan
 
 
+END_FRACTION = 0.95  # Growth beyond this fraction of the length is left out: the moving mass vanishes there (chosen)
 SYSTEMATIC_OF_TRAVEL = 4e-4  # Smooth position error where the lens is unknown, part of the longest travel (chosen)
 
 

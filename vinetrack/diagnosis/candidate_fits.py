@@ -1,7 +1,7 @@
-"""Fits of single effects: which candidates are worth a fit, and their full fits. Sets of effects: `effect_sets`.
+"""Fits of single effects: which candidates are worth a fit, and their full fits. Sets of effects: `selection`.
 
 Where linear predictions hold, candidates are chosen by their predicted gain and fitted to all trials at once. Elsewhere
-each candidate is first fitted from several starts to a subset, one trial of every condition (`multi_start`), and those
+each candidate is first fitted from several starts to a subset, one trial of every condition, and those
 that end near the best are fitted to all trials.
 """
 

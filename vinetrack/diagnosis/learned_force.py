@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 # Marginal likelihood and posterior of a smooth force over given variables, averaged over its hyperparameters.
 #
 # A force that is zero where growth begins, one that is constant there and one that is free there are compared by
-# their marginal likelihoods; `force_surface` explains why the first is drawn unless the tracks contradict it.
+# their marginal likelihoods; `force_inversion` explains why the first is drawn unless the tracks contradict it.
 
 
 # Log-likelihood below that of the best hyperparameters at which a set of them is left out of the mean and the band

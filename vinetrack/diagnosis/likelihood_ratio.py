@@ -1,4 +1,4 @@
-"""Likelihood ratios of refitted hypotheses, the plausibility of their sizes, and the answer set.
+"""Likelihood ratios of refitted effects and of differences between trials, the plausibility of sizes, the answer set.
 
 The answer set holds every hypothesis that the data cannot exclude.
 """

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import END_FRACTION, Floats
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
 from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
@@ -36,7 +36,7 @@ from vinetrack.diagnosis.score_test import (
 )
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect
-from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
+from vinetrack.inference.fit_data import FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.marginal_likelihood import FitState, solve_per_trial, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve

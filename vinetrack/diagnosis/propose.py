@@ -122,7 +122,7 @@ def _fit_with(before: Fit, effect: Effect) -> Fit:
 # A learned force as an effect file: a table of spline coefficients over one variable or two, in place of a formula.
 #
 # Where no formula reproduces the learned force, the force itself can enter the equation of motion. The file holds the
-# coefficients of its splines, N, at even steps of each normalised variable (`force_surface.Domain`), and a function
+# coefficients of its splines, N, at even steps of each normalised variable (`force_inversion.Domain`), and a function
 # that sums the four splines that are nonzero:
 #
 #     T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,

@@ -1,7 +1,7 @@
 """Score tests (Rao 1948): what each candidate would explain of the residuals, by linear algebra, without a refit.
 
 About a fitted model, measured minus predicted positions of trial i are r_i = X_i Δθ + C_i a + Z_i u_i + e_i, with C_i
-the sensitivities to the candidates' sizes a (`vinetrack.diagnosis.score_test`). The random effects u_i of
+the sensitivities to the candidates' sizes a (below). The random effects u_i of
 each trial, release, origin and the deviations of pressure and B, are integrated out, and the free parameters θ are
 projected off. Each candidate then has a score, an information, and a cosine with every other.
 

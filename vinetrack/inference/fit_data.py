@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
+from vinetrack.core.records import END_FRACTION, SYSTEMATIC_OF_TRAVEL, Floats, Track, Trial, with_flag
 from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import (
     Smoothing,
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 FEWEST_POINTS = 5  # A trial with fewer points is refused (derived)
 
-
-END_FRACTION = 0.95  # The growth beyond this fraction of the length is left out (chosen)
 
 FRAMES_BEHIND_END = 2  # Frames left out after the end of growth (derived)
 

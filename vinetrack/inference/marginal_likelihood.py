@@ -1,7 +1,7 @@
-"""Marginal and restricted likelihood of the variance components, trial effects (and parameters) integrated out.
+"""The mixed-effects model of a fit, and its marginal and restricted likelihood: trial effects (and parameters) out.
 
 Between-trial standard deviations and noise maximise the restricted likelihood (REML; Patterson & Thompson, Biometrika
-58, 545, 1971). See `vinetrack.inference.marginal_likelihood` for the model.
+58, 545, 1971).
 """
 
 from __future__ import annotations

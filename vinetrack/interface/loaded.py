@@ -1,4 +1,4 @@
-"""A results folder in memory: `vt.load("results/demo")`."""
+"""A results folder in memory, `vt.load("results/demo")`; data frames as trials with tracks; figures by name."""
 
 from __future__ import annotations
 

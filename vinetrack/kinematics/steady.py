@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Indices, Kinematics, Track, Trial, Window, with_flag
+from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Track, Trial, Window, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.kinematics.force import Release
 from vinetrack.kinematics.velocity import correlated
@@ -306,10 +306,6 @@ BAND = 0.5  # Half width of the band that contains every velocity, in drift limi
 
 SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (derived)
 
-
-# Fraction of the growth after which no window lies, if the end was recorded or follows from the length of the vine: the
-# moving mass vanishes there, or the vine is stopped (chosen)
-END_FRACTION = 0.95
 
 # A vine counts as moving where its speed exceeds this fraction of the highest, and this many standard errors (chosen)
 START_FRACTION, START_SIGMAS = 0.2, 5.0

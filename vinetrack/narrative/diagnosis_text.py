@@ -1,4 +1,4 @@
-"""Output of `vinetrack diagnose` and `vinetrack add`: a whole diagnosis, and the improvement by an added effect."""
+"""Output of `vinetrack diagnose`, `add` and `power`: a whole diagnosis, and the improvement by an added effect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Controller of one open page: input changes the choice of model, from which predictions, figures and text follow."""
+"""The explorer's server, and the controller of an open page: input changes the model, from which all else follows."""
 
 from __future__ import annotations
 

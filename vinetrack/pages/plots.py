@@ -1,4 +1,4 @@
-"""Figures that follow the choice of model: positions, residuals, and the error of each condition."""
+"""Figures and texts that follow the choice of model: positions, residuals, errors, the fit, tied candidates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HTTP server of the page, on the loopback address only: its files, its requests, and saving."""
+"""HTTP server of the set-up page, on the loopback address only: files, requests, pictures of clips, saving."""
 
 from __future__ import annotations
 

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.ladder import Comparison
-    from vinetrack.diagnosis.locate import Failure
     from vinetrack.diagnosis.result import Diagnosis
     from vinetrack.dynamics.audit import Audit
     from vinetrack.experiment.folder import Experiment
@@ -337,8 +336,7 @@ def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     from vinetrack.diagnosis.drift import drift_groups
 
     tables: dict[str, pd.DataFrame] = {}
-    failure: Failure | None = diagnosis.failure
-    if failure is not None:
+    if (failure := diagnosis.failure) is not None:
         tables |= {
             "conditions.csv": failure.by_condition,
             "along_time.csv": failure.along_time,
@@ -393,8 +391,8 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     return added_in_words(before, after, table, moved((before, after), ("", name)))
 
 
-def diagnosis_lines(folder: Path) -> list[str]:
-    """Return the verdict of a results folder in one line, then its reasons, one sentence per line."""
+def diagnosis_lines(folder: Path, brief: bool = False) -> list[str]:
+    """Return the verdict of a results folder in one line, then its reasons, one sentence per line; a few if `brief`."""
     diagnosis = read_diagnosis(Results(folder))
     if diagnosis is None:
         raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
@@ -405,12 +403,16 @@ def diagnosis_lines(folder: Path) -> list[str]:
     warning = f" {contradicted_in_words(columns)}" if columns else ""
     sizes = [fact.answer for fact in summary_facts(diagnosis, None) if fact.code in ("significance", "size")]
     headline = verdict_line(diagnosis) + (f" ({'; '.join(sizes)})" if sizes else "")
+    reasons, notes = sentences_of(diagnosis.explanation.removesuffix(warning)), diagnosis.notes
+    if brief:
+        more = [f"… {len(reasons) - 2} more reasons in the report"] if len(reasons) > 2 else []
+        reasons, notes, power = [*reasons[:2], *more], notes[:1], ""
     return [
         f"{headline}.{warning}" if columns else headline,
-        *(f"  {line}" for line in sentences_of(diagnosis.explanation.removesuffix(warning))),
+        *(f"  {line}" for line in reasons),
         *([f"{power[0].upper()}{power[1:]}"] if power and power not in headline else []),
         *_damping_line(diagnosis),
-        *(f"! {note}" for note in diagnosis.notes),
+        *(f"! {note}" for note in notes),
         *filter(None, [to_go_on(diagnosis)]),
     ]
 

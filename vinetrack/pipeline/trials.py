@@ -1,7 +1,7 @@
 """The stages of the trials: from recording or track to kinematics and figures of each, and the tables of all of them.
 
-Worker processes take one trial after another. The track of a recording in pixels and the pictures of a trial are kept
-(`kept.py`). A trial that fails writes its reason and never stops the others.
+Worker processes take one trial after another. The track of a recording in pixels and the pictures of a trial are kept.
+A trial that fails writes its reason and never stops the others.
 """
 
 from __future__ import annotations

@@ -541,7 +541,5 @@ def run_lines(results: Path) -> list[str]:
     failed = trials[trials["status"] == "failed"]
     lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
     lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
-    verdict, *reasons = diagnosis_lines(results)
-    told = [line for line in reasons if line.startswith("  ")]
-    more = [f"  … {len(told) - 2} more reasons in the report"] if len(told) > 3 else told[2:]
-    return [*lines, f"Report: {Results(results).report}", *told[:2], *more, *reasons[len(told) :][:3], verdict]
+    verdict, *reasons = diagnosis_lines(results, brief=True)
+    return [*lines, f"Report: {Results(results).report}", *reasons, verdict]

@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Trial, plain_track
+from vinetrack.core.records import END_FRACTION, Floats, Trial, plain_track
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
+from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, FreeParameter, ParameterMap
 from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,

@@ -1,4 +1,4 @@
-"""Building blocks of the page: pictures, figures with their data, tables, and sections of both."""
+"""Building blocks of the page, and its sections on the diagnosis and on the paper."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.problems import InputError
-from vinetrack.core.records import Floats, Track, Trial, join_flags, plain_track
+from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flags, plain_track
 from vinetrack.core.tables import Table, TableError, file_size, parse_table, read_text
 from vinetrack.core.units import convert, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
@@ -446,8 +446,8 @@ def flag_end_of_motion(trial: Trial, track: Track) -> Track:
     if end is None:
         end, what = _stops_dead(y, noise_m), "stops"
     if end is not None and is_vine:
-        # Where 95 % of its length has grown the fit leaves out the end itself; before it, the model goes on.
-        end = end - 1 if np.median(y[-3:]) - np.median(y[:3]) < 0.95 * trial.length_m else None
+        # The fit leaves out the end of the length itself; before it, the model goes on.
+        end = end - 1 if np.median(y[-3:]) - np.median(y[:3]) < END_FRACTION * trial.length_m else None
     if end is None or end + 1 < FEWEST_POINTS:
         return track
     flag = track.flag.astype("<U80")
@@ -467,13 +467,13 @@ def _turns_back(y: Floats, noise_m: float) -> int | None:
 
 
 def _stops_dead(y: Floats, noise_m: float) -> int | None:
-    """First point of a standstill that lasts to the end and begins abruptly: at constant speed the last ten standard
-    deviations of travel take half as long as the twenty before them. None where there is none.
+    """First point of a standstill that lasts to the end and begins abruptly: at constant speed the last twenty
+    standard deviations of travel take half as long as the forty before them. None where there is none.
     """
     first = y.size - rest_points(-y[::-1])
     if not FEWEST_POINTS <= first <= y.size - 3:
         return None
-    reach_m = 10 * max(noise_m, 1e-10)
+    reach_m = 20 * max(noise_m, 1e-10)
     behind_m = float(np.median(y[first:])) - y[:first]
     far, near = np.flatnonzero(behind_m > 3 * reach_m), np.flatnonzero(behind_m > reach_m)
     is_abrupt = far.size and first - near[-1] <= 0.75 * (near[-1] - far[-1]) + 2

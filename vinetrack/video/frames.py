@@ -2,7 +2,7 @@
 
 The Y plane is copied straight from the decoder's buffer, since a conversion to grey or colour would cost up to half the
 decoding speed. The capture rate is never taken from the container, which only knows the playback rate. DNG frames carry
-the true rate (tag 51044) and the exposure (33434), and so do the files of some high-speed cameras (`camera_headers`);
+the true rate (tag 51044) and the exposure (33434), and so do the files of some high-speed cameras (`images`);
 other image files carry neither.
 """
 
@@ -684,7 +684,7 @@ def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tupl
 # ------------------------------------------------------------------------------
 # Reading frames stored as the sensor gave them: 8 to 16 bits, packed or not, one frame at a time.
 #
-# High-speed cameras write such files with headers of their own (`camera_headers`). Only the current frame is held in
+# High-speed cameras write such files with headers of their own (`images`). Only the current frame is held in
 # memory.
 
 # Steps from each of the 1024 values of a packed Phantom frame to the next, starting at 2, up to 4064
