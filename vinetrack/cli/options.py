@@ -166,7 +166,7 @@ def with_options(command_name: str, columns: tuple[str, ...] = (), **meanings: s
         keywords = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in (*own, *parameters)]
         called.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
         called.__annotations__ = {one.name: one.annotation for one in keywords}
-        called.__doc__ = command.__doc__
+        called.__name__, called.__doc__ = command.__name__, command.__doc__
         return called
 
     return decorate
