@@ -274,6 +274,19 @@ TESTABLE_SIGMAS = 3.0
 ONE_SIDED_95 = 1.645  # Derived: quantile of the normal distribution
 
 
+def exceeds_slow_errors(fit: Fit) -> bool:
+    """Whether the misfit of a fit exceeds the noise and, as a fraction of growth, the slow errors of the tracks. Slow
+    errors may explain less of it where neither tracks nor a gauge have any.
+    """
+    data = fit.predictor.data
+    systematic = float(
+        np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
+    )
+    has_slow_errors = any(trial_data.slow_m is not None or trial_data.trace is not None for trial_data in data)
+    explained = max(MISSED_FRACTION if has_slow_errors else MISSED_FRACTION_WITHOUT_SLOW_ERRORS, systematic)
+    return fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and relative_residual(fit.predictor, fit.solution) > explained
+
+
 @dataclass(frozen=True)
 class MisfitTests:
     """Test statistics of one fit for every candidate. Arrays have shape (n_shapes,), see `EffectSensitivities`."""
@@ -362,17 +375,7 @@ class MisfitTests:
     @property
     def exceeds_slow_errors(self) -> bool:
         """Whether the misfit exceeds the noise and, as a fraction of growth, the slow errors of the tracks."""
-        return self.far_off and relative_residual(self.fit.predictor, self.fit.solution) > self._slow_error_fraction
-
-    @property
-    def _slow_error_fraction(self) -> float:
-        """Fraction of growth that slow errors may explain; less where neither tracks nor a gauge have such errors."""
-        data = self.fit.predictor.data
-        systematic = float(
-            np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
-        )
-        has_slow_errors = any(trial_data.slow_m is not None or trial_data.trace is not None for trial_data in data)
-        return max(MISSED_FRACTION if has_slow_errors else MISSED_FRACTION_WITHOUT_SLOW_ERRORS, systematic)
+        return exceeds_slow_errors(self.fit)
 
     @property
     def poorly_fitted(self) -> bool:

@@ -54,6 +54,7 @@ from vinetrack.diagnosis.misfit_tests import (
     FAR_OFF_CHI2_PER_DOF,
     SEARCH_SIGMAS,
     MisfitTests,
+    exceeds_slow_errors,
     has_excess_scatter,
     misfit_tests,
 )
@@ -673,13 +674,13 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, resta
 
 def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
     """Whether a better hypothesis may exist: the best one so far is far off, or its trial effects absorb a misfit.
-    Nothing is left to gain once the residuals are no larger than the noise of the tracks and trials scatter no more
+    Nothing is left to gain once the residuals are no larger than the errors of the tracks and trials scatter no more
     than careful work allows.
     """
     if not hypotheses:
         return True
     best = best_of(hypotheses).fit
-    return best.chi2_per_dof > FAR_OFF_CHI2_PER_DOF or has_excess_scatter(best)
+    return exceeds_slow_errors(best) or has_excess_scatter(best)
 
 
 def _is_better(hypotheses: Sequence[LikelihoodRatio], reference: LikelihoodRatio) -> bool:
