@@ -168,6 +168,14 @@ def test_a_window_chosen_by_hand_that_drifts_is_used_with_a_warning():
     assert window.drift == pytest.approx(-0.3 / 0.85, rel=0.02)
 
 
+@pytest.mark.parametrize(("drift_limit", "doubtful"), [(0.03, False), (0.005, True)])
+def test_a_window_chosen_by_hand_is_judged_by_the_limits_of_the_run(drift_limit, doubtful):
+    track = ramp(0.01, 1e-5)
+    kinematics = estimate_kinematics(track, travel_ratio=2)
+    window = user_window(track, kinematics, (0.0, 0.299), drift_limit=drift_limit)
+    assert (window.accepted, window.doubtful) == (True, doubtful)
+
+
 @pytest.mark.parametrize("first", [0, 63, 64, 3000, 4990])
 @pytest.mark.parametrize("points", [3, 4, 9, 127, 900])
 def test_short_windows_late_in_a_long_track_are_fitted_as_well_as_any(first, points):

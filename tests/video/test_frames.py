@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from dataclasses import replace
 
+import av.logging
 import cv2
 import numpy as np
 import pytest
@@ -19,10 +21,12 @@ from vinetrack.video.frames import (
     Region,
     inspect_recording,
     iterate_frames,
+    quiet_log,
     read_frames,
     slots_from_times,
 )
 from vinetrack.video.images import capture_exposure, capture_rate
+from vinetrack.video.strip import camera_unit
 from vinetrack.video.track import track_recording
 
 RNG = np.random.default_rng(5)
@@ -73,6 +77,43 @@ def test_tiff_stack_gives_back_every_page(tmp_path):
     path = tmp_path / "stack.tif"
     cv2.imwritemulti(str(path), list(FRAMES.astype(np.uint16) * 17))
     assert np.array_equal(read_frames(path).luma, FRAMES.astype(np.uint16) * 17)
+
+
+@pytest.mark.parametrize("kind", ["folder", "stack"])
+def test_pictures_that_do_not_fit_in_memory_are_refused_before_they_are_read(tmp_path, kind, monkeypatch):
+    path = write_images(tmp_path / "shots", FRAMES)
+    if kind == "stack":
+        cv2.imwritemulti(str(path := tmp_path / "stack.tif"), list(FRAMES))
+    monkeypatch.setattr("vinetrack.video.images.memory_for_pictures", lambda: FRAMES.nbytes - 1)
+    monkeypatch.setattr("vinetrack.video.images._stack_pages", lambda _: pytest.fail("read"))
+    with pytest.raises(RecordingError, match="memory"):
+        read_frames(path)
+
+
+def test_one_hot_pixel_does_not_dim_a_picture_of_twelve_bit():
+    luma = np.random.default_rng(4).integers(0, 4000, (9, 240, 320)).astype(np.uint16)
+    luma[:, 120, 160] = 65_535
+    assert camera_unit(luma) == pytest.approx(255 / 4000, rel=0.01)
+
+
+def test_films_that_two_threads_decode_do_not_share_the_log_of_the_decoder():
+    heard, decodes, ends = [], threading.Event(), threading.Event()
+
+    def other() -> None:
+        with quiet_log() as messages:
+            decodes.set()
+            ends.wait()
+        heard.append(messages)
+
+    thread = threading.Thread(target=other)
+    with quiet_log() as messages:
+        thread.start()
+        decodes.wait(0.3)
+        av.logging.log(av.logging.ERROR, "vinetrack", "a fault of the first film")
+        ends.set()
+    thread.join()
+    assert messages == ["a fault of the first film"]
+    assert heard == [[]]
 
 
 def test_picture_missing_by_its_number_leaves_a_gap(tmp_path):

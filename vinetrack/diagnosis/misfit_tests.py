@@ -354,12 +354,8 @@ class MisfitTests:
     @cached_property
     def rejects_at_first_round_level(self) -> bool:
         """Whether any candidate exceeds its threshold at the level of the first round."""
-        return (
-            self.largest_excess(
-                family_test(self.scores.cosines, self.signs, self.sensitivities.effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
-            )
-            > 0
-        )
+        family = family_test(self.scores.cosines, self.signs, self.sensitivities.effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
+        return self.largest_excess(family) > 0
 
     @property
     def probes_reject(self) -> bool:

@@ -347,9 +347,16 @@ def gated_window(
 
 
 def user_window(
-    track: Track, kinematics: Kinematics, window_s: tuple[float, float], length_m: float = math.nan
+    track: Track,
+    kinematics: Kinematics,
+    window_s: tuple[float, float],
+    *,
+    length_m: float = math.nan,
+    drift_limit: float = 0.03,
+    start_fraction: float = START_FRACTION,
+    start_sigmas: float = START_SIGMAS,
 ) -> Window:
-    """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady."""
+    """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady by these limits."""
     time_s, position_m = _points(track, kinematics)
     inside = np.flatnonzero((time_s >= window_s[0]) & (time_s <= window_s[1]))
     if inside.size < 3:
@@ -361,9 +368,9 @@ def user_window(
     if not window.x_ss_m_s > 0:
         reason = f"chosen by hand; warning: the mean tail speed is {window.x_ss_m_s:.3g} m/s"
         return replace(window, accepted=True, doubtful=True, reason=reason)
-    steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= 0.03
+    steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= drift_limit
     warnings = [] if steady else ["not shown to be steady"]
-    first, last, why = _gate(kinematics, START_FRACTION, START_SIGMAS)
+    first, last, why = _gate(kinematics, start_fraction, start_sigmas)
     if not why and inside[-1] > _before_the_end(track, position_m, first, last, length_m):
         warnings.append("runs into the end of growth")
     verdict = "; warning: ".join(["chosen by hand", *warnings])
@@ -389,14 +396,8 @@ def _gate(kinematics: Kinematics, start_fraction: float, start_sigmas: float) ->
     moving = velocity > np.maximum(start_fraction * top_speed, start_sigmas * sigma)
     points = np.flatnonzero(moving)
     if points.size < 3:
-        return (
-            0,
-            0,
-            (
-                f"only {points.size} points move faster than {start_fraction:g} of the top speed and"
-                f" {start_sigmas:g} standard errors"
-            ),
-        )
+        faster = f"{start_fraction:g} of the top speed and {start_sigmas:g} standard errors"
+        return 0, 0, f"only {points.size} points move faster than {faster}"
     return int(points[0]), int(points[-1]), ""
 
 

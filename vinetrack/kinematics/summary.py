@@ -315,22 +315,19 @@ def _growth_m(motion: TrialMotion) -> float:
 
 def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSettings) -> dict[str, Window]:
     steady = settings.steady
+    limits = {
+        "length_m": trial.length_m, "drift_limit": steady.drift_limit, "start_fraction": steady.start_fraction,
+        "start_sigmas": steady.start_sigmas,
+    }  # fmt: skip
     windows = {
-        "gated": gated_window(
-            track,
-            kinematics,
-            length_m=trial.length_m,
-            drift_limit=steady.drift_limit,
-            start_fraction=steady.start_fraction,
-            start_sigmas=steady.start_sigmas,
-        ),
+        "gated": gated_window(track, kinematics, **limits),
         "paper": paper_window(
             track, travel_ratio=trial.travel_ratio, cv_limit=steady.paper_cv, min_points=steady.paper_points
         ),
     }
     if trial.steady_window_s is not None:
         try:
-            windows["user"] = user_window(track, kinematics, trial.steady_window_s, trial.length_m)
+            windows["user"] = user_window(track, kinematics, trial.steady_window_s, **limits)
         except ValueError as error:
             windows["user"] = Window("user", False, str(error))
     return windows

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import threading
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -260,25 +261,26 @@ def memory_for_pictures() -> float:
         return math.inf
 
 
-class quiet_log:  # noqa: N801 - used as a context, like a function
-    """Collect the decoder's messages instead of printing or losing them; the log level is restored afterwards."""
+_one_log = threading.RLock()  # The decoder has one log for the whole process
 
-    def __enter__(self) -> list[str]:
-        import av.logging
 
-        self._level = av.logging.get_level()
+@contextlib.contextmanager
+def quiet_log() -> Iterator[list[str]]:
+    """Collect the decoder's messages instead of printing or losing them; the log level is restored afterwards. Films
+    that several threads decode wait for each other, or one would count as damaged for the faults of another.
+    """
+    import av.logging
+
+    messages: list[str] = []
+    with _one_log:
+        level = av.logging.get_level()
         av.logging.set_level(av.logging.ERROR)
-        self._capture = av.logging.Capture(False)
-        self._logs = self._capture.__enter__()
-        self._messages: list[str] = []
-        return self._messages
-
-    def __exit__(self, *exc: object) -> None:
-        import av.logging
-
-        self._capture.__exit__(None, None, None)
-        self._messages.extend(message.strip() for _, _, message in self._logs)
-        av.logging.set_level(self._level)
+        try:
+            with av.logging.Capture(False) as logs:
+                yield messages
+        finally:
+            messages.extend(message.strip() for _, _, message in logs)
+            av.logging.set_level(level)
 
 
 # ------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections.abc import Iterator
@@ -22,7 +23,9 @@ from vinetrack.video.frames import (
     Recording,
     RecordingError,
     Region,
+    memory_for_pictures,
     mosaic_brightness,
+    too_large,
     unpack_pixels,
 )
 
@@ -389,31 +392,41 @@ def inspect_images(path: Path) -> Recording:
 
 
 def read_images(recording: Recording, region: Region) -> Frames:
-    """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged."""
-    name = recording.path.name
-    notes = list(recording.notes)
+    """Read every picture, straight into one array; one that is truncated or cannot be read is partial or black, and
+    marked damaged.
+    """
+    name, notes = recording.path.name, list(recording.notes)
+    dtype = np.dtype(np.uint8 if recording.bit_depth == 8 else np.uint16)
+    shape = (recording.declared_frames or 0, *region.shape)
+    if math.prod(shape) * dtype.itemsize > memory_for_pictures():
+        raise too_large(recording)
+    luma, damaged = np.zeros(shape, dtype), np.zeros(shape[0], dtype=bool)
     if recording.kind == "stack":
-        pictures = [p[region.slices] for p in _stack_pages(recording)]
-        damaged = [False] * len(pictures)
-        if recording.declared_frames is not None and len(pictures) < recording.declared_frames:
-            notes.append(
-                f"{name}: {len(pictures)} pages read where the stack declares {recording.declared_frames}: cut short"
-            )
+        n = 0
+        for n, page in enumerate(_stack_pages(recording), 1):
+            luma[n - 1] = page[region.slices]
+        if n < shape[0]:
+            notes.append(f"{name}: {n} pages read where the stack declares {shape[0]}: cut short")
+        luma, damaged = luma[:n], damaged[:n]
     else:
-        pictures, damaged = _read_folder(recording, region)
-    if not pictures or all(damaged):
+        for i, file in enumerate(recording.files):
+            picture = _read_or_none(file)
+            damaged[i] = picture is None or picture.shape != (recording.height, recording.width)
+            if picture is not None and not damaged[i]:
+                luma[i], damaged[i] = picture[region.slices], not _has_end_marker(file)
+    if damaged.all():
         raise RecordingError("not one picture can be read", "the files are damaged", name)
-    if any(damaged):
-        bad = [f.name for f, d in zip(recording.files, damaged, strict=True) if d]
+    if damaged.any():
+        first = recording.files[int(np.argmax(damaged))].name
         notes.append(
-            f"{name}: damaged: {len(bad)} of {len(pictures)} pictures are cut short or unreadable, first {bad[0]}"
+            f"{name}: damaged: {damaged.sum()} of {len(luma)} pictures are cut short or unreadable, first {first}"
         )
-    slot = np.arange(len(pictures))
+    slot = np.arange(len(luma))
     if recording.numbers:
         slot, missing = _capture_periods(np.array(recording.numbers))
         if missing:
             notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
-    return Frames(recording, region, np.stack(pictures), slot, np.array(damaged, dtype=bool), tuple(notes))
+    return Frames(recording, region, luma, slot, damaged, tuple(notes))
 
 
 def iterate_images(recording: Recording, region: Region) -> Iterator[NDArray[Any]]:
@@ -467,21 +480,6 @@ def _capture_periods(numbers: NDArray[np.int_]) -> tuple[NDArray[np.int_], int]:
     slot = np.concatenate([[0], np.cumsum(steps // step)])
     missing = int(slot[-1] - consecutive[-1])
     return (slot, missing) if missing <= max(3, len(numbers) // 10) else (consecutive, 0)
-
-
-def _read_folder(recording: Recording, region: Region) -> tuple[list[NDArray[Any]], list[bool]]:
-    """The pictures of a folder, and which are damaged."""
-    pictures: list[NDArray[Any]] = []
-    damaged: list[bool] = []
-    dtype = np.uint8 if recording.bit_depth == 8 else np.uint16
-    for file in recording.files:
-        picture = _read_or_none(file)
-        bad = picture is None or picture.shape != (recording.height, recording.width) or not _has_end_marker(file)
-        if picture is None or picture.shape != (recording.height, recording.width):
-            picture = np.zeros((recording.height, recording.width), dtype)
-        pictures.append(picture[region.slices].astype(dtype, copy=False))
-        damaged.append(bad)
-    return pictures, damaged
 
 
 def _has_end_marker(file: Path) -> bool:
