@@ -34,7 +34,7 @@ from vinetrack.core.tables import (
     write_bytes,
 )
 from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, with_names
-from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units, read_experiment_settings
+from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,
@@ -43,8 +43,8 @@ from vinetrack.experiment.sheet import (
     find_missing,
     make_trial,
     read_row,
+    read_sheet,
     similar_entry,
-    unknown_columns,
 )
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
 
@@ -190,23 +190,16 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
         problems.append(Problem("missing", "is missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
         return None
     try:
-        table = read_table(folder / SHEET)
-    except TableError as error:
-        problems.append(Problem.from_error(error, SHEET))
+        table, found = read_sheet(folder / SHEET)
+    except ExperimentError as error:
+        problems += error.problems
         return None
-    table, converted = in_sheet_units(table, SHEET)
-    problems += [*converted, *unknown_columns(table, SHEET)]
-    if table.nameless:
-        message = "has a column without a name, which is ignored"
-        problems.append(Problem("nameless_column", message, file=SHEET, severity="warning"))
+    problems += found
     if "trial" not in table.columns:
         problems.append(_absent_column("trial"))
     if not {"video", "track"} & set(table.columns):
         message, remedy = "has neither a column video nor a column track", "add the one that applies"
         problems.append(Problem("no_recording", message, file=SHEET, remedy=remedy))
-    if not table.rows:
-        remedy = "write one row per trial below the header"
-        problems.append(Problem("no_rows", "has no rows", file=SHEET, remedy=remedy))
     return table
 
 

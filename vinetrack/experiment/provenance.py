@@ -11,17 +11,6 @@ from typing import Any
 
 import vinetrack
 
-LIBRARIES = (
-    "numpy",
-    "scipy",
-    "pandas",
-    "numba",
-    "opencv-python-headless",
-    "av",
-    "scikit-image",
-    "matplotlib",
-)
-
 
 def describe_run(
     experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
@@ -29,13 +18,17 @@ def describe_run(
     """Return the content of `provenance.json`. Returns mapping of JSON types: versions, platform, SHA-256 of every
     input, model and settings.
     """
+    libraries = ("numpy", "scipy", "pandas", "numba", "opencv-python-headless", "av", "scikit-image", "matplotlib")
     return {
         "vinetrack": vinetrack.__version__,
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
-        "libraries": {name: version for name in LIBRARIES if (version := _version(name))},
+        "libraries": {name: version for name in libraries if (version := _version(name))},
         "experiment": experiment.absolute().as_posix(),
-        "inputs": {_shown(path, experiment): _hash_file(path) for path in inputs},
+        "inputs": {
+            (path.relative_to(experiment) if path.is_relative_to(experiment) else path).as_posix(): _hash_file(path)
+            for path in inputs
+        },
         "model": list(model),
         "settings": settings,
     }
@@ -54,13 +47,6 @@ def _hash_file(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return "unreadable"
-
-
-def _shown(path: Path, folder: Path) -> str:
-    try:
-        return path.relative_to(folder).as_posix()
-    except ValueError:
-        return path.as_posix()
 
 
 def _version(name: str) -> str:

@@ -103,15 +103,24 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     return row
 
 
-def unknown_columns(table: Table, file: str) -> list[Problem]:
-    """Warn of every unknown column, with the most similar known names."""
+def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
+    """Read a sheet in the units of its columns, and what is wrong with its columns; unknown ones are ignored."""
+    try:
+        table, problems = in_sheet_units(read_table(path), path.name)
+    except TableError as error:
+        raise ExperimentError([Problem.from_error(error, path.name)]) from None
     message = "is not a column of the trial sheet and is ignored"
     left = [column for column in COLUMNS if column not in table.columns]
-    return [
-        Problem("unknown_column", message, name, file=file, line=1, severity="warning", remedy=did_you_mean(name, left))
-        for name in table.columns
-        if name not in COLUMNS
-    ]
+    for name in table.columns:
+        if name not in COLUMNS:
+            place: dict[str, Any] = {"file": path.name, "line": 1, "severity": "warning"}
+            problems.append(Problem("unknown_column", message, name, remedy=did_you_mean(name, left), **place))
+    if table.nameless:
+        message = "has a column without a name, which is ignored"
+        problems.append(Problem("nameless_column", message, file=path.name, severity="warning"))
+    if not table.rows:
+        problems.append(Problem("no_rows", "has no rows", file=path.name, remedy="write one row per trial"))
+    return table, problems
 
 
 def similar_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
@@ -128,20 +137,12 @@ def similar_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
 
 def _check_name(row: Row) -> None:
     """Report an invalid trial name, and replace it by the number of the line."""
-    max_name_length = 100  # Longest trial name; files are named after it (chosen)
     given = row.name
-    if not given:
-        code, message = "blank", "is blank"
-    elif given.startswith("-"):
-        code, message = "name", "begins with a hyphen, like a command-line option"
-    elif len(given) > max_name_length:
-        code, message = "name", "is too long"
-    elif not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII):
-        code, message = "name", "is not a valid trial name"
-    else:
+    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}", given, re.ASCII):
         return
     row.name = f"line-{row.line}"
-    remedy = f"at most {max_name_length} characters, no spaces or dots: files are named after it"
+    code, message = ("name", "is not a valid trial name") if given else ("blank", "is blank")
+    remedy = "at most 100 characters, no spaces or dots, no hyphen first: files are named after it"
     row.add(code, message, "trial", value=given, allowed=COLUMNS["trial"].allowed, remedy=remedy)
 
 
@@ -335,15 +336,14 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     if not file.is_file():
         remedy = similar_entry(file) or f"give a folder with {SHEET}, or a sheet"
         raise ExperimentError([Problem("no_file", "does not exist", file=str(file), remedy=remedy)])
-    try:
-        table = read_table(file)
-    except TableError as error:
-        raise ExperimentError([Problem.from_error(error, file.name)]) from None
-    table, header = in_sheet_units(table, file.name)
+    table, header = read_sheet(file)
     settings = read_experiment_settings(file.parent / "experiment.yaml")
-    if not table.rows:
-        raise ExperimentError([Problem("no_rows", "has no rows", file=file.name, remedy="write one row a trial")])
-    header += _check_header(table, settings, file.name)
+    given = {*table.columns, *(name for name in SHARED if getattr(settings, name) is not None)}
+    if absent := [name for name in REQUIRED_FOR_PREDICTION if name not in given]:
+        remedy = "give a trial sheet, one row a trial, with these columns"
+        header.append(Problem("missing", f"has no column {', '.join(absent)}", file=file.name, remedy=remedy))
+    if absent or not table.rows:
+        raise ExperimentError(header)
     rows, problems = _checked_rows(table, settings, REQUIRED_FOR_PREDICTION)
     problems = [*header, *(replace(problem, file=file.name) for problem in problems)]
     trials = _trials(rows, settings, problems)
@@ -357,20 +357,6 @@ def table_of_texts(rows: Sequence[dict[str, str]]) -> Table:
     """Return a table of rows that stand in no file: their lines are 0."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
     return Table(columns, tuple(rows), (0,) * len(rows), ((),) * len(rows), ",", ".")
-
-
-def _check_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
-    """Return warnings about unknown columns; refuse a sheet that lacks required ones."""
-    unknown = unknown_columns(table, file)
-    shared = {name for name in SHARED if getattr(settings, name) is not None}
-    absent = [name for name in REQUIRED_FOR_PREDICTION if name not in table.columns and name not in shared]
-    if not absent:
-        return unknown
-    message = f"has no column {', '.join(absent)}"
-    if len(absent) == len(REQUIRED_FOR_PREDICTION):
-        remedy = "give a trial sheet, one row a trial"
-        raise ExperimentError([Problem("missing", message, file=file, remedy=remedy)])
-    raise ExperimentError([Problem("missing", message, file=file, remedy="add what is missing"), *unknown])
 
 
 def _checked_rows(table: Table, settings: ExperimentSettings, needed: Sequence[str]) -> tuple[list[Row], list[Problem]]:

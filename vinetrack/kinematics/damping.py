@@ -386,57 +386,48 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_ax
     `thickness`, each a list of families: `along` (`diameter_mm` or `thickness_um`), `vines`, `sizes`, `B`, `power` and
     `line` (see `regress`), and `refused` (None, or why there is no regression).
     """
+    import pandas as pd
+
     vines = damping[method]["vines"]
-    isometric = _families(vines, "diameter_mm", lambda v: v["thickness_um"] / v["diameter_mm"], ISOMETRIC_WITHIN)
-    thickness = _families(vines, "thickness_um", lambda v: v["diameter_mm"], SAME_WITHIN)
+    table = pd.DataFrame(
+        [{"vine": name, **law} for name, law in vines.items()],
+        columns=["vine", "diameter_mm", "thickness_um", "B", "B_95"],
+    )
+    table["wall_over_diameter"] = table["thickness_um"] / table["diameter_mm"]
+    isometric = _families(table, "diameter_mm", {"wall_over_diameter": ISOMETRIC_WITHIN})
+    thickness = _families(table, "thickness_um", {"diameter_mm": SAME_WITHIN})
     reason = None
     if not isometric and not thickness:
-        reason = _why_no_family(len(vines))
+        few = ("no vine has a damping coefficient", "only one vine has a damping coefficient; it takes two")
+        none_alike = f"of {len(vines)} vines no two are scaled copies of each other or of equal diameter"
+        reason = [*few, none_alike][min(len(vines), 2)]
     return {"method": method, "isometric": isometric, "thickness": thickness, "reason": reason}
 
 
-def _why_no_family(count: int) -> str:
-    if count == 0:
-        return "no vine has a damping coefficient"
-    if count == 1:
-        return "only one vine has a damping coefficient, and a dependence on size needs two"
-    return f"of {count} vines with a damping coefficient no two are scaled copies of each other or of equal diameter"
+def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Groups of vines of several sizes that are alike in another, with the dependence of B on the size."""
+    (other,) = within
+    ordered = table.dropna(subset=[along, other]).sort_values(other, kind="stable")
+    groups = [group.sort_values(along, kind="stable") for group in alike(ordered, within)]
+    return [
+        {
+            "along": along,
+            "vines": group["vine"].tolist(),
+            "sizes": group[along].tolist(),
+            "B": group["B"].tolist(),
+            "B_95": group["B_95"].tolist(),
+            **_lines(group[along].to_numpy(float), group["B"].to_numpy(float), len(group)),
+        }
+        for group in groups
+        if np.unique(group[along].round(6)).size > 1
+    ]
 
 
-def _families(vines: Mapping[str, Any], along: str, alike: Any, within: float) -> list[dict[str, Any]]:
-    """Groups of two or more vines that differ only in one size."""
-    families = []
-    remaining = sorted(vines, key=lambda name: alike(vines[name]))
-    while remaining:
-        first = alike(vines[remaining[0]])
-        group = [name for name in remaining if alike(vines[name]) <= first * (1 + within)]
-        remaining = [name for name in remaining if name not in group]
-        group.sort(key=lambda name: vines[name][along])
-        sizes = np.array([vines[name][along] for name in group], dtype=float)
-        if len(np.unique(np.round(sizes, 6))) > 1:
-            families.append(_family(group, sizes, vines, along))
-    return families
-
-
-def _family(group: list[str], sizes: Floats, vines: Mapping[str, Any], along: str) -> dict[str, Any]:
-    B = np.array([vines[name]["B"] for name in group])
-    low, high = np.array([vines[name]["B_95"] for name in group], dtype=float).T
-    family: dict[str, Any] = {
-        "along": along,
-        "vines": group,
-        "sizes": sizes.tolist(),
-        "B": B.tolist(),
-        "B_95": np.column_stack([low, high]).tolist(),
-        "power": None,
-        "line": None,
-        "refused": None,
-    }
-    if len(group) < FEWEST_VINES:
-        family["refused"] = f"{len(group)} vines; a regression with an error needs at least {FEWEST_VINES}"
-        return family
-    family["power"] = regress(np.log(sizes), np.log(B))
-    family["line"] = regress(sizes, B)
-    return family
+def _lines(sizes: Floats, values: Floats, count: int) -> dict[str, Any]:
+    """A power law and a straight line, or why neither; `count` is the number of sizes, or of vines."""
+    if count < FEWEST_VINES:
+        return {"power": None, "line": None, "refused": f"{count} sizes; an error takes {FEWEST_VINES}"}
+    return {"power": regress(np.log(sizes), np.log(values)), "line": regress(sizes, values), "refused": None}
 
 
 def regress(x: Floats, y: Floats) -> dict[str, Any]:
@@ -518,16 +509,9 @@ def _speed_family(group: pd.DataFrame) -> dict[str, Any]:
         "sizes": sizes.tolist(),
         **{name: group[name].tolist() for name in columns},
         "monotonic": bool(np.all(np.diff(speeds) > 0)),
-        **_lines(sizes, speeds),
-        "over_diameter": _lines(sizes, relative),
+        **_lines(sizes, speeds, np.unique(sizes).size),
+        "over_diameter": _lines(sizes, relative, np.unique(sizes).size),
     }
-
-
-def _lines(sizes: Floats, values: Floats) -> dict[str, Any]:
-    """A power law and a straight line, or why neither."""
-    if np.unique(sizes).size < FEWEST_VINES:
-        return {"power": None, "line": None, "refused": f"{np.unique(sizes).size} sizes; it takes {FEWEST_VINES}"}
-    return {"power": regress(np.log(sizes), np.log(values)), "line": regress(sizes, values), "refused": None}
 
 
 def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -131,12 +131,12 @@ def _steady(group: pd.DataFrame) -> Mapping[str, float]:
 
 def _efficiencies(trial: Trial, values: Floats, at_mm: float) -> dict[str, object]:
     mean, sigma, count = mean_with_error(values)
-    shares = efficiency_shares(trial, at_mm / 1e3)
+    payload, weight = efficiency_shares(trial, at_mm / 1e3)
     row: dict[str, object] = {"n_efficiency": count, "efficiency_at_mm": at_mm if count else math.nan}
-    for name, factor in (("", 1.0), ("_payload", shares.payload), ("_with_weight", 1 / (1 + shares.weight))):
+    for name, factor in (("", 1.0), ("_payload", payload), ("_with_weight", 1 / (1 + weight))):
         row[f"efficiency{name}"] = mean * factor
         row[f"efficiency{name}_sigma"] = sigma * factor
-    return row | {"weight_share": shares.weight if count else math.nan}
+    return row | {"weight_share": weight if count else math.nan}
 
 
 def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float, float, int]:
@@ -178,28 +178,16 @@ def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: flo
     return float(0.5 * trial.moving_mass_kg(lead_travel_m) * tail_velocity_m_s**2 / work_J)
 
 
-class EfficiencyShares(NamedTuple):
-    """Factors that turn an efficiency ½ m(x) ẋ² / (P₀ A y) into its variants. `payload` is the payload's fraction of
-    the moving mass: efficiency × `payload` is that of the payload alone. `weight` is the work of the weight over that
-    of the gas: efficiency / (1 + `weight`) counts both as work.
-    """
-
-    payload: float
-    weight: float
-
-
-def efficiency_shares(trial: Trial, lead_travel_m: float) -> EfficiencyShares:
-    """Return the payload's fraction of the moving mass, and the work of the weight over that of the gas. The weight
-    does work on tail and payload along the travel of the tail x = r·y: g cosθ ∫ m dx, the third term of Eq. (2) of
-    Alvarez et al. (2025). NaN where there is no mass, or no work.
+def efficiency_shares(trial: Trial, lead_travel_m: float) -> tuple[float, float]:
+    """Return the payload's fraction of the moving mass, and the work of the weight over that of the gas: efficiency ×
+    the first is that of the payload alone, efficiency / (1 + the second) counts both works. The weight does work on
+    tail and payload along the travel of the tail x = r·y: g cosθ ∫ m dx, the third term of Eq. (2) of Alvarez et al.
+    (2025). NaN where there is no mass, or no work.
     """
     mass_kg = float(trial.moving_mass_kg(lead_travel_m))
     gas_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
     weight_J = GRAVITY_M_S2 * math.cos(trial.growth_angle_rad) * _mass_along(trial, trial.travel_ratio * lead_travel_m)
-    return EfficiencyShares(
-        payload=trial.payload_kg / mass_kg if mass_kg > 0 else math.nan,
-        weight=weight_J / gas_J if gas_J > 0 else math.nan,
-    )
+    return trial.payload_kg / mass_kg if mass_kg > 0 else math.nan, weight_J / gas_J if gas_J > 0 else math.nan
 
 
 def _mass_along(trial: Trial, tail_travel_m: float) -> float:
@@ -211,6 +199,9 @@ def _mass_along(trial: Trial, tail_travel_m: float) -> float:
 
 
 FEWEST_POINTS = 5  # Fewest usable points of a track (derived)
+
+
+NO_WINDOW = Window("", False, "")  # its numbers are NaN
 
 
 class TrialError(ValueError):
@@ -286,7 +277,8 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         steady = steadiness_under(motion, model)
     except EffectError as error:
         raise TrialError(str(error)) from error
-    track, kinematics, windows = motion.track, motion.kinematics, steady.windows
+    track, kinematics, windows, window = motion.track, motion.kinematics, steady.windows, steady.chosen or NO_WINDOW
+    moved_m = track.lead_position_m[track.usable]
     warnings = _warnings(track, motion.release, windows)
     notes = [*warnings, *([] if steady.chosen else [f"no steady window: {windows['gated'].reason}"])]
     row = {
@@ -299,18 +291,19 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         "mm_per_px": trial.m_per_px * 1e3,
         "scale_rel_sigma": math.nan,
         "noise_m": kinematics.noise_m,
-        **_steady_columns(steady.chosen, windows["paper"], steady.force),
+        "steady_from_s": window.from_s,
+        "steady_to_s": window.to_s,
+        "steady_rule": window.rule,
+        "x_ss_m_s": window.x_ss_m_s,
+        "x_ss_sigma_m_s": window.x_ss_sigma_m_s,
+        "x_ss_paper_m_s": windows["paper"].x_ss_m_s,
+        "cv": window.cv,
+        "force_N": steady.force.force_N if steady.force else math.nan,
         **_end_columns(trial, kinematics, motion.release, settings),
         "tube_width_mm": math.nan,
-        "growth_mm": 1e3 * _growth_m(motion),
+        "growth_mm": 1e3 * float(moved_m.max() - motion.release.lead_position_m) if moved_m.size else math.nan,
     }
     return TrialResult(track, kinematics, motion.release, windows, row, damping_point(trial, steady))
-
-
-def _growth_m(motion: TrialMotion) -> float:
-    """Growth from release to the furthest usable position, m."""
-    position_m = motion.track.lead_position_m[motion.track.usable]
-    return float(position_m.max() - motion.release.lead_position_m) if position_m.size else math.nan
 
 
 def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSettings) -> dict[str, Window]:
@@ -326,10 +319,7 @@ def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSe
         ),
     }
     if trial.steady_window_s is not None:
-        try:
-            windows["user"] = user_window(track, kinematics, trial.steady_window_s, **limits)
-        except ValueError as error:
-            windows["user"] = Window("user", False, str(error))
+        windows["user"] = user_window(track, kinematics, trial.steady_window_s, **limits)
     return windows
 
 
@@ -351,19 +341,6 @@ def _warnings(track: Track, release: Release, windows: Mapping[str, Window]) -> 
     return warnings
 
 
-def _steady_columns(window: Window | None, paper: Window, force: SteadyForce | None) -> dict[str, object]:
-    return {
-        "steady_from_s": window.from_s if window else math.nan,
-        "steady_to_s": window.to_s if window else math.nan,
-        "steady_rule": window.rule if window else "",
-        "x_ss_m_s": window.x_ss_m_s if window else math.nan,
-        "x_ss_sigma_m_s": window.x_ss_sigma_m_s if window else math.nan,
-        "x_ss_paper_m_s": paper.x_ss_m_s if paper.accepted else math.nan,
-        "cv": window.cv if window else math.nan,
-        "force_N": force.force_N if force else math.nan,
-    }
-
-
 def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, settings: RunSettings) -> dict[str, object]:
     """Speed at the set fraction of the length, and efficiency at the set growth; NaN where growth did not get there."""
     travel_m = kinematics.lead_position_m - release.lead_position_m
@@ -379,9 +356,8 @@ def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, setting
 
 def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
     """Return the row of a trial in the damping fit, with `used` and the `reason` if not."""
-    window, paper, force = steady.chosen, steady.windows["paper"], steady.force
-    reason = why_not_in_fit(trial) or why_not_force(force)
-    nan = math.nan
+    window, force = steady.chosen or NO_WINDOW, steady.force
+    reason, nan = why_not_in_fit(trial) or why_not_force(force), math.nan
     return {
         "trial": trial.name,
         "vine": trial.vine,
@@ -390,13 +366,13 @@ def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
         "thickness_um": trial.thickness_m * 1e6,
         "pressure_kPa": trial.pressure_Pa / 1e3,
         "window_pressure_kPa": force.window_pressure_Pa / 1e3 if force else nan,
-        "x_ss_m_s": window.x_ss_m_s if window else nan,
-        "x_ss_sigma_m_s": window.x_ss_sigma_m_s if window else nan,
+        "x_ss_m_s": window.x_ss_m_s,
+        "x_ss_sigma_m_s": window.x_ss_sigma_m_s,
         "force_N": force.force_N if force else nan,
         "force_sigma_N": force.sigma_N if force else nan,
         "yield_force_sigma_N": force.yield_sigma_N if force else nan,
         "pressure_source": force.pressure_source if force else "",
-        "x_ss_paper_m_s": paper.x_ss_m_s if paper.accepted else nan,
+        "x_ss_paper_m_s": steady.windows["paper"].x_ss_m_s,
         "force_paper_N": paper_force_N(trial),
         "eligible": not why_not_in_fit(trial),
         "used": not reason,

@@ -173,25 +173,16 @@ def _suspect_steps(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
     A point with a large stated error, such as one that a door half hides, makes no step that is conclusive about
     frames.
     """
-    before, after = _neighbours(speed)
+    import pandas as pd
+
+    # Medians of the three steps before and the three after each step, NaN where there are none.
+    before, after = (
+        pd.Series(one_way).shift(1).rolling(3, min_periods=1).median().to_numpy() for one_way in (speed, speed[::-1])
+    )
+    after = after[::-1]
     smaller = np.fmin(np.abs(before), np.abs(after))
     clear = np.fmax(before, after) > CLEAR_STEP_SIGMAS * noise_m
     return np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * np.fmax(before, after))))
-
-
-def _neighbours(speed: Floats) -> tuple[Floats, Floats]:
-    """Medians of the three steps before and the three after each step, NaN where there are none."""
-    padded = np.concatenate([np.full(3, np.nan), speed, np.full(3, np.nan)])
-    view = np.lib.stride_tricks.sliding_window_view(padded, 3)
-    return _row_median(view[: speed.size]), _row_median(view[4 : 4 + speed.size])
-
-
-def _row_median(view: Floats) -> Floats:
-    """Median of each row of three, ignoring NaN; NaN where all are."""
-    ordered = np.sort(view, axis=1)
-    count = np.isfinite(ordered).sum(axis=1)
-    pick = np.where(count == 3, ordered[:, 1], np.where(count == 2, (ordered[:, 0] + ordered[:, 1]) / 2, ordered[:, 0]))
-    return np.where(count == 0, np.nan, pick)
 
 
 def _dropped_frames(

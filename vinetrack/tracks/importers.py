@@ -6,19 +6,20 @@ on `records` and `tables` alone, so that the experiment's check can use it.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flags, plain_track
-from vinetrack.core.tables import Table, TableError, file_size, parse_table, read_text
+from vinetrack.core.tables import MAX_TABLE_BYTES, Table, TableError, file_size, parse_table, read_table, read_text
 from vinetrack.core.units import convert, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 
@@ -130,42 +131,59 @@ def _last_digit_s(time_s: Floats) -> float:
 # Pressure traces in TDMS files, in which LabVIEW writes measurements, read by npTDMS.
 
 
-def tdms_columns(path: Path) -> dict[str, Floats]:
-    """Read the channels of a file that are as long as its pressure. A channel is named as in the file, with its unit
-    appended (`pressure` in `kPa` is `pressure_kPa`). Where none is a time, `time_s` comes from the waveform's start and
-    increment. Returns values by column, each of shape (n_samples,).
+def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
+    """Times, s, and gauge pressures, kPa, of a TDMS file: channels `time_s` and `pressure_kPa`. Their unit stands in
+    the name, or beside it (`unit_string`). Where none is a time, the waveform's start and increment give it.
     """
     try:
         from nptdms import TdmsFile
     except ModuleNotFoundError:
         remedy = "pip install 'vinetrack[cameras]', or use a CSV"
         raise TrackError("is a TDMS file, which npTDMS reads", remedy) from None
-    _require_whole(path.read_bytes())
+    try:
+        if file_size(path) > MAX_TABLE_BYTES:
+            raise TrackError("is too large", "keep only its pressure channels")
+        data = path.read_bytes()
+    except OSError as error:
+        raise TrackError("cannot be read", f"{error.strerror}") from None
+    _require_whole(data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            file = TdmsFile.read(path)
-            channels = [channel for group in file.groups() for channel in group.channels() if len(channel)]
-            read = {
-                _with_unit(channel.name, channel.properties): (channel.properties, channel[:]) for channel in channels
-            }
+            groups = TdmsFile.read(io.BytesIO(data)).groups()
+            found = [(channel.name, channel.properties, channel[:]) for group in groups for channel in group.channels()]
     except Exception as error:  # Damaged files end in errors of many kinds.
         raise TrackError(f"is no whole TDMS file ({error})", "export it from LabVIEW again, or as CSV") from None
-    named = {name: (properties, values) for name, (properties, values) in read.items() if values.dtype.kind in "iuf"}
+    named = {}
+    for name, properties, values in found:
+        unit = str(properties.get("unit_string", ""))
+        if len(values) and values.dtype.kind in "iuf":
+            named[name if not unit or name.endswith(f"_{unit}") else f"{name}_{unit}"] = properties, values
     pressure = next((name for name in named if name.startswith("pressure")), None)
     if pressure is None:
         there = ", ".join(list(named)[:8]) or "none"
         raise TrackError(f"lacks a channel pressure_kPa (found: {there[:120]})", "name it so in LabVIEW")
     properties, samples = named[pressure]
-    columns = {
-        name: np.asarray(values, dtype=float) for name, (_, values) in named.items() if len(values) == len(samples)
-    }
-    if not any(name.startswith("time") for name in columns):
-        step, start = (float(properties.get(f"wf_{key}", 0.0)) for key in ("increment", "start_offset"))
-        if not step > 0:
-            raise TrackError("states no times", "write a channel time_s, or the waveform's increment (wf_increment)")
-        columns["time_s"] = start + step * np.arange(len(samples))
-    return dict(_in_own_unit(name, values) for name, values in columns.items())
+    pressure_kPa: Floats = _in_unit(pressure, samples, "kPa")
+    for name, (_, values) in named.items():
+        if name.startswith("time") and len(values) == len(samples):
+            return _in_unit(name, values, "s"), pressure_kPa
+    step, start = (float(properties.get(f"wf_{key}", 0.0)) for key in ("increment", "start_offset"))
+    if not step > 0:
+        raise TrackError("states no times", "write a channel time_s, or the waveform's increment (wf_increment)")
+    return start + step * np.arange(len(samples), dtype=float), pressure_kPa
+
+
+def _in_unit(name: str, values: np.ndarray, wanted: str) -> Floats:
+    """The samples of a channel in the unit wanted, from the unit at the end of its name."""
+    unit = split_unit(name)[1]
+    if not unit or not np.all(np.isfinite(values)):
+        fault = "holds a sample that is no number" if unit else "states no unit"
+        raise TrackError(f"channel {name[:40]} {fault}", "correct it in LabVIEW")
+    try:
+        return np.asarray(values, dtype=float) * (1.0 if unit == wanted else convert(1.0, unit, wanted))
+    except ValueError as error:
+        raise TrackError(f"channel {name}: {error}") from None
 
 
 def _require_whole(data: bytes) -> None:
@@ -178,23 +196,6 @@ def _require_whole(data: bytes) -> None:
         place += 28 + int.from_bytes(length, "big" if data[place + 4] & 1 << 6 else "little")
     if place > len(data):
         raise TrackError("is cut short", "export it from LabVIEW again, or as CSV")
-
-
-def _in_own_unit(name: str, values: Floats) -> tuple[str, Floats]:
-    """Convert a pressure to kPa and a time to s; others stay as they are."""
-    quantity, unit = split_unit(name)
-    wanted = {"pressure": "kPa", "time": "s"}.get(quantity, unit)
-    if unit in ("", wanted):
-        return name, values
-    try:
-        return f"{quantity}_{wanted}", values * convert(1.0, unit, wanted)
-    except ValueError as error:
-        raise TrackError(f"channel {name}: {error}") from None
-
-
-def _with_unit(name: str, properties: Mapping[str, Any]) -> str:
-    unit = str(properties.get("unit_string", ""))
-    return name if not unit or name.endswith(f"_{unit}") else f"{name}_{unit}"
 
 
 # ------------------------------------------------------------------------------
@@ -562,16 +563,20 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
     """Read a pressure trace: a CSV with `time_s, pressure_kPa`, or a TDMS file with such channels. Returns times in s
     and gauge pressures in Pa, two arrays, shape (n,).
     """
-    try:
-        table = parse_table(_as_csv(path) if path.suffix.lower() == ".tdms" else read_text(path))
-        _require(table, "time_s", "pressure_kPa")
-        time_s, pressure_kPa = table.numbers("time_s"), table.numbers("pressure_kPa")
-    except TableError as error:
-        raise TrackError(error.message, error.remedy) from None
+    if path.suffix.lower() == ".tdms":
+        time_s, pressure_kPa = _tdms_trace(path)
+        lines: Sequence[int] = range(1, len(time_s) + 1)
+    else:
+        try:
+            table = read_table(path)
+            _require(table, "time_s", "pressure_kPa")
+            time_s, pressure_kPa, lines = table.numbers("time_s"), table.numbers("pressure_kPa"), table.lines
+        except TableError as error:
+            raise TrackError(error.message, error.remedy) from None
     if len(time_s) == 0:
         raise TrackError("has no rows", "write time_s and pressure_kPa of at least one reading")
-    check_times(time_s, table.lines)
-    check_pressure(pressure_kPa, table.lines)
+    check_times(time_s, lines)
+    check_pressure(pressure_kPa, lines)
     return time_s, 1000 * pressure_kPa
 
 
@@ -589,20 +594,6 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
     if outside:
         notes = (*notes, f"The pressure trace does not cover {outside} of {len(track.time_s)} points: its end is held.")
     return replace(track, pressure_Pa=np.interp(track.time_s, time_s, pressure_Pa), notes=notes)
-
-
-def _as_csv(path: Path) -> str:
-    """The channels of a TDMS file as the text of a CSV, so that units in their names are converted in the same way."""
-    largest_tdms_bytes = 200_000_000  # Largest TDMS file that is read (chosen)
-    try:
-        size = file_size(path)
-        if size > largest_tdms_bytes:
-            raise TrackError(f"is larger than {largest_tdms_bytes // 1_000_000} MB", "keep only its pressure channels")
-        columns = tdms_columns(path)
-    except OSError as error:
-        raise TrackError("cannot be read", f"{error.strerror}") from None
-    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
-    return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows)])
 
 
 def _require(table: Table, *columns: str) -> None:

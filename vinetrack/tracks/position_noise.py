@@ -428,8 +428,6 @@ LEAST_SHARE = 0.75  # Least share of the neighbours that must lie on the cubic (
 
 FEWEST_POINTS = 2 * HALF_WIDTH + 1  # Fewest points of a window: the point and its neighbours (derived)
 
-MOST_NAMED = 8  # Most points named in the sentence about a campaign; a track's notes name all of its own (chosen)
-
 MOST_REJECTED = 0.1  # Largest share of points that may be rejected (chosen)
 
 
@@ -457,15 +455,13 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     time_from_point = time_s[places] - time_s[:, None]
     width = np.abs(time_from_point).max(axis=1)
     relative_time = time_from_point / width[:, None]
-    powers = np.ones((*relative_time.shape, 7))
-    for power in range(1, 7):
-        powers[..., power] = powers[..., power - 1] * relative_time
+    powers = np.polynomial.polynomial.polyvander(relative_time, 6)
     y = position_m[places] - position_m[:, None]
     smallest_scale = np.maximum(noise_m, 1e-9 * np.ptp(position_m))
     weight = np.ones_like(y)
     for turn in range(10):
-        coefficients = _normal_solution(_moments(powers, weight), _moments(powers[..., :4], weight * y))
-        residuals = np.abs(y - _cubic(relative_time, coefficients))
+        coefficients = _normal_solution(powers, weight, _sums(powers[..., :4], weight * y))
+        residuals = np.abs(y - _cubic(powers, coefficients))
         if turn < 6:  # least absolute residuals
             weight = 1 / np.maximum(residuals, 0.1 * smallest_scale)
         else:  # Tukey's biweight; the median of 12 residuals about 4 fitted numbers is 0.55 of their sd
@@ -477,7 +473,7 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     used = np.maximum(on_cubic.sum(axis=1), 5)
     # The point itself lies at 0, where the cubic is its first coefficient.
     first_coefficient = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    leverage = weight * _cubic(relative_time, _normal_solution(_moments(powers, weight), first_coefficient))
+    leverage = weight * _cubic(powers, _normal_solution(powers, weight, first_coefficient))
     # Of the 4 nearest neighbours, 3 must lie on the cubic too (`_outlying`).
     nearest = np.argsort(np.abs(time_from_point), axis=1, kind="stable")[:, :4]
     return LocalFit(
@@ -538,7 +534,7 @@ def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
     for row in outlying:
         flag[row] = join_flags(str(flag[row]), "rejected")
     rejected = replace(track, flag=flag)
-    note = f"{_outliers_are_left_out(outlying.size)}: {', '.join(_places(rejected, outlying))}"
+    note = f"far off the motion around, so left out: {', '.join(_places(rejected, outlying))}"
     return replace(rejected, notes=(*track.notes, note))
 
 
@@ -551,15 +547,10 @@ def rejected_points_note(tracks: Mapping[str, Track]) -> str:
     ]
     if not places:
         return ""
-    more = f" and {len(places) - MOST_NAMED} more" if len(places) > MOST_NAMED else ""
-    return f"{_outliers_are_left_out(len(places))}: {', '.join(places[:MOST_NAMED])}{more}."
-
-
-def _outliers_are_left_out(points: int) -> str:
-    """The beginning of a sentence about rejected points."""
-    if points == 1:
-        return "1 point lies far off the motion around it and is left out"
-    return f"{points} points lie far off the motion around them and are left out"
+    most_named = 8  # a track's notes name all of its own
+    more = f" and {len(places) - most_named} more" if len(places) > most_named else ""
+    points = "1 point" if len(places) == 1 else f"{len(places)} points"
+    return f"{points} far off the motion around, so left out: {', '.join(places[:most_named])}{more}."
 
 
 def _places(track: Track, outlying: NDArray[np.int_]) -> list[str]:
@@ -593,39 +584,24 @@ def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bo
     return np.asarray((distance_m > limit * fit.gain * sigma_m + allowance_m) & isolated & (sigma_m > 0))
 
 
-def _moments(powers: Floats, weight: Floats) -> Floats:
+def _sums(powers: Floats, weight: Floats) -> Floats:
     """Weighted sums of powers over each window, shape (n_windows, n_powers)."""
     return np.asarray(np.matmul(weight[:, None, :], powers)[:, 0])
 
 
-def _cubic(away: Floats, coefficients: Floats) -> Floats:
+def _cubic(powers: Floats, coefficients: Floats) -> Floats:
     """The cubic of each window at its places, shape (n_windows, n_places)."""
-    c0, c1, c2, c3 = (coefficients[:, k, None] for k in range(4))
-    return np.asarray(c0 + away * (c1 + away * (c2 + away * c3)))
+    return np.asarray((powers[..., :4] @ coefficients[..., None])[..., 0])
 
 
-def _normal_solution(sums: Floats, right: Floats) -> Floats:
-    """Coefficients, (n_windows, 4), of the normal equations with these sums of powers 0 to 6 and right sides. The
-    system is scaled to a unit diagonal, with a ridge of 1e-10, and factored as L D Lᵀ in all windows at once.
+def _normal_solution(powers: Floats, weight: Floats, right: Floats) -> Floats:
+    """Coefficients, (n_windows, 4), of weighted least squares with these right sides of the normal equations, which are
+    scaled to a unit diagonal, with a ridge of 1e-10.
     """
+    sums = _sums(powers, weight)
     scale = 1 / np.sqrt(sums[:, ::2])
-    lower, pivots = np.empty((4, 4, len(sums))), np.empty((4, len(sums)))
-    solution = (right * scale).T.copy()
-    for u in range(4):
-        for v in range(u):
-            left = sums[:, u + v] * scale[:, u] * scale[:, v]
-            for w in range(v):
-                left = left - lower[u, w] * lower[v, w] * pivots[w]
-            lower[u, v] = left / pivots[v]
-        pivots[u] = 1 + 1e-10
-        for v in range(u):
-            pivots[u] -= lower[u, v] ** 2 * pivots[v]
-            solution[u] -= lower[u, v] * solution[v]
-    solution /= pivots
-    for u in range(2, -1, -1):
-        for v in range(u + 1, 4):
-            solution[u] -= lower[v, u] * solution[v]
-    return np.asarray(solution.T * scale)
+    normal = sums[:, np.add.outer(np.arange(4), np.arange(4))] * scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.solve(normal + 1e-10 * np.eye(4), (right * scale)[..., None])[..., 0] * scale)
 
 
 # ------------------------------------------------------------------------------
