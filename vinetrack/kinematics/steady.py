@@ -225,7 +225,7 @@ def trim(
     time_s: Floats, position_m: Floats, kinematics: Kinematics, window: tuple[int, int], band: float, drift_limit: float
 ) -> tuple[int, int]:
     """Trim the ends of a steady window that deviate from its speed line. The first and last 1, 2, 4 … frames must move
-    within `band` (a fraction of the mean speed) plus `TRIM_SIGMAS` standard errors of the speed that the window's
+    within `band` (a fraction of the mean speed) plus 2.5 standard errors of the speed that the window's
     parabola has there. Returns first and last point of the trimmed window, both included. Shapes: time_s, position_m
     (n,).
     """
@@ -249,9 +249,6 @@ def trim(
     return first, last
 
 
-TRIM_SIGMAS = 2.5  # Standard errors by which an end of a window must deviate from its speed line to be trimmed
-
-
 def _points_to_trim(
     time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, band: float
 ) -> tuple[int, int]:
@@ -267,7 +264,8 @@ def _points_to_trim(
             gap_s = t[j] - t[i]
             expected = fit.speed_m_s * (1 + fit.drift * ((t[i] + t[j]) / 2 - middle) / length)
             error = noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
-            if abs((y[j] - y[i]) / gap_s - expected) > band * abs(fit.speed_m_s) + TRIM_SIGMAS * error:
+            # 2.5: standard errors by which an end must deviate from its speed line to be trimmed
+            if abs((y[j] - y[i]) / gap_s - expected) > band * abs(fit.speed_m_s) + 2.5 * error:
                 cuts[end] = max(cuts[end], (span + 1) // 2)
         span *= 2
     return cuts[0], cuts[1]
@@ -278,9 +276,6 @@ BAND = 0.5  # Half width of the band that contains every velocity, in drift limi
 SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (derived)
 
 
-# A vine counts as moving where its speed exceeds this fraction of the highest, and this many standard errors (chosen)
-START_FRACTION, START_SIGMAS = 0.2, 5.0
-
 BAND_SIGMAS = 4.0  # Standard errors by which a single velocity may lie outside the band
 
 
@@ -290,8 +285,8 @@ def gated_window(
     *,
     length_m: float = math.nan,
     drift_limit: float = 0.03,
-    start_fraction: float = START_FRACTION,
-    start_sigmas: float = START_SIGMAS,
+    start_fraction: float = 0.2,
+    start_sigmas: float = 5.0,
 ) -> Window:
     """Find the longest window in which the speed is shown to be constant within the drift limit."""
     time_s, position_m = _points(track, kinematics)
@@ -324,8 +319,8 @@ def user_window(
     *,
     length_m: float = math.nan,
     drift_limit: float = 0.03,
-    start_fraction: float = START_FRACTION,
-    start_sigmas: float = START_SIGMAS,
+    start_fraction: float = 0.2,
+    start_sigmas: float = 5.0,
 ) -> Window:
     """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady by these limits."""
     time_s, position_m = _points(track, kinematics)

@@ -201,9 +201,6 @@ def _mass_along(trial: Trial, tail_travel_m: float) -> float:
 FEWEST_POINTS = 5  # Fewest usable points of a track (derived)
 
 
-NO_WINDOW = Window("", False, "")  # its numbers are NaN
-
-
 class TrialError(ValueError):
     """A trial that cannot be analysed; the message is a sentence for its `reason`."""
 
@@ -241,6 +238,11 @@ class Steadiness:
     chosen: Window | None
     force: SteadyForce | None
 
+    @property
+    def window(self) -> Window:
+        """The chosen window, or one whose numbers are NaN."""
+        return self.chosen or Window("", False, "")
+
 
 def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMotion:
     """Find velocity, release and the windows that do not depend on a model."""
@@ -277,7 +279,7 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         steady = steadiness_under(motion, model)
     except EffectError as error:
         raise TrialError(str(error)) from error
-    track, kinematics, windows, window = motion.track, motion.kinematics, steady.windows, steady.chosen or NO_WINDOW
+    track, kinematics, windows, window = motion.track, motion.kinematics, steady.windows, steady.window
     moved_m = track.lead_position_m[track.usable]
     warnings = _warnings(track, motion.release, windows)
     notes = [*warnings, *([] if steady.chosen else [f"no steady window: {windows['gated'].reason}"])]
@@ -356,7 +358,7 @@ def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, setting
 
 def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
     """Return the row of a trial in the damping fit, with `used` and the `reason` if not."""
-    window, force = steady.chosen or NO_WINDOW, steady.force
+    window, force = steady.window, steady.force
     reason, nan = why_not_in_fit(trial) or why_not_force(force), math.nan
     return {
         "trial": trial.name,
