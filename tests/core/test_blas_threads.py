@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-import vinetrack as vt
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.diagnose import diagnose
 
 
 def threads() -> set[int]:
@@ -32,16 +30,3 @@ def test_threads_are_limited_within_a_function_only() -> None:
             asked("kept", fails=True)
         assert threads() == before
     assert asked.__name__ == "asked"
-
-
-def test_a_diagnosis_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[set[int]] = []
-
-    def noted(*_args: object, **_options: object) -> None:
-        seen.append(threads())
-        raise vt.FitError("enough")
-
-    monkeypatch.setattr("vinetrack.diagnosis.diagnose.initial_fit", noted)
-    with threadpool_limits(2, user_api="blas"), pytest.raises(vt.FitError, match="enough"):
-        diagnose([])
-    assert seen == [{1}]

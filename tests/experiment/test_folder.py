@@ -108,15 +108,23 @@ def test_a_trial_put_aside_is_listed_and_not_judged(folder: Path) -> None:
 
 
 FAULTS = {
-    **dict.fromkeys(("diameter_mm", "thickness_um", "length_mm", "yield_pressure_kPa", "track"), ("",)),
-    "trial": ("", "-rf", "--help"),
+    "diameter_mm": ("", "0.024", "abc", "nan", "-3", "301", "1e400", "24 mm"),
+    "thickness_um": ("", "0", "80000", "1_0"),
+    "length_mm": ("", "1e9", "٣"),
+    "pressure_kPa": ("24000", "-1", "28 kPa", "0x1F"),
+    "yield_pressure_kPa": ("", "3000", "-0.1"),
+    "payload_g": ("-1", "none", "1e9"),
+    "growth_angle_deg": ("181", "down", "1 2"),
+    "bends": ("1:2", "1:2:0", "a:b:c", "::"),
+    "steady": ("1", "2:1", "1:1", "a:b", "1:2:3"),
+    "trial": ("", "-rf", "v 1", "a/b", "..", "é", "x" * 200),
+    "track": ("", "../a.csv", "/a.csv", "C:/a.csv", "a/../../b.csv"),
     "video": ("a.mp4",),  # beside a track
     "use": ("perhaps",),
     "travel_ratio": ("1.5",),
     "film_density_kg_m3": ("1.2",),
     "capture_fps": ("0",),
 }
-"""Beside those that `test_sheet_properties` draws."""
 
 
 @pytest.mark.parametrize(("column", "cell"), [(column, cell) for column, cells in FAULTS.items() for cell in cells])
@@ -126,8 +134,9 @@ def test_a_broken_cell_is_named_with_file_line_trial_and_column(folder: Path, co
     experiment = read_experiment(write(folder, ",".join(row) + "\n\n" + ",".join(row.values()) + "\n"))
     (problem,) = experiment.problems
     assert (problem.severity, problem.file, problem.line) == ("error", "trials.csv", 3)
-    assert problem.trial == (row["trial"] if column != "trial" else "line-3")
+    assert problem.trial == ("a" if column != "trial" else "line-3")
     assert problem.column in (column, "track", "")
+    assert len(format_problems(experiment.problems)[0]) < 400
     assert experiment.trials == ()
     assert list(experiment.failed) == [problem.trial]
 
@@ -221,13 +230,6 @@ def test_a_blank_pressure_without_a_measured_one_fails_the_trial(folder: Path, t
     if trace:
         (folder / "p.csv").write_text(trace)
     assert list(read_experiment(write(folder, sheet)).failed) == ["a"]
-
-
-def test_replicates_share_a_condition_whatever_the_capture(folder: Path) -> None:
-    sheet = f"{HEADER},capture_fps,exposure_us,mm_per_px,steady\n"
-    sheet += "a,a.csv,24,200,280,28,3,,1000,100,0.3,0:1\nb,b.csv,24.0,2e2,280.00,28.0,3,0,500,50,0.4,\n"
-    a, b = read_experiment(write(folder, sheet)).trials
-    assert a.condition == b.condition == "24mm-200um-280mm_28kPa_0g"
 
 
 def test_the_yield_pressure_belongs_to_the_vine(folder: Path) -> None:

@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 from lsoda_vine import as_track, grown_position, vine_trial
 from vine_truth import Vine, ar1, make_track, record
@@ -14,7 +13,6 @@ from vine_truth import Vine, ar1, make_track, record
 from vinetrack.core.records import Track, Trial
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.experiment.settings import RunSettings
-from vinetrack.kinematics.damping import fit_damping
 from vinetrack.kinematics.steady import WindowMoments, gated_window, paper_window, user_window
 from vinetrack.kinematics.summary import TrialResult, summarise_trial
 from vinetrack.kinematics.velocity import estimate_kinematics
@@ -118,16 +116,6 @@ def test_a_plateau_declining_by_two_per_cent_is_accepted_and_its_drift_reported(
     assert window.n_points > 250
     assert window.drift == pytest.approx(-0.02 * window.n_points / 300, abs=1.5e-3)
     assert window.drift_95[0] < window.drift < window.drift_95[1]
-
-
-@pytest.mark.slow
-def test_drift_interval_covers_the_truth():
-    covered = 0
-    for seed in range(1000, 1100):
-        window = gated(ramp(0.01, 1e-4, seed))
-        truth = -0.01 * (window.to_s - window.from_s) / 0.299
-        covered += window.drift_95[0] <= truth * 1.0 <= window.drift_95[1]
-    assert 88 <= covered <= 100
 
 
 @pytest.mark.slow
@@ -242,16 +230,6 @@ def test_where_inertia_rules_there_is_no_window() -> None:
     window = loaded.windows.get("quasi_steady", loaded.windows["gated"])
     # The drive of 34 kPa falls so fast that the film's inertia takes more than a tenth of it.
     assert not window.accepted
-
-
-@pytest.mark.slow
-def test_a_chamber_that_empties_gives_the_law_once_its_pressure_is_known() -> None:
-    points = [analysed(vine(p), seed=1010 + i, traced=True).point for i, p in enumerate((12, 14, 16, 18, 20, 22, 24))]
-    table = pd.DataFrame([dict(point) for point in points])
-    assert table["used"].sum() >= 4
-    fit = fit_damping(table[table["used"]], resamples=200)["both_axes"]
-    assert fit["n"] == pytest.approx(N, abs=0.01)
-    assert fit["vines"]["v"]["B"] == pytest.approx(B, rel=0.01)
 
 
 # ---- the paper's literal rule against a search by brute force, and the misfires it is known for ----

@@ -49,20 +49,6 @@ def test_stated_error_holds_within_a_factor_of_two_from_four_frames_after_releas
     assert np.mean(np.abs(pull) > 3) < 0.1
 
 
-@pytest.mark.slow
-def test_free_fall_has_the_acceleration_of_gravity():
-    time_s = np.arange(300) / 1000
-    found = []
-    for seed in range(1000, 1040):
-        y = 0.5 * 9.81 * time_s**2 + ar1(300, 1e-4, 0.0, np.random.default_rng(seed))
-        kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=1)
-        np.testing.assert_array_equal(kinematics.tail_velocity_m_s, kinematics.lead_velocity_m_s)
-        found.append(kinematics.lead_acceleration_m_s2[150])
-    standard_error = np.std(found) / np.sqrt(len(found))
-    assert abs(np.mean(found) - 9.81) < 3 * standard_error
-    assert standard_error < 0.02
-
-
 def test_exact_cubic_is_returned_exactly_and_without_division_by_its_noise():
     time_s = np.arange(100) / 1000
     cubic = np.polynomial.Polynomial([0.2, 0.4, 3.0, -11.0])

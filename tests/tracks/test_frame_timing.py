@@ -61,21 +61,6 @@ def test_a_jump_of_only_the_nearest_points_is_sure_where_noise_is_far_below_it(r
     assert frames_surely_missing(out) is sure
 
 
-def test_a_stale_copy_is_flagged_and_times_stay():
-    track = stale(steady_track(), 70)
-    out = correct_frames(track)
-    assert flags(out) == {70: "duplicate"}
-    np.testing.assert_array_equal(out.time_s, track.time_s)
-
-
-def test_after_an_inserted_copy_times_go_back_by_one_frame():
-    clean = steady_track()
-    out = correct_frames(inserted(clean, 70))
-    assert flags(out) == {70: "duplicate"}
-    np.testing.assert_allclose(np.delete(out.time_s, 70), clean.time_s, atol=1e-12)
-    assert np.all(np.diff(out.time_s) > 0)
-
-
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_after_dropped_frames_times_go_on_by_as_many(count):
     clean = steady_track()
@@ -105,21 +90,19 @@ def test_a_gap_that_the_times_show_is_flagged_and_times_stay():
     np.testing.assert_array_equal(out.time_s, gapped.time_s)
 
 
-def seen_in_the_picture(track: Track, row: int) -> Track:
-    """The tracker has seen that the picture at `row` is the one before it."""
-    flag = track.flag.astype("<U80")
-    flag[row] = "duplicate"
-    return replace(track, flag=flag)
-
-
-def test_a_copy_seen_in_the_picture_changes_times_only_where_it_was_inserted():
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_copy_changes_times_only_where_it_was_inserted(seen: bool):
+    """Whether or not the tracker has seen that the picture is the one before it."""
     clean = steady_track()
-    late = correct_frames(seen_in_the_picture(inserted(clean, 70), 70))
-    assert np.delete(late.time_s, 70) == pytest.approx(clean.time_s)
-    assert flags(late) == {70: "duplicate"}
-    replaced = correct_frames(seen_in_the_picture(stale(clean, 70), 70))
-    assert replaced.time_s == pytest.approx(clean.time_s)
-    assert flags(replaced) == {70: "duplicate"}
+    for fault in (stale, inserted):
+        track = fault(clean, 70)
+        if seen:
+            track = replace(track, flag=np.where(np.arange(track.flag.size) == 70, "duplicate", track.flag))
+        out = correct_frames(track)
+        assert flags(out) == {70: "duplicate"}
+        others = np.delete(out.time_s, 70) if fault is inserted else out.time_s
+        np.testing.assert_allclose(others, clean.time_s, atol=1e-12)
+        assert np.all(np.diff(out.time_s) > 0)
 
 
 @pytest.mark.parametrize(("vine", "noise_m", "rho"), CLEAR)
@@ -186,12 +169,6 @@ def test_noise_that_grows_along_the_way_changes_no_times():
 def test_a_dropped_frame_is_found_beside_noise_that_grows_along_the_way():
     told = [flags(correct_frames(dropped(growing_noise(seed), 80))).get(80, "") for seed in range(20)]
     assert sum("retimed" in flag for flag in told) >= 18
-
-
-def test_release_is_not_a_dropped_frame():
-    time_s = np.arange(100) * FRAME_S
-    y = 0.5 * 4000 * np.maximum(time_s - time_s[50], 0) ** 2
-    assert correct_frames(make_track(time_s, y)).notes == ()
 
 
 def steps_with(long: float, number: np.ndarray | None = None):

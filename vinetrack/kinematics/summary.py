@@ -385,17 +385,6 @@ def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
 LAW_COLUMNS = ("model", "method", "vine", "n", "n_low_95", "n_high_95", "B", "B_low_95", "B_high_95", "n_trials")
 
 
-@dataclass(frozen=True)
-class DampingLaw:
-    """The damping law under one model: `points` as in `damping_points.csv`, `laws` as in `damping.json`. `left_out`
-    maps trials that cannot be analysed under the model to the reason.
-    """
-
-    points: pd.DataFrame
-    laws: Mapping[str, Any]
-    left_out: Mapping[str, str]
-
-
 def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings | None = None) -> list[TrialMotion]:
     """Find velocity, release and windows of every track; trials with too few points are skipped."""
     settings, motions = settings or RunSettings(), []
@@ -407,24 +396,25 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings 
     return motions
 
 
-def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSettings | None = None) -> DampingLaw:
-    """Find steady windows and the damping law with the pressure of a model."""
+def redo_damping(
+    model: Model, motions: Sequence[TrialMotion], settings: RunSettings | None = None
+) -> Mapping[str, Any]:
+    """Find steady windows and the damping law with the pressure of a model; laws as in `damping.json`. Trials that
+    cannot be analysed under the model are left out.
+    """
     import pandas as pd
 
     settings = settings or RunSettings()
-    rows, left_out = [], {}
+    rows, reasons = [], []
     for motion in motions:
         try:
             rows.append(damping_point(motion.trial, steadiness_under(motion, model)))
         except EffectError as error:
-            left_out[motion.trial.name] = str(error)
+            reasons.append(str(error))
     if not rows:
-        raise ValueError(
-            f"no trial can be analysed under this model: {'; '.join(left_out.values()) or 'there is none'}"
-        )
+        raise ValueError(f"no trial can be analysed under this model: {'; '.join(reasons) or 'there is none'}")
     points = mark_left_out(pd.DataFrame(rows))
-    laws = fit_laws(points, resamples=settings.damping.resamples, seed=settings.damping.seed)
-    return DampingLaw(points, laws, left_out)
+    return fit_laws(points, resamples=settings.damping.resamples, seed=settings.damping.seed)
 
 
 def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:

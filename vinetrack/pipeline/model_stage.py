@@ -325,7 +325,7 @@ def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings | None) -> p
         motions = look_at_motions(pairs, settings)
         for fit in diagnosis.fits:
             try:
-                laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings).laws
+                laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings)
             except ValueError as error:
                 log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
     return law_table(laws) if laws else empty_table(LAW_COLUMNS)
