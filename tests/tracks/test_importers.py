@@ -150,57 +150,43 @@ FRAME_MS = 4.0
 SCALE = 400.0  # px per m
 
 
+def tracker(name: str, content: object) -> str:
+    """A property of a Tracker project."""
+    return f'<property name="{name}">{content}</property>'
+
+
+def thing(kind: str, *properties: str) -> str:
+    return f'<object class="org.opensourcephysics.{kind}">{"".join(properties)}</object>'
+
+
+def system(frame: int, origin: tuple[float, float] = (50.0, 300.0), scale: float = SCALE) -> str:
+    values = {"xorigin": origin[0], "yorigin": origin[1], "angle": 0.0, "xscale": scale, "yscale": scale}
+    return tracker(f"[{frame}]", thing("FrameData", *(tracker(key, value) for key, value in values.items())))
+
+
 def project(
     marks: dict[int, tuple[float, float]],
     *,
     axes: str | None = None,
-    unit: str | None = "m",
-    clock: str = f'<property name="delta_t" type="double">{FRAME_MS}</property>',
-    more: str = "",
+    unit: str = "m",
+    clock: str = tracker("delta_t", FRAME_MS),
 ) -> str:
     """A Tracker project with one point mass; `marks` in px, image y downwards."""
-    kind = "org.opensourcephysics.cabrillo.tracker.PointMass$FrameData"
     points = "".join(
-        f'<property name="[{n}]" type="object"><object class="{kind}">'
-        f'<property name="x" type="double">{float(x)!r}</property>'
-        f'<property name="y" type="double">{float(y)!r}</property></object></property>'
+        tracker(f"[{n}]", thing("PointMass$FrameData", tracker("x", float(x)), tracker("y", float(y))))
         for n, (x, y) in marks.items()
     )
-    unit_line = "" if unit is None else f'<property name="length_unit" type="string">{unit}</property>'
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<object class="org.opensourcephysics.cabrillo.tracker.TrackerPanel">
-  <property name="description" type="string"><![CDATA[Growth <of> a vine & more]]></property>
-  <property name="videoclip" type="object"><object class="org.opensourcephysics.media.core.VideoClip">
-    <property name="startframe" type="int">2</property>
-    <property name="stepsize" type="int">1</property>
-    <property name="starttime" type="double">100.0</property>
-  </object></property>
-  <property name="clipcontrol" type="object"><object class="org.opensourcephysics.media.core.StepperClipControl">
-    {clock}
-  </object></property>
-  <property name="coords" type="object"><object class="org.opensourcephysics.media.core.ImageCoordSystem">
-    <property name="framedata" type="array">{axes if axes is not None else system(0)}</property>
-  </object></property>
-  {unit_line}
-  <property name="tracks" type="collection">
-    <property name="item" type="object"><object class="org.opensourcephysics.cabrillo.tracker.CoordAxes"/></property>
-    <property name="item" type="object"><object class="org.opensourcephysics.cabrillo.tracker.PointMass">
-      <property name="name" type="string">tip</property>
-      <property name="framedata" type="array">{points}</property>
-    </object></property>
-    {more}
-  </property>
-</object>
-"""
-
-
-def system(
-    frame: int, origin: tuple[float, float] = (50.0, 300.0), angle_deg: float = 0.0, scale: float | tuple = SCALE
-) -> str:
-    xscale, yscale = scale if isinstance(scale, tuple) else (scale, scale)
-    values = {"xorigin": origin[0], "yorigin": origin[1], "angle": angle_deg, "xscale": xscale, "yscale": yscale}
-    cells = "".join(f'<property name="{key}" type="double">{value}</property>' for key, value in values.items())
-    return f'<property name="[{frame}]" type="object"><object class="FrameData">{cells}</object></property>'
+    tip = thing("cabrillo.tracker.PointMass", tracker("name", "tip"), tracker("framedata", points))
+    coordinates = thing("media.core.ImageCoordSystem", tracker("framedata", system(0) if axes is None else axes))
+    return '<?xml version="1.0" encoding="UTF-8"?>' + thing(
+        "cabrillo.tracker.TrackerPanel",
+        tracker("description", "<![CDATA[Growth <of> a vine & more]]>"),
+        tracker("videoclip", thing("media.core.VideoClip", tracker("startframe", 2), tracker("starttime", 100.0))),
+        tracker("clipcontrol", thing("media.core.StepperClipControl", clock)),
+        tracker("coords", coordinates),
+        tracker("length_unit", unit),
+        tracker("tracks", tracker("item", thing("cabrillo.tracker.CoordAxes")) + tracker("item", tip)),
+    )
 
 
 FRAMES = [2, 3, 4, 6, 7, 9]

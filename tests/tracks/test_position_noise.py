@@ -16,18 +16,17 @@ from vinetrack.tracks.position_noise import (
     common_rounding_noise,
     find_outliers,
     noise_shape,
+    position_noise,
     reject_outliers,
     rest_points,
-    robust_position_noise,
     rounding_noise,
-    track_noise,
 )
 
 FRAMES = np.arange(300) / 1069
 
 
 def median_estimate(positions: list[np.ndarray]) -> tuple[float, float]:
-    found = np.array([track_noise(make_track(np.arange(y.size) / 1069, y)) for y in positions])
+    found = np.array([position_noise(np.arange(y.size) / 1069, y) for y in positions])
     return float(np.median(found[:, 0])), float(np.median(found[:, 1]))
 
 
@@ -53,7 +52,7 @@ def test_release_does_not_pass_for_noise(vine):
     found = []
     for seed in range(1000, 1030):
         trial = record(vine, np.random.default_rng(seed), noise_m=5e-5, rest_frames=60, end_frames=20)
-        found.append(track_noise(trial.track)[0])
+        found.append(position_noise(trial.track.time_s, trial.track.lead_position_m)[0])
     assert np.median(found) == pytest.approx(5e-5, rel=0.1)
 
 
@@ -61,7 +60,7 @@ def test_release_does_not_pass_for_noise(vine):
 def test_rounding_to_whole_pixels_is_noise_even_at_rest(speed_m_s):
     pixel = 4e-4
     y = np.where(FRAMES > 0.2, speed_m_s * (FRAMES - 0.2), 0.0)
-    noise_m, _ = track_noise(make_track(FRAMES, np.round(y / pixel) * pixel))
+    noise_m, _ = position_noise(FRAMES, np.round(y / pixel) * pixel)
     assert noise_m == pytest.approx(pixel / np.sqrt(12), rel=0.35)
 
 
@@ -95,7 +94,7 @@ def test_rounding_that_few_tracks_share_is_not_that_of_all():
 def test_noise_of_rounded_positions_is_not_kept_below_rounding():
     """Most points are at rest: the median third difference is zero, and hides that the others are rounded."""
     y = np.concatenate([np.full(200, 0.01), rounded(1)])
-    assert robust_position_noise(np.arange(y.size) / 267, y)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)
+    assert position_noise(np.arange(y.size) / 267, y, robust=True)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)
 
 
 # ---- noise of known size and shape on known motions ----

@@ -49,7 +49,8 @@ class Problem:
         >>> Problem(message="is not a number", column="pressure_kPa", value="12 kPa", remedy="write 12").reason
         "pressure_kPa '12 kPa' is not a number: write 12"
         """
-        shown = "" if self.value is None or self.value == "" else repr(_shorten(self.value))
+        value = self.value or ""
+        shown = repr(value if len(value) <= 60 else f"{value[:59]}…") if value else ""
         subject = " ".join(part for part in (self.column, shown, self.message) if part)
         allowed = f" (allowed: {self.allowed})" if self.allowed else ""
         return _one_line(f"{subject}{allowed}{': ' + self.remedy if self.remedy else ''}")
@@ -118,11 +119,6 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         return f"the closest names are {', '.join(nearest)}; vinetrack settings lists all"
     others = f" (or {', '.join(nearest[1:])})" if len(nearest) > 1 else ""
     return f"did you mean {nearest[0]}?{others}"
-
-
-def _shorten(text: str) -> str:
-    max_quoted_length = 60  # Longest quotation of a value in a message (chosen)
-    return text if len(text) <= max_quoted_length else text[: max_quoted_length - 1] + "…"
 
 
 def _one_line(text: str) -> str:

@@ -158,8 +158,7 @@ def join_flags(*flags: str) -> str:
 
 def split_flags(flag: str) -> list[str]:
     """Split the flags of one point."""
-    # "gap;corrected": former spelling of `gap;retimed`, read for one more release
-    return [part for part in flag.replace("gap;corrected", "gap;retimed").split(";") if part]
+    return [part for part in flag.split(";") if part]
 
 
 def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:

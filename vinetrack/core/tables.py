@@ -287,23 +287,19 @@ def _find_delimiter(header: str) -> str:
 
 def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
     """Split the text into records of stripped cells, each with the number of the line on which it starts."""
-    try:
-        return _split_records(text, delimiter, strict=True)
-    except csv.Error as error:
-        if "end of data" in str(error):
-            raise TableError("has a quotation mark that is never closed", "remove it") from None
-    try:
-        return _split_records(text, delimiter, strict=False)
-    except csv.Error as error:
-        raise TableError(f"is not a table ({error})", "save it as CSV") from None
-
-
-def _split_records(text: str, delimiter: str, strict: bool) -> list[tuple[int, list[str]]]:
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=strict)
-    records, start = [], 1
-    for cells in reader:
-        records.append((start, [cell.strip() for cell in cells]))
-        start = reader.line_num + 1
+    for strict in (True, False):
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=strict)
+        records, start = [], 1
+        try:
+            for cells in reader:
+                records.append((start, [cell.strip() for cell in cells]))
+                start = reader.line_num + 1
+            break
+        except csv.Error as error:
+            if "end of data" in str(error):
+                raise TableError("has a quotation mark that is never closed", "remove it") from None
+            if not strict:
+                raise TableError(f"is not a table ({error})", "save it as CSV") from None
     return records
 
 

@@ -12,7 +12,7 @@ stated one and takes the speed with it (Berkson error). York's estimator then gi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -434,10 +434,9 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
     """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope. Returns
     `slope, slope_95, intercept, intercept_95, R2, p, n`. Shapes: x, y (n,).
     """
-    from scipy.stats import linregress, t
+    from scipy.stats import linregress
 
-    line = linregress(x, y)
-    quantile = float(t.ppf(0.975, x.size - 2))
+    line, quantile = linregress(x, y), _student(x.size - 2)
     return {
         "slope": float(line.slope),
         "slope_95": [float(line.slope - quantile * line.stderr), float(line.slope + quantile * line.stderr)],
@@ -555,44 +554,30 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     known = np.isfinite(values) & (values > 0)
     varying = {name: np.log(size[known]) for name, size in sizes.items() if np.unique(size[known]).size > 1}
     n, dof = int(known.sum()), int(known.sum()) - len(varying) - 1
-    if not varying or dof < 1:
-        return {"refused": _too_few(n, list(varying)), "n": n, "R2": None}
     matrix = np.column_stack([np.ones(n), *varying.values()])
-    if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
-        return {
-            "refused": f"{' and '.join(SIZES[name] for name in varying)} vary together: neither power is identifiable",
-            "n": n,
-            "R2": None,
-        }
+    refused = None
+    if n == 0:
+        refused = "no condition has such a value above 0"
+    elif not varying:
+        refused = "all vines are of one size"
+    elif dof < 1:
+        powers = " and ".join(SIZES[name] for name in varying)
+        refused = f"{n} conditions are too few for powers of {powers} with errors: it takes {len(varying) + 2}"
+    elif np.linalg.matrix_rank(matrix) < matrix.shape[1]:
+        refused = f"{' and '.join(SIZES[name] for name in varying)} vary together: neither power is identifiable"
+    if refused:
+        return {"refused": refused, "n": n, "R2": None}
     y = np.log(values[known])
     coefficients = np.linalg.lstsq(matrix, y, rcond=None)[0]
     residual = y - matrix @ coefficients
     errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(residual @ residual) / dof)
-    quantile = float(t.ppf(0.975, dof))
-    total = float(np.sum((y - y.mean()) ** 2))
-    return {
-        **{name: _power(coefficients[i + 1], errors[i + 1], quantile, dof) for i, name in enumerate(varying)},
-        "R2": 1 - float(residual @ residual) / total if total > 0 else math.nan,
-        "n": n,
-        "refused": None,
+    half_widths = _student(dof) * errors
+    powers_of = {
+        name: {
+            "power": float(coefficients[i]),
+            "power_95": [float(coefficients[i] - half_widths[i]), float(coefficients[i] + half_widths[i])],
+            "p": 2 * float(t.sf(abs(coefficients[i]) / errors[i], dof)) if errors[i] > 0 else 0.0,
+        }
+        for i, name in enumerate(varying, start=1)
     }
-
-
-def _too_few(n: int, varying: Sequence[str]) -> str:
-    if n == 0:
-        return "no condition has such a value above 0"
-    if not varying:
-        return "all vines are of one size"
-    powers = "a power of " + " and one of ".join(SIZES[name] for name in varying)
-    return f"{n} conditions; {powers} with an error take{'s' if len(varying) == 1 else ''} {len(varying) + 2}"
-
-
-def _power(value: float, error: float, quantile: float, dof: int) -> dict[str, float | Sequence[float]]:
-    from scipy.stats import t
-
-    p = 2 * float(t.sf(abs(value) / error, dof)) if error > 0 else 0.0
-    return {
-        "power": float(value),
-        "power_95": [float(value - quantile * error), float(value + quantile * error)],
-        "p": p,
-    }
+    return {**powers_of, "R2": _r_squared(y, residual), "n": n, "refused": None}

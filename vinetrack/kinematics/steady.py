@@ -107,32 +107,19 @@ class RangeExtremes:
         return np.maximum(self.table[level, first], self.table[level, last - (1 << level) + 1])
 
 
-def chord_bounds(time_s: Floats, position_m: Floats, noise_m: float, rho: float, sigmas: float) -> list[Bounds]:
-    """Return functions for the highest lower and lowest upper limit of chord speeds in a window, by length of chord.
-    Chords span 1, 2, 4 … frames of the raw positions; the speed of one has the error σ√(2(1 − ρ^k))/Δt. Nothing is
-    smoothed, so a window may extend right up to the start-up or the end of growth without being affected by them.
-    Shapes: time_s, position_m (n,).
+def speed_bounds(low: Floats, high: Floats, span: int) -> Bounds:
+    """Return a function for the highest lower and the lowest upper limit of the speeds in a window. Each speed takes
+    `span` frames from its point on. Shapes: low, high (n − span,).
     """
-    bounds: list[Bounds] = []
-    span = 1
-    while span <= max(1, (time_s.size - 1) // 2):
-        gap_s = time_s[span:] - time_s[:-span]
-        speed = (position_m[span:] - position_m[:-span]) / gap_s
-        error = sigmas * noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
-        bounds.append(_bounds_of(RangeExtremes(speed - error), RangeExtremes(-(speed + error)), span))
-        span *= 2
-    return bounds
+    highest_low, lowest_high = RangeExtremes(low), RangeExtremes(-high)
 
-
-def _bounds_of(low: RangeExtremes, high: RangeExtremes, span: int) -> Bounds:
     def bounds(first: Indices, last: Indices) -> tuple[Floats, Floats]:
         fits = last - first >= span
-        stop = np.where(fits, last - span, first)
-        stop = np.minimum(stop, low.table.shape[1] - 1)
+        stop = np.minimum(np.where(fits, last - span, first), low.size - 1)
         start = np.minimum(first, stop)
         return (
-            np.where(fits, low.maximum(start, stop), -np.inf),
-            np.where(fits, -high.maximum(start, stop), np.inf),
+            np.where(fits, highest_low.maximum(start, stop), -np.inf),
+            np.where(fits, -lowest_high.maximum(start, stop), np.inf),
         )
 
     return bounds
@@ -230,45 +217,29 @@ def trim(
     (n,).
     """
     first, last = window
+    noise_m, rho = kinematics.noise_m, kinematics.noise_correlation
+    fit = fit_window(time_s[first : last + 1], position_m[first : last + 1], noise_m, rho)
     while last - first >= 4:
-        move_first, move_last = _points_to_trim(time_s, position_m, kinematics, first, last, band)
-        if not (move_first or move_last):
+        t, y = time_s[first : last + 1], position_m[first : last + 1]
+        middle, length = (t[0] + t[-1]) / 2, t[-1] - t[0]
+        cuts, span = [0, 0], 1
+        while span <= max(1, (t.size - 1) // 4):
+            for end, (i, j) in enumerate(((0, span), (t.size - 1 - span, t.size - 1))):
+                gap_s = t[j] - t[i]
+                expected = fit.speed_m_s * (1 + fit.drift * ((t[i] + t[j]) / 2 - middle) / length)
+                error = noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
+                # 2.5: standard errors by which an end must deviate from its speed line to be trimmed
+                if abs((y[j] - y[i]) / gap_s - expected) > band * abs(fit.speed_m_s) + 2.5 * error:
+                    cuts[end] = max(cuts[end], (span + 1) // 2)
+            span *= 2
+        shorter = slice(first + cuts[0], last - cuts[1] + 1)
+        if cuts == [0, 0] or shorter.stop - shorter.start < 4:
             break
-        first_now, last_now = first + move_first, last - move_last
-        if last_now - first_now < 3:
-            break
-        fit = fit_window(
-            time_s[first_now : last_now + 1],
-            position_m[first_now : last_now + 1],
-            kinematics.noise_m,
-            kinematics.noise_correlation,
-        )
+        fit = fit_window(time_s[shorter], position_m[shorter], noise_m, rho)
         if max(abs(bound) for bound in fit.drift_95) > drift_limit:
             break
-        first, last = first_now, last_now
+        first, last = shorter.start, shorter.stop - 1
     return first, last
-
-
-def _points_to_trim(
-    time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, band: float
-) -> tuple[int, int]:
-    """Number of points to trim from the beginning and the end: none where the ends follow the parabola."""
-    t, y = time_s[first : last + 1], position_m[first : last + 1]
-    noise_m, rho = kinematics.noise_m, kinematics.noise_correlation
-    fit = fit_window(t, y, noise_m, rho)
-    middle, length = (t[0] + t[-1]) / 2, t[-1] - t[0]
-    cuts = [0, 0]
-    span = 1
-    while span <= max(1, (t.size - 1) // 4):
-        for end, (i, j) in enumerate(((0, span), (t.size - 1 - span, t.size - 1))):
-            gap_s = t[j] - t[i]
-            expected = fit.speed_m_s * (1 + fit.drift * ((t[i] + t[j]) / 2 - middle) / length)
-            error = noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
-            # 2.5: standard errors by which an end must deviate from its speed line to be trimmed
-            if abs((y[j] - y[i]) / gap_s - expected) > band * abs(fit.speed_m_s) + 2.5 * error:
-                cuts[end] = max(cuts[end], (span + 1) // 2)
-        span *= 2
-    return cuts[0], cuts[1]
 
 
 BAND = 0.5  # Half width of the band that contains every velocity, in drift limits (derived)
@@ -294,9 +265,8 @@ def gated_window(
     if why:
         return Window("gated", False, why)
     inside = slice(first, last + 1)
-    search = _Search(time_s[inside], position_m[inside], kinematics, inside, drift_limit)
-    search.latest = _before_the_end(track, position_m, first, last, length_m) - first
-    steady, nearest = search.longest()
+    latest = _before_the_end(track, position_m, first, last, length_m) - first
+    steady, nearest = _Search(time_s[inside], position_m[inside], kinematics, inside, latest, drift_limit).longest()
     if steady is None:
         return Window("gated", False, nearest)
     untrimmed = (first + steady[0], first + steady[1])
@@ -387,18 +357,23 @@ class _Search:
     """Search over all windows between two points, each evaluated in constant time from cumulative sums."""
 
     def __init__(
-        self, time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, drift_limit: float
+        self, time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, latest: int, drift_limit: float
     ) -> None:
-        self.n = time_s.size
-        self.latest = self.n - 1  #: the last point that a window may contain
-        self.limit = drift_limit
-        self.moments = WindowMoments(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation)
-        self.width = kinematics.window_points[inside]
-        self.velocity, sigma = kinematics.lead_velocity_m_s[inside], kinematics.lead_velocity_sigma_m_s[inside]
-        velocity = self.velocity
-        self.smooth_low = RangeExtremes(velocity - BAND_SIGMAS * sigma)
-        self.smooth_high = RangeExtremes(-(velocity + BAND_SIGMAS * sigma))
-        self.chords = chord_bounds(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation, BAND_SIGMAS)
+        self.n, self.latest, self.limit = time_s.size, latest, drift_limit  #: no window contains points after `latest`
+        noise_m, rho = kinematics.noise_m, kinematics.noise_correlation
+        self.moments = WindowMoments(time_s, position_m, noise_m, rho)
+        self.width, self.velocity = kinematics.window_points[inside], kinematics.lead_velocity_m_s[inside]
+        allowance = BAND_SIGMAS * kinematics.lead_velocity_sigma_m_s[inside]
+        self.bounds = [speed_bounds(self.velocity - allowance, self.velocity + allowance, 0)]
+        # Chords of the raw positions over 1, 2, 4 … frames. Nothing is smoothed in them, so a window may extend right
+        # up to the start-up or the end of growth without being affected by those.
+        span = 1
+        while span <= max(1, (self.n - 1) // 2):
+            gap_s = time_s[span:] - time_s[:-span]
+            speed = (position_m[span:] - position_m[:-span]) / gap_s
+            error = BAND_SIGMAS * noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
+            self.bounds.append(speed_bounds(speed - error, speed + error, span))
+            span *= 2
 
     def longest(self) -> tuple[tuple[int, int] | None, str]:
         """First and last point of the longest steady window, or the reason why there is none."""
@@ -431,7 +406,7 @@ class _Search:
         # 0.02, 1 / 3: shortest window where the speed falls by more than a third of the limit (chosen)
         share = np.where(drift < -(1 / 3) * self.limit, 0.02, SHORTEST_SHARE)
         steady = (mean > 0) & (worst <= self.limit) & (points >= share * self.n)
-        for bounds in (self._smooth, *self.chords):
+        for bounds in self.bounds:
             index = np.flatnonzero(steady)
             if index.size == 0:
                 break
@@ -443,9 +418,6 @@ class _Search:
         index = np.flatnonzero(steady)
         winner = index[np.lexsort((worst[index], -points[index]))[0]]
         return (int(first[winner]), int(last[winner])), ""
-
-    def _smooth(self, first: NDArray[np.int_], last: NDArray[np.int_]) -> tuple[Floats, Floats]:
-        return self.smooth_low.maximum(first, last), -self.smooth_high.maximum(first, last)
 
     def _nearest(
         self, first: NDArray[np.int_], last: NDArray[np.int_], mean: Floats, drift: Floats, sigma: Floats

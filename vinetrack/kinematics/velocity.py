@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from vinetrack.core.records import Bools, Floats, Indices, Kinematics, Track
-from vinetrack.tracks.position_noise import track_noise
+from vinetrack.tracks.position_noise import position_noise
 
 # ------------------------------------------------------------------------------
 # Local polynomials fitted to all windows of one width along a track at once.
@@ -61,7 +61,7 @@ class WindowFits:
         (n,).
         """
         n, m = time_s.size, self.coefficients.shape[1]
-        offset = _window_offset(self.width, side)
+        offset = round((1 + side) / 2 * (self.width - 1))
         window = np.clip(np.arange(n) - offset, 0, m - 1)
         velocity, gain = np.empty(n), np.empty(n)
         u = 2 * offset / (self.width - 1) - 1
@@ -75,11 +75,6 @@ class WindowFits:
         values, gain[points] = self.at(time_s[points], window[points])
         velocity[points] = values[1]
         return window, velocity, gain
-
-
-def _window_offset(width: int, side: float) -> int:
-    """Number of points of a window before the one at `side`."""
-    return round((1 + side) / 2 * (width - 1))
 
 
 def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, rho: float) -> WindowFits:
@@ -182,7 +177,7 @@ def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, ka
         raise ValueError(f"the track has {time_s.size} usable points; a velocity needs at least 2")
     if np.any(np.diff(time_s) <= 0):
         raise ValueError("the times of the track do not increase; sort its rows or drop repeated ones")
-    noise_m, rho = track_noise(track)
+    noise_m, rho = position_noise(time_s, position_m)
     origin_m = float(position_m[0])
     values, sigma, widths = smooth(time_s, position_m - origin_m, noise_m, rho, order=order, kappa=kappa)
     return Kinematics(
@@ -214,7 +209,11 @@ def smooth(
     fits_points = [fit.misfit <= noise_m**2 * MISFIT_LIMITS[fit.misfit_terms] for fit in fits]
     centred = [fit.velocities(time_s, 0.0) for fit in fits]
     low, high, centred_error = _agreement(centred, fits_points, noise_m, kappa)
-    best, window_used, sigma = _narrowest(fits[0], centred[0], fits_points[0], noise_m)
+    # The narrowest window is used where no wider one is; its error is that of the noise, or of its misfit if larger.
+    window_used, _, gain = centred[0]
+    window_used, good = window_used.copy(), fits_points[0][window_used]
+    sigma = np.where(good, noise_m, np.maximum(noise_m, KINK_GAIN * np.sqrt(fits[0].misfit[window_used]))) * gain
+    best = np.where(good, sigma, np.inf)
     fit_used = np.zeros(n, dtype=int)
     for side in SIDES:
         wider_agrees = np.full(n, len(fits) == 1)
@@ -233,14 +232,6 @@ def smooth(
         values[:, points] = fit.at(time_s[points], window_used[points])[0]
     # 0.5: least standard error of a one-sided window, relative to that of the centred ones (chosen)
     return values, np.maximum(sigma, 0.5 * centred_error), np.array(widths)[fit_used]
-
-
-def _narrowest(fit: WindowFits, centred: Centred, fits_points: Bools, noise_m: float) -> tuple[Floats, Indices, Floats]:
-    """The narrowest window, used where no wider one is; its error is that of the noise, or of its misfit if larger."""
-    window, _, gain = centred
-    good = fits_points[window]
-    sigma = np.where(good, noise_m, np.maximum(noise_m, KINK_GAIN * np.sqrt(fit.misfit[window]))) * gain
-    return np.where(good, sigma, np.inf), window.copy(), sigma
 
 
 def _agreement(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, join_flags, with_flag
-from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, reject_outliers, robust_position_noise
+from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
 
 # Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
 CLEAR_STEP_SIGMAS = 8.0
@@ -107,7 +107,7 @@ def _noise(track: Track) -> tuple[Floats, float]:
     """
     usable = track.usable
     y = track.lead_position_m[usable]
-    whole_m, rho = robust_position_noise(track.time_s[usable], y)
+    whole_m, rho = position_noise(track.time_s[usable], y, robust=True)
     noise_m = np.full(usable.size, whole_m)
     if y.size > 2 * WIDE_SIDE_POINTS:
         around_m = local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE_SD, WIDE_SIDE_POINTS)

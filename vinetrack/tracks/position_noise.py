@@ -164,23 +164,16 @@ SHORTEST_MOTION = 12  # Points in motion below which the whole track is used (ch
 
 THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences of white noise of unit variance
 
-# Factor by which the median third difference may underestimate correlated noise (derived)
-THIRD_DIFFERENCE_ALLOWANCE = 1.84
 
-
-def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
-    """Estimate the standard deviation and lag-one correlation of the random error of single positions. Returns noise_m
-    (standard deviation, m. 0 where the positions are exact or fewer than 5), correlation (lag-one correlation, 0 to
-    0.95; shrunk to 0 where the track is short). Shapes: time_s, position_m (n,).
+def position_noise(time_s: Floats, position_m: Floats, *, robust: bool = False) -> tuple[float, float]:
+    """Estimate the standard deviation and lag-one correlation of the random error of single positions. `robust`: so
+    that a fault in a short track does not pass for noise, at most 1.84 times what the median third difference says,
+    which a single fault hardly changes; of positions that are rounded, and mostly at rest, it carries no information.
+    Returns noise_m (0 where the positions are exact or fewer than 5), correlation (0 to 0.95; shrunk to 0 where the
+    track is short). Shapes: time_s, position_m (n,).
     """
-    noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
-    return (rounding_m, 0.0) if noise_m < rounding_m else (noise_m, correlation)
-
-
-def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, float, float]:
-    """Noise and its correlation as if nothing were rounded, and the error of rounding."""
     if position_m.size < 5:
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0
     groups = []
     n_rest = _frames_at_rest(position_m)
     if n_rest:
@@ -197,18 +190,12 @@ def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, floa
     if correlation > 0.85:
         short = [_stretches(time_s, position_m, 7, MOVING_ORDER)]
         noise_m, correlation = min((noise_m, correlation), _restricted_likelihood(short))
-    return noise_m, correlation, rounding_noise(position_m)
-
-
-def robust_position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
-    """Estimate `position_noise`, bounded so that a fault in a short track does not pass for noise. The bound is the
-    median third difference, which a single fault hardly changes, times THIRD_DIFFERENCE_ALLOWANCE; of positions that
-    are rounded, and mostly at rest, it carries no information. Returns noise_m, correlation. Shapes: time_s, position_m
-    (n,).
-    """
-    noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
+    rounding_m = rounding_noise(position_m)
     correlation = 0.0 if noise_m < rounding_m else correlation
-    return max(min(noise_m, THIRD_DIFFERENCE_ALLOWANCE * rough_noise(position_m)), rounding_m), correlation
+    if robust:
+        # 1.84: factor by which the median third difference may underestimate correlated noise (derived)
+        noise_m = min(noise_m, 1.84 * rough_noise(position_m))
+    return max(noise_m, rounding_m), correlation
 
 
 def _frames_at_rest(position_m: Floats) -> int:
@@ -351,7 +338,9 @@ def _restricted_likelihood(groups: list[tuple[Floats, Floats]]) -> tuple[float, 
     used = np.ones(dof.size, dtype=bool)
     best = 0
     for _ in range(6):
-        variance = np.median(rss[best] / _chi2_median(dof)) if used.all() else rss[best, used].sum() / dof[used].sum()
+        # The median of χ² by Wilson and Hilferty.
+        chi2_median = dof * (1 - 2 / (9 * dof)) ** 3
+        variance = np.median(rss[best] / chi2_median) if used.all() else rss[best, used].sum() / dof[used].sum()
         following = rss[best] <= variance * (dof + 4 * np.sqrt(2 * dof) + 3)
         used = following if following.any() else used
         pooled, n = rss[:, used].sum(axis=1), float(dof[used].sum())
@@ -363,11 +352,6 @@ def _restricted_likelihood(groups: list[tuple[Floats, Floats]]) -> tuple[float, 
     rho = _parabola_vertex(RHO_GRID, score, best)
     innovation = math.exp(np.interp(rho, RHO_GRID, np.log(pooled / n)))
     return math.sqrt(innovation / (1 - rho**2)), rho
-
-
-def _chi2_median(dof: Floats) -> Floats:
-    """Median of χ² (Wilson and Hilferty)."""
-    return dof * (1 - 2 / (9 * dof)) ** 3
 
 
 def _whitened_residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
@@ -389,15 +373,6 @@ def _parabola_vertex(x: Floats, score: Floats, best: int) -> float:
         return float(x[best])
     left, middle, right = score[best - 1 : best + 2]
     return float(x[best] + 0.5 * (x[1] - x[0]) * (left - right) / (left - 2 * middle + right))
-
-
-def track_noise(track: Track) -> tuple[float, float]:
-    """Estimate the noise of a track's usable points; see `position_noise`. Returns noise_m (standard deviation, m. 0
-    where the positions are exact or fewer than 5), correlation (lag-one correlation, 0 to 0.95; shrunk to 0 where the
-    track is short).
-    """
-    usable = track.usable
-    return position_noise(track.time_s[usable], track.lead_position_m[usable])
 
 
 def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
@@ -568,7 +543,7 @@ def _places(track: Track, outlying: NDArray[np.int_]) -> list[str]:
 
 def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> NDArray[np.bool_]:
     """Points beyond the limit whose neighbours follow one cubic without them."""
-    noise_m, _ = robust_position_noise(time_s, position_m)
+    noise_m, _ = position_noise(time_s, position_m, robust=True)
     fit = local_fit(time_s, position_m, noise_m)
     sigma_m = np.maximum(np.maximum(local_noise(np.abs(fit.residual_m) / fit.gain), noise_m), fit.spread_m)
     distance_m = np.abs(fit.residual_m)
@@ -681,7 +656,7 @@ def ar1_difference_gain(rho: float) -> float:
 
 def _differences(time_s: Floats, position_m: Floats) -> _Differences:
     """Fourth differences of a trial, winsorised, without those over uneven spacings or at corners of the motion."""
-    noise_m, _ = robust_position_noise(time_s, position_m)
+    noise_m, _ = position_noise(time_s, position_m, robust=True)
     fit = local_fit(time_s, position_m, noise_m)
     distance_m = np.zeros(time_s.size)
     distance_m[2:-2] = np.abs(np.convolve(position_m, FOURTH_DIFFERENCE, "valid")) / np.linalg.norm(FOURTH_DIFFERENCE)
