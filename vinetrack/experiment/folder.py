@@ -307,10 +307,7 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
         except TableError as error:
             place: dict[str, Any] = {"line": line, "trial": row["trial"], "column": column, "value": row[column]}
             problems.append(Problem.from_error(error, CORRECTIONS_FILE, **place))
-    sorted_by_frame = {
-        name: tuple(by_frame[frame] for frame in sorted(by_frame)) for name, by_frame in by_trial.items()
-    }
-    return sorted_by_frame, problems
+    return {name: tuple(by_frame[frame] for frame in sorted(by_frame)) for name, by_frame in by_trial.items()}, problems
 
 
 def _unmatched(corrections: Corrections, rows: list[Row]) -> Iterator[Problem]:

@@ -60,21 +60,10 @@ class WindowFits:
         of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,). Shapes: time_s
         (n,).
         """
-        n, m = time_s.size, self.coefficients.shape[1]
         offset = round((1 + side) / 2 * (self.width - 1))
-        window = np.clip(np.arange(n) - offset, 0, m - 1)
-        velocity, gain = np.empty(n), np.empty(n)
-        u = 2 * offset / (self.width - 1) - 1
-        slope = _rows(np.array([u]), self.coefficients.shape[0])[1][:, 0]
-        regular = slice(offset, offset + m)
-        velocity[regular] = slope @ self.coefficients / self.half_s
-        gain[regular] = max(float(slope @ self.even_covariance @ slope), 0.0) ** 0.5 / self.half_s
-        irregular = np.ones(n, dtype=bool)
-        irregular[regular] = self.odd
-        points = np.flatnonzero(irregular)
-        values, gain[points] = self.at(time_s[points], window[points])
-        velocity[points] = values[1]
-        return window, velocity, gain
+        window = np.clip(np.arange(time_s.size) - offset, 0, self.coefficients.shape[1] - 1)
+        values, gain = self.at(time_s, window)
+        return window, values[1], gain
 
 
 def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, rho: float) -> WindowFits:

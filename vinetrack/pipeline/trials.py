@@ -291,7 +291,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
     of an unexpected exception (blank if there was none).
     """
     from vinetrack.kinematics.summary import TrialError, summarise_trial
-    from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
+    from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
     from vinetrack.video.frames import RecordingError
 
     reason, fault, kept = experiment.failed.get(name, ""), "", Kept(results.folder)
@@ -312,8 +312,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
             contradictions = _contradictions(trial, measurement)
             track = measurement.tracking.track
             track = replace(track, notes=(*track.notes, *(problem.reason for problem in contradictions)))
-            if trial.pressure_trace is not None:
-                track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+            track = with_pressure_trace(trial, track)
             columns = {
                 "mm_per_px": 1e3 * measurement.m_per_px,
                 "scale_rel_sigma": measurement.scale_rel_sigma,

@@ -252,7 +252,7 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     """Make a track of `tracks/<trial>.csv`, with the measured pressure. The results do not contain the pressure: it is
     read from the user's track or pressure trace.
     """
-    from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
+    from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
 
     systematic_m = table["lead_position_systematic_m"].to_numpy(dtype=float)
     track = Track(
@@ -265,7 +265,7 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     )
     try:
         if trial.pressure_trace is not None:
-            return attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+            return with_pressure_trace(trial, track)
         source_track = load_track(trial) if trial.track is not None else None
     except TrackError as error:
         raise ResultsError(f"trial {trial.name}: {error}; then run snakemake again") from None

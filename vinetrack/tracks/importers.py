@@ -486,7 +486,11 @@ def load_track(trial: Trial) -> Track:
     if trial.track is None:
         raise TrackError("is blank", "this trial has a video, not a track")
     track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
-    track = flag_end_of_motion(trial, track)
+    return with_pressure_trace(trial, flag_end_of_motion(trial, track))
+
+
+def with_pressure_trace(trial: Trial, track: Track) -> Track:
+    """Return a track of a trial with its `pressure_trace`, if it has one."""
     if trial.pressure_trace is None:
         return track
     try:
