@@ -175,12 +175,6 @@ def read_range(column: Column, value: Any) -> tuple[float, float]:
     return low, high
 
 
-def interior_values(low: float, high: float) -> list[float]:
-    """Return three values between two others, in geometric steps where `low` is positive, else in equal steps."""
-    parts = (0.25, 0.5, 0.75)
-    return [low ** (1 - part) * high**part if low > 0 else low + (high - low) * part for part in parts]
-
-
 def read_limit(column: Column, value: Any) -> float:
     """Read one number of `limits`, checked like a cell of the column."""
     if isinstance(value, bool | list | tuple | dict):

@@ -16,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import (
     BaseModel,
     BeforeValidator,
@@ -37,7 +38,6 @@ from vinetrack.experiment.schema import (
     SHARED,
     SMALLEST_POINT_SPACING_PX,
     CellError,
-    interior_values,
     read_limit,
     read_range,
     read_value,
@@ -190,7 +190,8 @@ class Limits(_LimitedColumns):
         column = COLUMNS[info.field_name]
         if isinstance(value, str) and ":" in value:
             low, high = read_range(column, value)
-            return tuple(sorted({low, *(float(f"{step:.3g}") for step in interior_values(low, high)), high}))
+            steps = np.geomspace(low, high, 5) if low > 0 else np.linspace(low, high, 5)
+            return tuple(sorted({low, *(float(f"{step:.3g}") for step in steps[1:-1]), high}))
         if isinstance(value, list | tuple):
             if not value:
                 raise CellError("is empty", "name at least one value, or remove the key", code="empty")

@@ -489,9 +489,13 @@ def _speed_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
         "pressure_kPa": SAME_SETTING_WITHIN,
         "growth_angle_deg": SAME_SETTING_WITHIN,
     }
-    groups = [group.sort_values("diameter_mm") for group in alike(bare, settings)]
-    families = [_speed_family(group) for group in groups if np.unique(group["diameter_mm"]).size > 1]
-    return sorted(families, key=lambda family: -len(family["sizes"]))
+    return [_speed_family(group) for group in _of_several_sizes(bare, settings, ["diameter_mm"])]
+
+
+def _of_several_sizes(table: pd.DataFrame, within: Mapping[str, float], sizes: list[str]) -> list[pd.DataFrame]:
+    """Groups of rows that are alike but for their sizes, in the order of size; the largest group first."""
+    groups = [group.sort_values(sizes) for group in alike(table, within)]
+    return sorted((group for group in groups if len(group[sizes].drop_duplicates()) > 1), key=lambda group: -len(group))
 
 
 def _speed_family(group: pd.DataFrame) -> dict[str, Any]:
@@ -522,10 +526,8 @@ def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
         "efficiency_at_mm": 0.0,
         "growth_angle_deg": SAME_SETTING_WITHIN,
     }
-    groups = [group.sort_values(["diameter_mm", "thickness_um"]) for group in alike(known, settings)]
-    several = [group for group in groups if len(group[["diameter_mm", "thickness_um"]].drop_duplicates()) > 1]
-    families = [_efficiency_family(group) for group in several]
-    return sorted(families, key=lambda family: -len(family["conditions"]))
+    several = _of_several_sizes(known, settings, ["diameter_mm", "thickness_um"])
+    return [_efficiency_family(group) for group in several]
 
 
 def _efficiency_family(group: pd.DataFrame) -> dict[str, Any]:

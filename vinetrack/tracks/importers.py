@@ -20,7 +20,7 @@ import numpy as np
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import END_FRACTION, Floats, Track, Trial, join_flags, plain_track
 from vinetrack.core.tables import MAX_TABLE_BYTES, Table, TableError, file_size, parse_table, read_table, read_text
-from vinetrack.core.units import convert, split_unit
+from vinetrack.core.units import UNITS, convert, split_unit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 
 if TYPE_CHECKING:
@@ -206,8 +206,6 @@ def _require_whole(data: bytes) -> None:
 # is that of Tracker's source, `org.opensourcephysics.media.core.ImageCoordSystem`. Where origin, angle or scale
 # change, a project holds them for key frames; each is valid until the next.
 
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "µm": 1e-6, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
-SECONDS = {"s": 1.0, "ms": 0.001, "min": 60.0}
 _HEADER_CELL = re.compile(r"#?\s*(t|time|x|y)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE)
 
 
@@ -228,11 +226,9 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     if others and not point_mass:
         notes.append(f"Taken from the point mass {name!r}, which has the most points; not used: {', '.join(others)}.")
     unit = _text(panel, "length_unit").strip()
-    if unit and unit not in METRES:
-        raise TrackError(f"measures lengths in {unit[:20]!r}", "set the length unit to m in Tracker")
     if not unit:
         notes.append("The project names no unit of length; metres are assumed.")
-    world_m = _to_world(frames, pixels, _axes(panel)) * METRES.get(unit, 1.0)
+    world_m = _to_world(frames, pixels, _axes(panel)) * _factor(unit or "m", "m")
     position_m, note = _project_on_axis(world_m)
     edge_px, _ = _project_on_axis(pixels)
     missing = int(frames[-1] - frames[0]) + 1 - len(frames)
@@ -379,10 +375,10 @@ def read_export(table: Table) -> Track:
         columns.setdefault(name, (column, unit))
     if "t" not in columns or not {"x", "y"} & columns.keys():
         raise TrackError("has no columns t and x or y", "export them from Tracker with one separator throughout")
-    time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS))
+    time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"][1] or "s", "s"))
     check_times(time_s, table.lines)
     axes = [
-        table.numbers(columns[name][0], blank_is_nan=True) * _factor(columns[name], METRES)
+        table.numbers(columns[name][0], blank_is_nan=True) * _factor(columns[name][1] or "m", "m")
         for name in ("x", "y")
         if name in columns
     ]
@@ -396,12 +392,13 @@ def read_export(table: Table) -> Track:
     return new_track(time_s, position_m, notes=[*notes, note] if note else notes)
 
 
-def _factor(column: tuple[str, str], units: dict[str, float]) -> float:
-    """Factor that converts a column's unit to SI."""
-    name, unit = column
-    if unit and unit not in units:
-        raise TrackError(f"column {name[:30]!r} has an unknown unit", f"use one of {', '.join(units)}")
-    return units.get(unit, 1.0)
+def _factor(unit: str, si: str) -> float:
+    """Factor that converts a unit of Tracker to SI."""
+    known = UNITS.get(unit.replace("µ", "u"))
+    if known is None or known.si != si:
+        others = ", ".join(key for key, other in UNITS.items() if other.si == si)
+        raise TrackError(f"has an unknown unit {unit[:20]!r}", f"use one of {others} in Tracker")
+    return known.to_si(1.0)
 
 
 def _project_on_axis(points: Floats) -> tuple[Floats, str]:
