@@ -6,14 +6,12 @@ import errno
 import json
 import multiprocessing
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from test_pipeline import ROOT, write_track
+from test_pipeline import write_track
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
@@ -84,22 +82,6 @@ def test_provenance_says_what_could_not_be_read(vines: Path, monkeypatch: pytest
     monkeypatch.setattr(Path, "open", shut)
     inputs = describe_run(vines, [vines / "shut", vines / "pipe"], {}, ())["inputs"]
     assert inputs == {"shut": "unreadable", "pipe": "missing"}
-
-
-@pytest.mark.slow
-@pytest.mark.pipeline
-def test_a_pipe_among_the_tracks_does_not_end_the_run(vines: Path, tmp_path: Path) -> None:
-    assert (vines / "pipe").is_fifo()
-    command = [
-        sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--cores", "1",
-        "results/vines/trials.csv", "--config", "experiment=vines",
-    ]  # fmt: skip
-    done = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=120,
-        check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "a pipe or a device" in (tmp_path / "results" / "vines" / "trials.csv").read_text()
 
 
 def test_a_full_disk_is_said_as_such(vines: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ of a single row makes that trial `failed`, unless the experiment is `strict`.
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 import math
 import os
@@ -40,11 +39,11 @@ from vinetrack.experiment.sheet import (
     Row,
     check_pressures,
     check_row,
+    closest_entry,
     find_missing,
     make_trial,
     read_row,
     read_sheet,
-    similar_entry,
 )
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
 
@@ -205,14 +204,9 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
 
 def _missing_sheet_remedy(folder: Path) -> str:
     """Remedy for a missing sheet: rename a file with a similar name, else what a folder should contain."""
-    try:
-        names = sorted(path.name for path in folder.iterdir())
-    except OSError:
-        return "allow its folder to be read"
-    close = difflib.get_close_matches(SHEET, [name for name in names if "tri" in name.lower()], 1, 0.5)
-    if close:
-        return f"rename {close[0]} to {SHEET}" if close[0].endswith(".csv") else f"save {close[0]} as {SHEET}"
-    return EXPECTED_FOLDER if names else f"the folder is empty; {EXPECTED_FOLDER}"
+    if close := closest_entry(folder / SHEET):
+        return f"rename {close} to {SHEET}" if close.endswith(".csv") else f"save {close} as {SHEET}"
+    return EXPECTED_FOLDER
 
 
 def _absent_column(name: str) -> Problem:
@@ -246,8 +240,7 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     try:
         pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
     except TrackError as error:
-        place: dict[str, Any] = {"trial": row.name, "line": row.line, "column": column}
-        row.problems.append(Problem.from_error(error, SHEET, value=row.values[column], **place))
+        row.add_error(error, column)
         return
     if pressure is None:
         remedy = "fill it in, or give the track a column pressure_kPa"
@@ -499,7 +492,8 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
             return []
     except (FileNotFoundError, ValueError):
         code, (message, remedy) = "no_file", missing_file_message(path)
-        remedy = remedy if path.is_symlink() else similar_entry(path, named_videos) or remedy
+        if not path.is_symlink() and (close := closest_entry(path, named_videos)):
+            remedy = f"did you mean {close}?"
     except OSError as error:
         code, message = "unreadable", f"cannot be read: {error.strerror}"
     return [Problem(code, message, "video", value=path.name, remedy=remedy)]

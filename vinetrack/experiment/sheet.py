@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, Problem, did_you_mean
+from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputError, Problem, did_you_mean
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
 from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, read_cell, unusual_value_hint, with_names
@@ -67,6 +67,11 @@ class Row:
         """Record a problem of this row."""
         place: dict[str, Any] = {"file": SHEET, "trial": self.name, "line": self.line}
         self.problems.append(Problem(code, message, column, severity=severity, **place, **details))
+
+    def add_error(self, error: InputError, column: str) -> None:
+        """Record why the value of a column cannot be used."""
+        place: dict[str, Any] = {"trial": self.name, "line": self.line, "column": column}
+        self.problems.append(Problem.from_error(error, SHEET, value=self.values.get(column), **place))
 
     def add_blank(self, columns: Sequence[str], remedy: str = "fill it in") -> None:
         """Report required columns that have no value, unless another problem already concerns them."""
@@ -123,16 +128,17 @@ def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
     return table, problems
 
 
-def similar_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
-    """Suggest the entry of a missing file's folder with the most similar name, in upper or lower case, that is not
-    `taken`; blank if there is none.
+def closest_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
+    """Name of the entry of a missing file's folder that is most like its own, in upper or lower case, and not `taken`;
+    blank if there is none.
     """
     try:
         names = {entry.name.lower(): entry.name for entry in sorted(path.parent.iterdir()) if entry not in taken}
     except (OSError, ValueError):
         return ""
-    close = difflib.get_close_matches(path.name.lower(), names, 1, CLOSE_NAME_RATIO)
-    return f"did you mean {names[close[0]]}?" if close else ""
+    return next(
+        (names[close] for close in difflib.get_close_matches(path.name.lower(), names, 1, CLOSE_NAME_RATIO)), ""
+    )
 
 
 def _check_name(row: Row) -> None:
@@ -185,8 +191,7 @@ def _check_paths(row: Row, folder: Path) -> None:
             try:
                 safe_join(folder, row.values[name])
             except TableError as error:
-                place: dict[str, Any] = {"trial": row.name, "line": row.line, "column": name}
-                row.problems.append(Problem.from_error(error, SHEET, value=row.values[name], **place))
+                row.add_error(error, name)
     if "video" in row.values and "track" in row.values:
         message, remedy = "has both a video and a track", "keep one of the two"
         row.add("two_recordings", message, "track", value=row.values["track"], remedy=remedy)
@@ -334,7 +339,9 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     """
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
-        remedy = similar_entry(file) or f"give a folder with {SHEET}, or a sheet"
+        remedy = (
+            f"did you mean {close}?" if (close := closest_entry(file)) else f"give a folder with {SHEET}, or a sheet"
+        )
         raise ExperimentError([Problem("no_file", "does not exist", file=str(file), remedy=remedy)])
     table, header = read_sheet(file)
     settings = read_experiment_settings(file.parent / "experiment.yaml")
