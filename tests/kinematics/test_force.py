@@ -15,6 +15,7 @@ from vinetrack.dynamics.model import base_model
 from vinetrack.kinematics.force import (
     Release,
     SteadyForce,
+    TrialMotion,
     find_release,
     flag_rest,
     known_pressure,
@@ -45,18 +46,18 @@ RELEASE = Release(
 )
 
 
-def moved(pressure_Pa: np.ndarray | None = None) -> tuple[Track, Kinematics]:
+def moved(pressure_Pa: np.ndarray | None = None, trial: Trial = VINE) -> TrialMotion:
     """Growth at 1 m/s of the edge from 20 mm on; in WINDOW from 50 to 150 mm of growth, 100 mm in the mean."""
     y = ORIGIN_M + SPEED * (TIME - START_S)
     nan, ones = np.full(TIME.size, math.nan), np.ones(TIME.size)
     track = Track(TIME, y, nan, np.full(TIME.size, "", dtype="<U8"), nan, pressure_Pa)
     points = np.full(TIME.size, 7)
-    return track, Kinematics(TIME, y, SPEED * ones, 0.01 * ones, 0 * ones, points, 1e-4, 0.0, 2.0)
+    kinematics = Kinematics(TIME, y, SPEED * ones, 0.01 * ones, 0 * ones, points, 1e-4, 0.0, 2.0)
+    return TrialMotion(trial, track, kinematics, RELEASE, {})
 
 
 def force_of(trial: Trial, window: Window = WINDOW, pressure_Pa: np.ndarray | None = None, model=None) -> SteadyForce:
-    track, kinematics = moved(pressure_Pa)
-    return steady_force(trial, track, kinematics, RELEASE, window, model or base_model())
+    return steady_force(moved(pressure_Pa, trial), window, model or base_model())
 
 
 def test_force_is_the_excess_pressure_and_the_weight_of_what_still_moves() -> None:
@@ -119,10 +120,8 @@ def test_in_a_quasi_steady_window_inertia_is_taken_off() -> None:
 
 
 def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only() -> None:
-    track, kinematics = moved()
-    assert known_pressure(VINE, track, kinematics, RELEASE, base_model()) is None
-    traced, _ = moved(np.where(np.arange(200) % 2, 12e3 + np.arange(200), math.nan))
-    found = known_pressure(VINE, traced, kinematics, RELEASE, base_model())
+    assert known_pressure(moved(), base_model()) is None
+    found = known_pressure(moved(np.where(np.arange(200) % 2, 12e3 + np.arange(200), math.nan)), base_model())
     assert found is not None
     np.testing.assert_allclose(found[1:], 12e3 + np.arange(1, 200))
 

@@ -11,6 +11,7 @@ rule of the paper, Eq. (3), uses the set pressure and neglects the weight: noise
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +38,17 @@ class Release:
     lead_position_sigma_m: float
     moving_from_start: bool
     reason: str
+
+
+@dataclass(frozen=True)
+class TrialMotion:
+    """Model-independent results of a trial: its corrected track, motion, release, and windows by rule."""
+
+    trial: Trial
+    track: Track
+    kinematics: Kinematics
+    release: Release
+    windows: Mapping[str, Window]
 
 
 def find_release(track: Track, kinematics: Kinematics) -> Release:
@@ -148,13 +160,19 @@ class SteadyForce:
     pressure_source: str  #: `trace` where it was measured in the window, else `set`
 
 
-def steady_force(
-    trial: Trial, track: Track, kinematics: Kinematics, release: Release, window: Window, model: Model
-) -> SteadyForce:
+def steady_force(motion: TrialMotion, window: Window, model: Model) -> SteadyForce:
     """Compute the force of a trial in one window."""
+    trial, kinematics = motion.trial, motion.kinematics
     inside = (kinematics.time_s >= window.from_s) & (kinematics.time_s <= window.to_s)
-    travel_m = np.maximum(kinematics.lead_position_m[inside] - release.lead_position_m, 0.0)
-    pressure_Pa, sigma_Pa, source = _window_pressure(trial, track, kinematics, release, window, model, inside)
+    travel_m = np.maximum(kinematics.lead_position_m[inside] - motion.release.lead_position_m, 0.0)
+    trace_Pa, time_s = motion.track.pressure_Pa, motion.track.time_s
+    measured_Pa = np.empty(0) if trace_Pa is None else trace_Pa[(time_s >= window.from_s) & (time_s <= window.to_s)]
+    measured_Pa = measured_Pa[np.isfinite(measured_Pa)]
+    if measured_Pa.size:
+        pressure_Pa, sigma_Pa, source = float(measured_Pa.mean()), _mean_error(measured_Pa), "trace"
+    else:
+        pressure_Pa = float(np.mean(_modelled_pressure(motion, model)[inside]))
+        sigma_Pa, source = trial.pressure_sigma_Pa, "set"
     mass_kg = float(np.mean(trial.moving_mass_kg(travel_m)))
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
     if window.rule == "quasi_steady":
@@ -174,42 +192,25 @@ def paper_force_N(trial: Trial) -> float:
     return (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
 
 
-def known_pressure(trial: Trial, track: Track, kinematics: Kinematics, release: Release, model: Model) -> Floats | None:
+def known_pressure(motion: TrialMotion, model: Model) -> Floats | None:
     """Return the gauge pressure at the points of the kinematics; None where only the set pressure is known. It is the
     measured pressure, else that of a model with an effect on the pressure. Shape (n,).
     """
-    if track.pressure_Pa is not None and np.isfinite(track.pressure_Pa).sum() > 1:
-        measured = np.isfinite(track.pressure_Pa)
-        return np.interp(kinematics.time_s, track.time_s[measured], track.pressure_Pa[measured])
+    trace_Pa, time_s = motion.track.pressure_Pa, motion.track.time_s
+    if trace_Pa is not None and np.isfinite(trace_Pa).sum() > 1:
+        measured = np.isfinite(trace_Pa)
+        return np.interp(motion.kinematics.time_s, time_s[measured], trace_Pa[measured])
     if not any({"pressure", "chamber_rate"} & set(effect.functions) for effect in model):
         return None
-    return _modelled_pressure(trial, kinematics, release, model)
+    return _modelled_pressure(motion, model)
 
 
-def _modelled_pressure(trial: Trial, kinematics: Kinematics, release: Release, model: Model) -> Floats:
+def _modelled_pressure(motion: TrialMotion, model: Model) -> Floats:
+    kinematics, release = motion.kinematics, motion.release
     start_s = release.time_s if math.isfinite(release.time_s) else kinematics.time_s[0]
     travel_m = np.maximum(kinematics.lead_position_m - release.lead_position_m, 0.0)
     since_s = np.maximum(kinematics.time_s - start_s, 0.0)
-    return pressure_along(model, trial, since_s, travel_m, np.maximum(kinematics.lead_velocity_m_s, 0.0))
-
-
-def _window_pressure(
-    trial: Trial,
-    track: Track,
-    kinematics: Kinematics,
-    release: Release,
-    window: Window,
-    model: Model,
-    inside: np.ndarray,
-) -> tuple[float, float, str]:
-    """Mean gauge pressure in the window, its random error, Pa, and whether it comes from a `trace` or was `set`."""
-    if track.pressure_Pa is not None:
-        measured = track.pressure_Pa[(track.time_s >= window.from_s) & (track.time_s <= window.to_s)]
-        measured = measured[np.isfinite(measured)]
-        if measured.size:
-            return float(measured.mean()), _mean_error(measured), "trace"
-    along = _modelled_pressure(trial, kinematics, release, model)[inside]
-    return float(np.mean(along)), trial.pressure_sigma_Pa, "set"
+    return pressure_along(model, motion.trial, since_s, travel_m, np.maximum(kinematics.lead_velocity_m_s, 0.0))
 
 
 def _mean_error(measured_Pa: Floats) -> float:

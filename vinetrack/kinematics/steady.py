@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Track, Trial, Window, with_flag
+from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Track, Window, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
-from vinetrack.kinematics.force import Release
+from vinetrack.kinematics.force import TrialMotion
 from vinetrack.kinematics.velocity import correlated
 
 # ------------------------------------------------------------------------------
@@ -505,25 +505,16 @@ PARTS = 3  # Parts of a window in which inertia is fitted separately (chosen)
 FEWEST_POINTS = 4 * PARTS  # Fewest points of a window (derived)
 
 
-def quasi_steady_window(
-    trial: Trial,
-    track: Track,
-    kinematics: Kinematics,
-    release: Release,
-    pressure_Pa: Floats,
-    *,
-    start_fraction: float = 0.2,
-) -> Window:
+def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
     """Find the longest window after the highest speed in which inertia is a small part of the force. Shapes:
     pressure_Pa (n,).
     """
-    usable = track.usable
-    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
-    travel_m = position_m - release.lead_position_m
+    trial, kinematics = motion.trial, motion.kinematics
+    time_s, position_m = _points(motion.track, kinematics)
+    travel_m = position_m - motion.release.lead_position_m
     velocity = kinematics.lead_velocity_m_s
     first = int(np.argmax(velocity))
-    # 0.3: largest relative change of speed across a window (derived)
-    lowest = max(start_fraction, 1 - 0.3) * velocity[first]
+    lowest = (1 - 0.3) * velocity[first]  # 0.3: largest relative change of speed across a window (derived)
     # 0.95: fraction of the length up to which the moving mass of a vine without payload is known well enough (chosen)
     beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > 0.95 * trial.length_m))
     last = first + int(beyond[0]) - 1 if beyond.size else velocity.size - 1

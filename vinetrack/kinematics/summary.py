@@ -23,6 +23,7 @@ from vinetrack.kinematics.damping import LEAST_STEADY_SHARE, fit_laws, mark_left
 from vinetrack.kinematics.force import (
     Release,
     SteadyForce,
+    TrialMotion,
     find_release,
     flag_rest,
     known_pressure,
@@ -220,17 +221,6 @@ class TrialResult:
 
 
 @dataclass(frozen=True)
-class TrialMotion:
-    """Model-independent results of a trial: its corrected track, motion, release, and windows by rule."""
-
-    trial: Trial
-    track: Track
-    kinematics: Kinematics
-    release: Release
-    windows: Mapping[str, Window]
-
-
-@dataclass(frozen=True)
 class Steadiness:
     """Windows by rule under one model, the chosen one, whose values are reported, and the force in it."""
 
@@ -260,15 +250,14 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
 
 def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
     """Find the steady window of a trial and the force in it, with the pressure of a model."""
-    trial, track, kinematics, release = motion.trial, motion.track, motion.kinematics, motion.release
     windows = dict(motion.windows)
     chosen = _chosen(windows)
-    if chosen is None and "user" not in windows and why_not_in_fit(trial) == "":
-        pressure_Pa = known_pressure(trial, track, kinematics, release, model)
+    if chosen is None and "user" not in windows and why_not_in_fit(motion.trial) == "":
+        pressure_Pa = known_pressure(motion, model)
         if pressure_Pa is not None:
-            windows["quasi_steady"] = quasi_steady_window(trial, track, kinematics, release, pressure_Pa)
+            windows["quasi_steady"] = quasi_steady_window(motion, pressure_Pa)
             chosen = _chosen(windows)
-    force = steady_force(trial, track, kinematics, release, chosen, model) if chosen else None
+    force = steady_force(motion, chosen, model) if chosen else None
     return Steadiness(windows, chosen, force)
 
 
