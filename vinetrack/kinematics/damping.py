@@ -151,30 +151,24 @@ def _refusal(reason: str, left_out: dict[str, str]) -> dict[str, Any]:
 
 
 def _logarithms(points: pd.DataFrame) -> Points:
-    force, speed = points["force_N"].to_numpy(float), points["x_ss_m_s"].to_numpy(float)
-    names = tuple(dict.fromkeys(points["vine"].astype(str)))
-    index = {name: i for i, name in enumerate(names)}
+    import pandas as pd
 
-    def relative(column: str, to: Floats) -> Floats:
-        return np.nan_to_num(points[column].to_numpy(float)) / to
-
-    measured = (
-        points["pressure_source"].to_numpy() == "trace" if "pressure_source" in points else np.zeros(len(points), bool)
-    )
-    force_error = relative("force_sigma_N", force)
+    sigmas = ["x_ss_sigma_m_s", "force_sigma_N", "yield_force_sigma_N", "scale_rel_sigma"]
+    numbers = points.reindex(columns=["x_ss_m_s", "force_N", *sigmas]).to_numpy(float).T
+    speed, force, speed_sigma, force_sigma, yield_sigma, scale_sigma = np.nan_to_num(numbers)
+    measured = points.reindex(columns=["pressure_source"])["pressure_source"].eq("trace").to_numpy()
+    vine, names = pd.factorize(points["vine"].astype(str))
     return Points(
         log_speed=np.log(speed),
         log_force=np.log(force),
-        speed_error=relative("x_ss_sigma_m_s", speed),
-        force_error=np.where(measured, force_error, 0.0),
-        set_error=np.where(measured, 0.0, force_error),
-        yield_error=np.nan_to_num(points["yield_force_sigma_N"].to_numpy(float)),
-        scale_error=relative("scale_rel_sigma", np.ones(len(points)))
-        if "scale_rel_sigma" in points
-        else np.zeros(len(points)),
+        speed_error=speed_sigma / speed,
+        force_error=np.where(measured, force_sigma / force, 0.0),
+        set_error=np.where(measured, 0.0, force_sigma / force),
+        yield_error=yield_sigma,
+        scale_error=scale_sigma,
         force=force,
-        vine=np.array([index[name] for name in points["vine"].astype(str)]),
-        names=names,
+        vine=vine,
+        names=tuple(names),
     )
 
 

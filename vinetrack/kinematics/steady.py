@@ -500,40 +500,50 @@ def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[in
 # applied.
 
 
-PARTS = 3  # Parts of a window in which inertia is fitted separately (chosen)
-
-FEWEST_POINTS = 4 * PARTS  # Fewest points of a window (derived)
-
-
 def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
     """Find the longest window after the highest speed in which inertia is a small part of the force. Shapes:
     pressure_Pa (n,).
     """
+    parts = 3  # parts of a window in which inertia is fitted separately (chosen)
+    fewest_points = 4 * parts
     trial, kinematics = motion.trial, motion.kinematics
     time_s, position_m = _points(motion.track, kinematics)
     travel_m = position_m - motion.release.lead_position_m
     velocity = kinematics.lead_velocity_m_s
     first = int(np.argmax(velocity))
     lowest = (1 - 0.3) * velocity[first]  # 0.3: largest relative change of speed across a window (derived)
-    # 0.95: fraction of the length up to which the moving mass of a vine without payload is known well enough (chosen)
-    beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > 0.95 * trial.length_m))
+    beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > END_FRACTION * trial.length_m))
     last = first + int(beyond[0]) - 1 if beyond.size else velocity.size - 1
-    if last - first + 1 < FEWEST_POINTS:
+    if last - first + 1 < fewest_points:
         points = max(last - first + 1, 0)
-        reason = f"{points} points between the highest speed and the end are too few; {FEWEST_POINTS} are needed"
+        reason = f"{points} points between the highest speed and the end are too few; {fewest_points} are needed"
         return Window("quasi_steady", False, reason)
     mass_kg = trial.moving_mass_kg(np.maximum(travel_m, 0.0))
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
     force_N = (pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N
     inertial_mass_kg = trial.travel_ratio**2 * mass_kg
+
+    def largest_inertia(a: int, b: int) -> float:
+        """Largest inertia in any part of a window as a fraction of the force, at the end of its 95 % interval."""
+        largest = 0.0
+        for low, high in itertools.pairwise(np.linspace(a, b + 1, parts + 1).round().astype(int)):
+            t = time_s[low:high]
+            fit = fit_window(t, position_m[low:high], kinematics.noise_m, kinematics.noise_correlation)
+            if not (fit.speed_m_s > 0 and np.all(force_N[low:high] > 0)):
+                return math.inf
+            to_force = float(np.mean(inertial_mass_kg[low:high]) / np.mean(force_N[low:high]))
+            to_force *= fit.speed_m_s / float(t[-1] - t[0])
+            largest = max(largest, to_force * (abs(fit.drift) + 1.96 * fit.drift_sigma))
+        return largest
+
     # 6: sections between whose ends all windows are tried (chosen)
     ends = np.linspace(first, last, 6 + 1).round().astype(int)
     candidates = sorted(itertools.combinations(ends.tolist(), 2), key=lambda ends: ends[0] - ends[1])
     smallest = math.inf
     for a, b in candidates:
-        if b - a + 1 < FEWEST_POINTS:
+        if b - a + 1 < fewest_points:
             break
-        inertia = _largest_inertia(time_s, position_m, kinematics, inertial_mass_kg, force_N, a, b)
+        inertia = largest_inertia(a, b)
         smallest = min(smallest, inertia)
         # 0.1: largest inertia as a fraction of the force, at the end of its 95 % interval (chosen)
         if inertia <= 0.1:
@@ -544,29 +554,3 @@ def quasi_steady_window(motion: TrialMotion, pressure_Pa: Floats) -> Window:
             )
             return replace(window, accepted=True, reason=reason)
     return Window("quasi_steady", False, f"inertia takes at least {100 * smallest:.2g} % of the force in every window")
-
-
-def _largest_inertia(
-    time_s: Floats,
-    position_m: Floats,
-    kinematics: Kinematics,
-    inertial_mass_kg: Floats,
-    force_N: Floats,
-    a: int,
-    b: int,
-) -> float:
-    """Largest inertia in any third of a window as a fraction of the force, at the end of its 95 % interval."""
-    edges = np.linspace(a, b + 1, PARTS + 1).round().astype(int)
-    largest = 0.0
-    for low, high in itertools.pairwise(edges):
-        t = time_s[low:high]
-        fit = fit_window(t, position_m[low:high], kinematics.noise_m, kinematics.noise_correlation)
-        to_force = (
-            float(np.mean(inertial_mass_kg[low:high]) / np.mean(force_N[low:high]))
-            * fit.speed_m_s
-            / float(t[-1] - t[0])
-        )
-        if not (fit.speed_m_s > 0 and np.all(force_N[low:high] > 0)):
-            return math.inf
-        largest = max(largest, to_force * (abs(fit.drift) + 1.96 * fit.drift_sigma))
-    return largest
