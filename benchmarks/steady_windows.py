@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"
 from vine_truth import CAPTURE_FPS, G, Recording, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Window
+from vinetrack.experiment.settings import SteadySettings
 from vinetrack.kinematics.steady import gated_window, paper_window
 from vinetrack.kinematics.velocity import estimate_kinematics
 
@@ -102,7 +103,7 @@ def main() -> None:
                     rng = np.random.default_rng(seed)
                     trial = record(vine, rng, noise_m=noise_m, rho=rho, rest_frames=60, end_frames=30 * (seed % 2))
                     kinematics = estimate_kinematics(trial.track, travel_ratio=2)
-                    tallies["gated"].add(gated_window(trial.track, kinematics), vine, trial)
+                    tallies["gated"].add(gated_window(trial.track, kinematics, SteadySettings()), vine, trial)
                     tallies["paper"].add(paper_window(trial.track, travel_ratio=2), vine, trial)
         for rule, tally in tallies.items():
             print(f"{noise_m * 1e3:8.2f}  {rho:3.1f}  {rule:5s} {tally.row()}")
@@ -113,7 +114,7 @@ def main() -> None:
             trial = never_steady(seed, noise_m)
             kinematics = estimate_kinematics(trial.track, travel_ratio=2)
             found += [
-                gated_window(trial.track, kinematics).accepted,
+                gated_window(trial.track, kinematics, SteadySettings()).accepted,
                 paper_window(trial.track, travel_ratio=2).accepted,
             ]
         gated, paper = 100 * found / (10 * trials)

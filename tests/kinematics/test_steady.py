@@ -12,12 +12,12 @@ from vine_truth import Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.dynamics.model import base_model, make_model
-from vinetrack.experiment.settings import RunSettings
+from vinetrack.experiment.settings import RunSettings, SteadySettings
 from vinetrack.kinematics.steady import WindowMoments, gated_window, paper_window, user_window
 from vinetrack.kinematics.summary import TrialResult, summarise_trial
 from vinetrack.kinematics.velocity import estimate_kinematics
 
-SEEDS = range(1000, 1010)
+SEEDS, LIMITS = range(1000, 1010), SteadySettings()
 STEADY = [
     pytest.param(Vine(scale, speed), noise_m, rho, id=f"R{scale}-{speed}m_s-{noise_m * 1e3}mm-{rho}")
     for scale, speed in ((1, 0.2), (1, 3.0), (2, 1.0), (3, 5.0), (4, 0.3), (4, 3.0))
@@ -26,7 +26,7 @@ STEADY = [
 
 
 def gated(track, travel_ratio=2.0, length_m=math.nan):
-    return gated_window(track, estimate_kinematics(track, travel_ratio=travel_ratio), length_m=length_m)
+    return gated_window(track, estimate_kinematics(track, travel_ratio=travel_ratio), LIMITS, length_m=length_m)
 
 
 def ramp(drop: float, noise_m: float, seed: int = 1000, n: int = 300):
@@ -142,7 +142,7 @@ def test_a_long_plateau_does_not_swallow_its_start_up():
 
 def test_a_window_chosen_by_hand_is_used_and_judged():
     track = ramp(0.0, 3e-5)
-    window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.05, 0.25))
+    window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.05, 0.25), LIMITS, math.nan)
     assert window.accepted
     assert window.rule == "user"
     assert (window.from_s, window.to_s) == (0.05, 0.25)
@@ -153,7 +153,7 @@ def test_a_window_chosen_by_hand_is_used_and_judged():
 def test_a_window_chosen_by_hand_is_judged_by_the_limits_of_the_run(drift_limit, doubtful):
     track = ramp(0.01, 1e-5)
     kinematics = estimate_kinematics(track, travel_ratio=2)
-    window = user_window(track, kinematics, (0.0, 0.299), drift_limit=drift_limit)
+    window = user_window(track, kinematics, (0.0, 0.299), SteadySettings(drift_limit=drift_limit), math.nan)
     assert (window.accepted, window.doubtful) == (True, doubtful)
 
 
@@ -178,7 +178,7 @@ def test_a_speed_that_bends_within_the_window_is_known_no_better_than_the_bend()
     bend_m_s = 4e-3
     y = 0.5 * time_s + bend_m_s * time_s[-1] / 2 * np.polynomial.legendre.legval(u, [0, 0, 0, 1])
     track = make_track(time_s, y + ar1(200, 1e-6, 0.0, np.random.default_rng(1000)))
-    window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.0, 1.0))
+    window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.0, 1.0), LIMITS, math.nan)
     assert window.x_ss_m_s == pytest.approx(1.0, abs=5e-4)
     assert window.x_ss_sigma_m_s == pytest.approx(2 * bend_m_s, rel=0.05)
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Track, Window, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
+from vinetrack.experiment.settings import SteadySettings
 from vinetrack.kinematics.force import TrialMotion
 from vinetrack.kinematics.velocity import correlated
 
@@ -250,18 +251,11 @@ SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (der
 BAND_SIGMAS = 4.0  # Standard errors by which a single velocity may lie outside the band
 
 
-def gated_window(
-    track: Track,
-    kinematics: Kinematics,
-    *,
-    length_m: float = math.nan,
-    drift_limit: float = 0.03,
-    start_fraction: float = 0.2,
-    start_sigmas: float = 5.0,
-) -> Window:
+def gated_window(track: Track, kinematics: Kinematics, limits: SteadySettings, *, length_m: float = math.nan) -> Window:
     """Find the longest window in which the speed is shown to be constant within the drift limit."""
     time_s, position_m = _points(track, kinematics)
-    first, last, why = _gate(kinematics, start_fraction, start_sigmas)
+    drift_limit = limits.drift_limit
+    first, last, why = _gate(kinematics, limits)
     if why:
         return Window("gated", False, why)
     inside = slice(first, last + 1)
@@ -283,14 +277,7 @@ def gated_window(
 
 
 def user_window(
-    track: Track,
-    kinematics: Kinematics,
-    window_s: tuple[float, float],
-    *,
-    length_m: float = math.nan,
-    drift_limit: float = 0.03,
-    start_fraction: float = 0.2,
-    start_sigmas: float = 5.0,
+    track: Track, kinematics: Kinematics, window_s: tuple[float, float], limits: SteadySettings, length_m: float
 ) -> Window:
     """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady by these limits."""
     time_s, position_m = _points(track, kinematics)
@@ -305,9 +292,9 @@ def user_window(
     if not window.x_ss_m_s > 0:
         reason = f"chosen by hand; warning: the mean tail speed is {window.x_ss_m_s:.3g} m/s"
         return replace(window, accepted=True, doubtful=True, reason=reason)
-    steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= drift_limit
+    steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= limits.drift_limit
     warnings = [] if steady else ["not shown to be steady"]
-    first, last, why = _gate(kinematics, start_fraction, start_sigmas)
+    first, last, why = _gate(kinematics, limits)
     if not why and inside[-1] > _before_the_end(track, position_m, first, last, length_m):
         warnings.append("runs into the end of growth")
     verdict = "; warning: ".join(["chosen by hand", *warnings])
@@ -324,16 +311,16 @@ def _points(track: Track, kinematics: Kinematics) -> tuple[Floats, Floats]:
     return time_s, position_m
 
 
-def _gate(kinematics: Kinematics, start_fraction: float, start_sigmas: float) -> tuple[int, int, str]:
+def _gate(kinematics: Kinematics, limits: SteadySettings) -> tuple[int, int, str]:
     """First and last point between which a window may lie, or the reason why there is none."""
     velocity, sigma = kinematics.lead_velocity_m_s, kinematics.lead_velocity_sigma_m_s
     top_speed = float(np.max(velocity - 3 * sigma))  # a lower limit, so that noise does not raise the gate
     if velocity.size < 3 or top_speed <= 0:
         return 0, 0, "nothing moves faster than three standard errors of its velocity"
-    moving = velocity > np.maximum(start_fraction * top_speed, start_sigmas * sigma)
+    moving = velocity > np.maximum(limits.start_fraction * top_speed, limits.start_sigmas * sigma)
     points = np.flatnonzero(moving)
     if points.size < 3:
-        faster = f"{start_fraction:g} of the top speed and {start_sigmas:g} standard errors"
+        faster = f"{limits.start_fraction:g} of the top speed and {limits.start_sigmas:g} standard errors"
         return 0, 0, f"only {points.size} points move faster than {faster}"
     return int(points[0]), int(points[-1]), ""
 

@@ -18,7 +18,7 @@ from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError
-from vinetrack.experiment.settings import RunSettings
+from vinetrack.experiment.settings import RunSettings, SteadySettings
 from vinetrack.kinematics.damping import LEAST_STEADY_SHARE, fit_laws, mark_left_out
 from vinetrack.kinematics.force import (
     Release,
@@ -245,7 +245,7 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
     )
     release = find_release(track, kinematics)
     track = flag_rest(track, release)
-    return TrialMotion(trial, track, kinematics, release, _windows(trial, track, kinematics, settings))
+    return TrialMotion(trial, track, kinematics, release, _windows(trial, track, kinematics, settings.steady))
 
 
 def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
@@ -297,20 +297,15 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
     return TrialResult(track, kinematics, motion.release, windows, row, damping_point(trial, steady))
 
 
-def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSettings) -> dict[str, Window]:
-    steady = settings.steady
-    limits = {
-        "length_m": trial.length_m, "drift_limit": steady.drift_limit, "start_fraction": steady.start_fraction,
-        "start_sigmas": steady.start_sigmas,
-    }  # fmt: skip
+def _windows(trial: Trial, track: Track, kinematics: Kinematics, limits: SteadySettings) -> dict[str, Window]:
     windows = {
-        "gated": gated_window(track, kinematics, **limits),
+        "gated": gated_window(track, kinematics, limits, length_m=trial.length_m),
         "paper": paper_window(
-            track, travel_ratio=trial.travel_ratio, cv_limit=steady.paper_cv, min_points=steady.paper_points
+            track, travel_ratio=trial.travel_ratio, cv_limit=limits.paper_cv, min_points=limits.paper_points
         ),
     }
     if trial.steady_window_s is not None:
-        windows["user"] = user_window(track, kinematics, trial.steady_window_s, **limits)
+        windows["user"] = user_window(track, kinematics, trial.steady_window_s, limits, trial.length_m)
     return windows
 
 
