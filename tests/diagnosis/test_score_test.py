@@ -123,6 +123,17 @@ def test_probes_of_nothing_find_structure_as_often_as_they_say(scatter: float) -
         assert np.mean([one.p < 0.2 for one in found]) > 0.05
 
 
+def test_six_trials_hear_a_force_that_one_probe_feels_and_seldom_one_that_is_not_there() -> None:
+    """Of noise alone one campaign in twenty at that level; thirty standard errors in one of 12 always."""
+    draw = np.random.default_rng(9)
+    nothing = [structure_from_scores(scores(draw, 6, 12)) for _ in range(200)]
+    assert np.mean([one.p < 0.05 for one in nothing]) < 0.09
+    assert np.mean([one.smallest_probe_p < 0.05 for one in nothing]) < 0.09
+    loud = [structure_from_scores(scores(draw, 6, 12, sizes=[30 / math.sqrt(6), *[0] * 11])) for _ in range(40)]
+    level = 0.1 * FALSE_ALARM_LEVEL_LATER_ROUNDS
+    assert all(one.p < level and one.smallest_probe_p < level for one in loud)
+
+
 def test_what_all_probes_feel_a_little_shows_in_their_sum_and_in_none_alone() -> None:
     draw = np.random.default_rng(20605)
     heard = []

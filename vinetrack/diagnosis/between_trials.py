@@ -388,6 +388,3 @@ def between_candidates(
         for hypothesis in fitted
         if hypothesis.effects[-1].kind == BETWEEN_TRIALS
     ]
-
-
-__all__ = ["BetweenRatio", "Difference", "between_candidates", "between_fits", "differences", "significant"]

@@ -35,12 +35,13 @@ from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import is_poor_fit, relative_residual, track_correlation, variance_floor
-from vinetrack.inference.robust_covariance import Systematics, cluster_variance, systematics_of
+from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, Systematics, cluster_variance, systematics_of
 
 # ------------------------------------------------------------------------------
 # Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.
 #
-# Probes are bumps of force along the growth, over speed and over time.
+# Probes are bumps of force along the growth, over speed and over time. Where too few trials tell how far trials
+# differ, scores have the variance of the noise model, known from each spare trial once for every bump along its growth.
 
 
 def _probe_shapes(fit: Fit) -> list[CandidateShape]:
@@ -112,11 +113,13 @@ def structure_from_scores(scores: Scores) -> Structure:
     robust = cluster_variance(trial_z - explained, scores.degrees)
     chi2 = float(np.sum(z**2 / np.maximum(1.0, robust)))
     degrees = int(np.count_nonzero(keep))
-    p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
+    few, noise_degrees = len(trial_z) < FEWEST_CLUSTERS, 8 * scores.degrees  # 8: bumps along the growth
+    p = float(fisher.sf(chi2 / degrees, degrees, noise_degrees if few else scores.degrees)) if degrees else 1.0
     # A probe to which few trials respond has as few degrees of freedom (effective number of trials).
     by_trial = np.einsum("njj->nj", scores.trial_informations)[:, informative]
     n_effective = by_trial.sum(axis=0) ** 2 / np.maximum(np.sum(by_trial**2, axis=0), 1e-300)
-    p_values = 2 * t.sf(np.abs(scores.z[informative]), np.clip(n_effective - 1, 1.0, max(scores.degrees, 3.0)))
+    probe_degrees = noise_degrees if few else np.clip(n_effective - 1, 1.0, max(scores.degrees, 3.0))
+    p_values = 2 * t.sf(np.abs(scores.z[informative]), probe_degrees)
     smallest_probe_p = min(degrees * float(np.min(p_values, initial=1.0)), 1.0)
     return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), smallest_probe_p)
 
