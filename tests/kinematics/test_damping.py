@@ -132,6 +132,30 @@ def test_log_log_is_least_squares_of_the_logarithm_of_force() -> None:
     np.testing.assert_allclose(fit["covariance"]["matrix"], variance * np.linalg.inv(design.T @ design), rtol=1e-6)
 
 
+NORRIS = """
+0.1 0.2, 338.8 337.4, 118.1 118.2, 888.0 884.6, 9.2 10.1, 228.1 226.5, 668.5 666.3, 998.5 996.3, 449.1 448.6,
+778.9 777.0, 559.2 558.2, 0.3 0.4, 0.1 0.6, 778.1 775.5, 668.8 666.9, 339.3 338.0, 448.9 447.5, 10.8 11.6,
+557.7 556.0, 228.3 228.1, 998.0 995.8, 888.8 887.6, 119.6 120.2, 0.3 0.3, 0.6 0.3, 557.6 556.8, 339.3 339.1,
+888.0 887.2, 998.5 999.0, 778.9 779.0, 10.2 11.1, 117.6 118.3, 228.9 229.2, 668.4 669.1, 449.2 448.9,
+0.2 0.5
+"""
+
+
+def test_a_line_of_nist_has_the_certified_numbers_errors_and_scatter() -> None:
+    """Norris (StRD, linear regression): y and x, here ln F and ln x_ss in hundredths, so that n is their slope."""
+    y, x = np.array([pair.split() for pair in NORRIS.split(",")], float).T / 100
+    points = pd.DataFrame({"trial": [f"t{i}" for i in range(36)], "x_ss_m_s": np.exp(x), "force_N": np.exp(y)})
+    points = points.assign(vine="v", diameter_mm=24.0, thickness_um=200.0, yield_force_sigma_N=0.0)
+    points = points.assign(x_ss_sigma_m_s=0.0, force_sigma_N=0.0)
+    fit = fit_damping(points, resamples=50)["log_log"]
+    assert fit["n"] == pytest.approx(1.00211681802045, rel=1e-12)
+    assert math.log(fit["vines"]["v"]["B"]) == pytest.approx(-0.262323073774029e-2, rel=1e-9)
+    assert fit["scatter"] == pytest.approx(0.884796396144373e-2, rel=1e-9)
+    assert fit["vines"]["v"]["R2"] == pytest.approx(0.999993745883712, rel=1e-9)
+    errors = np.sqrt(np.diag(fit["covariance"]["matrix"]))
+    np.testing.assert_allclose(errors, [0.429796848199937e-3, 0.232818234301152e-2], rtol=1e-9)
+
+
 def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors() -> None:
     draw = default_rng(8)
     points = scattered(2, trials=2)
@@ -401,6 +425,13 @@ def test_walls_of_one_diameter_make_a_line() -> None:
     assert family["power"]["slope"] == pytest.approx(1.0)
     assert family["line"]["slope"] == pytest.approx(0.02)
     assert family["line"]["intercept"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_vine_of_unknown_wall_belongs_to_no_family() -> None:
+    vines = {f"t{t:g}": law(2.0, 12.0, t) for t in (50.0, 100.0, math.nan)}
+    found = fit_scaling(damping(vines))
+    assert [family["vines"] for family in found["thickness"]] == [["t50", "t100"]]
+    assert found["isometric"] == []
 
 
 # ---- trends with size against exact power laws and against textbook regressions worked out by hand ----

@@ -13,7 +13,7 @@ from vine_truth import Vine, ar1, make_track, record
 from vinetrack.core.records import Track, Trial
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.experiment.settings import RunSettings, SteadySettings
-from vinetrack.kinematics.steady import WindowMoments, gated_window, paper_window, user_window
+from vinetrack.kinematics.steady import WindowMoments, _Search, gated_window, paper_window, user_window
 from vinetrack.kinematics.summary import TrialResult, summarise_trial
 from vinetrack.kinematics.velocity import estimate_kinematics
 
@@ -119,6 +119,16 @@ def test_a_plateau_declining_by_two_per_cent_is_accepted_and_its_drift_reported(
 
 
 @pytest.mark.slow
+def test_drift_interval_covers_the_truth():
+    covered = 0
+    for seed in range(1000, 1100):
+        window = gated(ramp(0.01, 1e-4, seed))
+        truth = -0.01 * (window.to_s - window.from_s) / 0.299
+        covered += window.drift_95[0] <= truth * 1.0 <= window.drift_95[1]
+    assert 88 <= covered <= 100
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_error_of_the_speed_is_honest_at_constant_speed(rho):
     time_s, pulls = np.arange(200) / 1069, []
@@ -169,6 +179,20 @@ def test_short_windows_late_in_a_long_track_are_fitted_as_well_as_any(first, poi
     _, slope, curve = np.polynomial.polynomial.polyfit((t - (t[0] + t[-1]) / 2) / half_s, y - y.mean(), 2)
     assert mean[0] == pytest.approx(slope / half_s, rel=1e-8)
     assert drift[0] == pytest.approx(4 * curve / slope, abs=1e-6)
+
+
+def test_windows_of_which_sums_over_a_long_track_say_nothing_are_not_tried():
+    """The last start of the first pass leaves three points of 3,193."""
+    n, tried = 3193, []
+    time_s = np.arange(n) / 1000
+    position_m = 0.5 * time_s + ar1(n, 1e-4, 0.0, np.random.default_rng(1000))
+    kinematics = estimate_kinematics(make_track(time_s, position_m), travel_ratio=2)
+    narrow = replace(kinematics, window_points=np.full(n, 2))
+    search = _Search(time_s, position_m, narrow, slice(None), n - 1, 0.03)
+    drift = search.moments.drift
+    search.moments.drift = lambda first, last: tried.append(np.min(last - first + 1)) or drift(first, last)
+    search.longest()
+    assert min(tried) >= 0.02 * n
 
 
 def test_a_speed_that_bends_within_the_window_is_known_no_better_than_the_bend():

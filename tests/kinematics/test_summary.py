@@ -219,6 +219,13 @@ def test_efficiency_by_hand() -> None:
     assert truth == pytest.approx(1.132, rel=1e-3)
 
 
+@pytest.mark.parametrize(("diameter_m", "share"), [(0.012, 0.1816), (0.018, 0.0807)])
+def test_the_weight_of_the_payload_works_beside_the_gas(diameter_m: float, share: float) -> None:
+    """35.6 g × 9.81 m/s² × 0.3 m = 0.10477 J, beside 34 kPa × 0.15 m × 113.10 or 254.47 mm² = 0.57679 or 1.29777 J."""
+    no_film = replace(VINE, diameter_m=diameter_m, thickness_m=1e-12)
+    assert efficiency_shares(no_film, 0.15)[1] == pytest.approx(share, rel=1e-3)
+
+
 @pytest.mark.parametrize(("angle_deg", "factor"), [(0, 1.0), (60, 0.5), (90, 0.0), (180, -1.0)])
 def test_only_growth_downwards_is_helped_by_the_weight(angle_deg: float, factor: float) -> None:
     tilted = replace(VINE, growth_angle_rad=math.radians(angle_deg))

@@ -171,6 +171,12 @@ def test_a_dropped_frame_is_found_beside_noise_that_grows_along_the_way():
     assert sum("retimed" in flag for flag in told) >= 18
 
 
+def test_release_is_not_a_dropped_frame():
+    time_s = np.arange(100) * FRAME_S
+    y = 0.5 * 4000 * np.maximum(time_s - time_s[50], 0) ** 2
+    assert correct_frames(make_track(time_s, y)).notes == ()
+
+
 def steps_with(long: float, number: np.ndarray | None = None):
     """Twenty frames that move 10 px each, but for one step of `long` before the tenth."""
     step = np.full(20, 10.0)

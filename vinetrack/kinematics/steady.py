@@ -384,14 +384,15 @@ class _Search:
         long_enough = (last - first + 1 >= 3) & (last <= self.latest)
         first, last = first[long_enough], last[long_enough]
         points = last - first + 1
-        keep = points >= np.maximum(3, self.width[(first + last) // 2] / 2 + 2)
+        # 0.02: shortest window, as a fraction of the motion (chosen)
+        keep = points >= np.maximum(max(3, 0.02 * self.n), self.width[(first + last) // 2] / 2 + 2)
         first, last, points = first[keep], last[keep], points[keep]
         if first.size == 0:
             return None, "fewer points move than one smoothing window holds"
         mean, drift, drift_sigma = self.moments.drift(first, last)
         worst = np.abs(drift) + 1.96 * drift_sigma
-        # 0.02, 1 / 3: shortest window where the speed falls by more than a third of the limit (chosen)
-        share = np.where(drift < -(1 / 3) * self.limit, 0.02, SHORTEST_SHARE)
+        # 1 / 3: where the speed falls by more than this part of the limit, a window may be that short (chosen)
+        share = np.where(drift < -(1 / 3) * self.limit, 0.0, SHORTEST_SHARE)
         steady = (mean > 0) & (worst <= self.limit) & (points >= share * self.n)
         for bounds in self.bounds:
             index = np.flatnonzero(steady)
