@@ -22,6 +22,8 @@ LASER_POWER_PERCENT = {1: 60.0, 2: 76.0, 3: 81.0, 4: 86.0}  # Fabrication settin
 
 CONDITIONS = (8, 11)  # Pressures per scale in the damping fit, fewest and most (published)
 
+TRIALS = (4, 5)  # Trials per pressure, fewest and most (published; read by `paper/rows.csv`)
+
 REPLICATES = 4  # N of Figs. 4, 5, 8 and 9 (published)
 
 STEADY_FEWEST_POINTS, STEADY_CV = 3, 0.03  # Definition of a steady window (published)
