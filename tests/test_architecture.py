@@ -50,7 +50,7 @@ BUDGETS = {
     "dynamics": (2667, 8, 29),
     "effects": (2711, 44, 180),
     "experiment": (2018, 7, 26),
-    "figures": (3103, 9, 40),
+    "figures": (3078, 9, 40),
     "inference": (7357, 14, 83),
     "interface": (698, 3, 2),
     "kinematics": (2254, 6, 22),

@@ -117,12 +117,8 @@ def tracking(n_along: int = 300, height: int = 60) -> Tracking:
     return Tracking(track, Axis((0.0, 30.0), (n_along - 1.0, 30.0), 20.0), kymograph, pictures, 1.0, 0.1, np.zeros(N))
 
 
-def axes(figure: object) -> list:
-    return [ax for part in figure.subfigs for ax in part.axes]  # type: ignore[attr-defined]
-
-
 def test_the_edge_and_flagged_frames_are_counted_apart() -> None:
-    kymograph = axes(draw_strip("a", tracking(), 1e-3))[0]
+    kymograph = draw_strip("a", tracking(), 1e-3).axes[0]
     labels = [line.get_label() for line in kymograph.lines]
     assert labels == ["leading edge, N = 38", "flagged, N = 2"]
     crosses = kymograph.lines[1]
@@ -131,7 +127,7 @@ def test_the_edge_and_flagged_frames_are_counted_apart() -> None:
 
 
 def test_each_frame_shows_the_edge_across_the_axis_where_it_was() -> None:
-    frames = axes(draw_strip("a", tracking(), 1e-3))[1:]
+    frames = draw_strip("a", tracking(), 1e-3).axes[2:]
     titles = [ax.get_title(loc="left") for ax in frames]
     assert titles == ["frame 10, 10.0 ms", "frame 25, 25.0 ms", "frame 39, 39.0 ms"]
     for ax, at in zip(frames, (20, 125, 223), strict=True):

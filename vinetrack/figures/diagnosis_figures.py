@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -613,9 +613,7 @@ def assemble_tables(
         cosines=_cosine_cells(names, matrix),
         drift=drifting,
         missing_force=force,
-        rounds=[
-            (round_heading(i, diagnosis.rounds), ranking_table(ranked)) for i, ranked in enumerate(diagnosis.rounds)
-        ],
+        rounds=[(round_heading(i, diagnosis.rounds), ranking_table(one)) for i, one in enumerate(diagnosis.rounds)],
         worst=labels.get(worst, worst),
         added=listed_names(diagnosis.effects),
         learned_force=pd.DataFrame() if learned is None else learned,
@@ -654,12 +652,8 @@ def _start(trial: str, table: pd.DataFrame, compared: pd.DataFrame) -> tuple[flo
     if len(of_trial) == len(table):
         return time_s - float(of_trial["time_s"].iloc[0]), position_m - float(of_trial["lead_position_m"].iloc[0])
     origin_m = float(np.nanmin(table["lead_position_m"]))
-    return _first_moving_s(table, origin_m), origin_m
-
-
-def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:
-    growth = table["lead_position_m"].to_numpy(dtype=float) - origin_m
-    return float(table["time_s"].iloc[int(np.argmax(growth > 0.01 * np.nanmax(growth)))])
+    growth_m = table["lead_position_m"].to_numpy(dtype=float) - origin_m
+    return float(table["time_s"].iloc[int(np.argmax(growth_m > 0.01 * np.nanmax(growth_m)))]), origin_m
 
 
 def worst_condition(trials: pd.DataFrame) -> str:
@@ -672,78 +666,42 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in sections of its growth, for the figure `where`. The misfit
-    of the initial model and its error are taken from the diagnosis if it contains them.
+    """Return the mean misfit of every condition in sections of its growth, for the figure `where`: the sections of the
+    diagnosis with the misfit of the initial model there and its error, or else equal ones, with means over the trials.
     """
     import pandas as pd
+
+    from vinetrack.diagnosis.result import MAX_STRETCHES
 
     rows: list[dict[str, Any]] = []
     for condition, label in labels.items():
         members = trials[trials["condition"] == condition]
-        if len(members):
-            of_condition = located[located["condition"] == condition] if len(located) and condition else located[:0]
-            sections = _located_sections(of_condition, located) if len(of_condition) else _equal_sections(members)
-            name = {"condition": condition, "condition_label": label, "n_trials": int(members["trial"].nunique())}
-            rows += [name | row for row in _sections(members, *sections)]
+        members = members[members["time_s"] >= 0]
+        if not len(members):
+            continue
+        found = located[located["condition"] == condition] if len(located) and condition else located[:0]
+        if len(found):
+            along, whole_m = "model_before_m", located.loc[located["vine"] == found["vine"].iloc[0], "to_m"].max()
+            sections = found[["from_m", "to_m", "mean_residual_m", "sigma_m"]].to_numpy(dtype=float)
+        else:
+            along, whole_m = "lead_position_m", members["lead_position_m"].max()
+            ends = np.linspace(0.0, whole_m, MAX_STRETCHES + 1)
+            sections = np.array([(*section, np.nan, np.nan) for section in itertools.pairwise(ends)])
+        n_trials, models = members["trial"].nunique(), ["model_before_m", "model_after_m"]
+        misfits = members[models].rsub(members["lead_position_m"], axis=0)
+        for low, high, mean, sigma in sections if whole_m > 0 else ():
+            to_end = math.isnan(mean) and not high < whole_m
+            inside = (members[along] >= low) & (members[along] < (math.inf if to_end else high))
+            of_trials = misfits[inside].groupby(members["trial"]).mean()
+            if math.isnan(mean):
+                if of_trials["model_before_m"].isna().all():
+                    continue
+                mean = of_trials["model_before_m"].mean()
+                sigma = of_trials["model_before_m"].std() / math.sqrt(n_trials)
+            misfit = {"misfit_before_m": mean, "misfit_after_m": of_trials["model_after_m"].mean(), "scatter_m": sigma}
+            name = {"condition": condition, "condition_label": label, "n_trials": n_trials}
+            rows.append(name | {"growth_from": low / whole_m, "growth_to": high / whole_m} | misfit)
     return pd.DataFrame(rows)
-
-
-Section = tuple[float, float, float, float]  # Its ends, the mean misfit in it and the error of that, m
-
-
-def _located_sections(of_condition: pd.DataFrame, located: pd.DataFrame) -> tuple[str, float, list[Section]]:
-    """Return the sections of the diagnosis: along which column, the whole growth, and the sections."""
-    whole_m = float(located.loc[located["vine"] == of_condition["vine"].iloc[0], "to_m"].max())
-    columns = of_condition[["from_m", "to_m", "mean_residual_m", "sigma_m"]].to_numpy(dtype=float)
-    return "model_before_m", whole_m, [(low, high, mean, sigma) for low, high, mean, sigma in columns]
-
-
-def _equal_sections(members: pd.DataFrame) -> tuple[str, float, list[Section]]:
-    """Return equal sections of the measured growth, as `_located_sections`, without a misfit."""
-    from vinetrack.diagnosis.result import MAX_STRETCHES
-
-    whole_m = float(members["lead_position_m"].max())
-    edges = itertools.pairwise(np.linspace(0.0, whole_m, MAX_STRETCHES + 1))
-    return "lead_position_m", whole_m, [(low, high, math.nan, math.nan) for low, high in edges]
-
-
-def _sections(
-    members: pd.DataFrame, along: str, whole_m: float, sections: Sequence[Section]
-) -> Iterator[dict[str, float]]:
-    """Yield each section with its misfits; a misfit that is not given is the mean over the trials, with its standard
-    error.
-    """
-    for low, high, mean, sigma in sections if whole_m > 0 else ():
-        to_end = math.isnan(mean) and not high < whole_m
-        means = _mean_misfits(members, along, low, math.inf if to_end else high)
-        before, after = means["model_before_m"], means["model_after_m"]
-        if math.isnan(mean):
-            count = np.isfinite(before).sum()
-            if not count:
-                continue
-            mean = float(np.nanmean(before))
-            spread = float(np.nanstd(before, ddof=1)) if count > 1 else math.nan
-            sigma = spread / math.sqrt(members["trial"].nunique())
-        yield {
-            "growth_from": low / whole_m,
-            "growth_to": high / whole_m,
-            "misfit_before_m": mean,
-            "misfit_after_m": float(np.nanmean(after)) if np.isfinite(after).any() else math.nan,
-            "scatter_m": sigma,
-        }
-
-
-def _mean_misfits(members: pd.DataFrame, along: str, low: float, high: float) -> dict[str, np.ndarray]:
-    """Return the mean misfit of each trial, by model, where `low <= along < high`; NaN for a trial without points."""
-    chosen = members[(members["time_s"] >= 0) & (members[along] >= low) & (members[along] < high)]
-    means: dict[str, list[float]] = {"model_before_m": [], "model_after_m": []}
-    for trial in dict.fromkeys(members["trial"]):
-        part = chosen[chosen["trial"] == trial]
-        for model, values in means.items():
-            misfit = (part["lead_position_m"] - part[model]).to_numpy(dtype=float)
-            misfit = misfit[np.isfinite(misfit)]
-            values.append(float(misfit.mean()) if misfit.size else math.nan)
-    return {model: np.array(values) for model, values in means.items()}
 
 
 def round_heading(index: int, rounds: Sequence[Round]) -> str:

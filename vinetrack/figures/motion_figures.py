@@ -193,16 +193,31 @@ def draw_trial_motion(
     strip = row_of_axes(bottom_in, strip_in)
     speed = row_of_axes(bottom_in + strip_in + 0.1, 2.1, sharex=strip)
     lead = row_of_axes(bottom_in + strip_in + 0.1 + 2.1 + 0.14, 1.75, sharex=strip)
-    for ax in (lead, speed):
-        ax.tick_params(labelbottom=False)
+    for ax in (lead, speed, strip):
         ax.yaxis.set_label_coords(-0.095, 0.5)
+    strip.xaxis.set_label_coords(0.5, -0.29 / strip_in)
     _draw_position(lead, track, kinematics, unusable, by_hand)
     lead.set_title(title, pad=8, fontsize=fitting_size(title, 0.8 * 72 * 7.2, 11))
     _draw_speed(speed, kinematics, windows, travel_ratio)
     _draw_strip(strip, windows)
+    _share_ticks(strip, (lead, speed))
     for i, (colour, line) in enumerate(notes):
         fig.text(0.012, (text_in - 0.05 - i * line_in) / height_in, line, color=colour, fontsize=8.8, va="top")
     return fig
+
+
+def _share_ticks(below: Axes, above: Sequence[Axes]) -> None:
+    """Draw the ticks of an axis in the panels above it; tick by tick, matplotlib would take a tenth of the figure."""
+    low, high = below.get_xlim()
+    ticks = [tick for tick in below.get_xticks() if low <= tick <= high]
+    below.set_xlim(low, high)
+    for ax in above:
+        ax.xaxis.set_visible(False)
+        across = ax.get_xaxis_transform()
+        ax.vlines(ticks, 0, 1, color=GRID, lw=0.7, zorder=0.5, transform=across)
+        ax.plot(
+            ticks, [0] * len(ticks), ls="none", marker=3, ms=3.5, mew=0.8, color=INK, transform=across, clip_on=False
+        )
 
 
 def _draw_position(
@@ -232,9 +247,11 @@ def _draw_speed(ax: Axes, kinematics: pd.DataFrame, windows: pd.DataFrame, trave
     ax.set_ylim(*_speed_limits(speed_m_s, two_sigma_m_s))
     ax.set_ylabel("leading edge (m/s)")
     if travel_ratio != 1:
-        to_tail, to_lead = (lambda lead: travel_ratio * lead), (lambda tail: tail / travel_ratio)
-        right = ax.secondary_yaxis("right", functions=(to_tail, to_lead))
-        right.set_ylabel("tail (m/s)")
+        right = ax.twinx()
+        right.set(ylabel="tail (m/s)", ylim=[travel_ratio * limit for limit in ax.get_ylim()])
+        right.grid(visible=False)
+        right.yaxis.set_label_coords(1.07, 0.5)
+        right.spines[["left", "bottom"]].set_visible(False)
         right.spines["right"].set_visible(True)
 
 

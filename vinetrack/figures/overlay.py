@@ -106,23 +106,29 @@ def draw_pixel_places(subpixel_px: Floats) -> Figure | None:
 @look()
 def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     """Draw the strip of one tracked recording."""
-    aspect = min(max(picture.shape[0] / picture.shape[1] for _, picture in tracking.pictures), 2.2)
-    pictures_in = 7.2 / len(tracking.pictures) * aspect + 0.35
-    fig = new_figure(7.2, 3.9 + pictures_in)
-    above, below = np.asarray(fig.subfigures(2, 1, height_ratios=[3.9, pictures_in]))
-    above.patch.set_alpha(0)
-    below.patch.set_alpha(0)
-    ax = above.add_subplot()
+    n = len(tracking.pictures)
+    wide_in = 7.2 / n - 0.08
+    tall_in = min(max(picture.shape[0] / picture.shape[1] for _, picture in tracking.pictures), 2.2) * wide_in
+    scaled = np.isfinite(m_per_px)
+    below_in = tall_in + (1.35 if scaled else 0.8)
+    height_in = below_in + 2.95
+    fig = new_figure(7.2, height_in, layout=None)
+
+    def panel(left_in: float, bottom_in: float, width_in: float, tall_in: float) -> Axes:
+        return fig.add_axes((left_in / 7.2, bottom_in / height_in, width_in / 7.2, tall_in / height_in))
+
+    ax = panel(0.75, below_in, 6.38, 2.6)
+    ax.xaxis.set_label_coords(0.5, -0.115)
+    ax.yaxis.set_label_coords(-0.085, 0.5)
     _draw_kymograph(ax, tracking)
-    if np.isfinite(m_per_px):
-        mm_per_px = 1e3 * m_per_px
-        top = ax.secondary_xaxis(-0.21, functions=((lambda px: mm_per_px * px), (lambda mm: mm / mm_per_px)))
-        top.set_xlabel("along the growth axis (mm)")
+    if scaled:
+        scale = panel(0.75, below_in - 0.54, 6.38, 0.0)
+        scale.set(xlabel="along the growth axis (mm)", xlim=[1e3 * m_per_px * px for px in ax.get_xlim()], yticks=[])
+        scale.spines["left"].set_visible(False)
     legend_above(ax, 2)
     small_title(ax, title, loc="right", fontsize=10, color=MUTED)
-    frames = below.subplots(1, len(tracking.pictures), squeeze=False)[0]
-    for axes, (frame, picture) in zip(frames, tracking.pictures, strict=True):
-        _draw_frame(axes, tracking, frame, picture)
+    for i, (frame, picture) in enumerate(tracking.pictures):
+        _draw_frame(panel(0.04 + 7.2 * i / n, 0.05, wide_in, tall_in), tracking, frame, picture)
     return fig
 
 

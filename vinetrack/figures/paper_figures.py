@@ -264,10 +264,10 @@ def draw_paper_speeds(paper_speeds: pd.DataFrame, paper_speed_curves: pd.DataFra
     title = f"{reached['vine'].iloc[0]}, after {reached['final_at_mm'].iloc[0]:.4g} mm\n"
     title += f"N = {counted(counts, 'trial')} per point{error}"
     legend_above(ax, 2, title=title, alignment="left", fontsize=9)
-    note_below(
-        fig,
-        "B of this vine and the payloads other than 35.6 g are not printed; the paper shows its points only in a plot",
+    note = (
+        "B of this vine and the payloads other than 35.6 g are not printed; the paper shows its points only in a plot"
     )
+    note_below(fig, note)
     return fig
 
 

@@ -186,7 +186,12 @@ class FigureTables:
     @property
     def curves(self) -> pd.DataFrame:
         """Measured and modelled growth of all trials, at most `MAX_CURVE_ROWS` rows at an even stride."""
-        return _curves(self.results)
+        import pandas as pd
+
+        conditions = read_result(self.results.comparison)["condition"]
+        parts = [read_result(self.results.trajectories(name)).assign(condition=name) for name in conditions]
+        whole = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+        return whole.iloc[:: -(-len(whole) // MAX_CURVE_ROWS) or 1]
 
     @cached_property
     def diagnosed(self) -> DiagnosisTables | None:
@@ -194,18 +199,6 @@ class FigureTables:
         from vinetrack.figures.diagnosis_figures import read_diagnosis_tables
 
         return read_diagnosis_tables(self.results, self.trials)
-
-
-def _curves(results: Results) -> pd.DataFrame:
-    """Return measured and modelled growth of all trials, at most `MAX_CURVE_ROWS` rows at an even stride."""
-    import pandas as pd
-
-    conditions = read_result(results.comparison)["condition"]
-    parts = [read_result(results.trajectories(name)).assign(condition=name) for name in conditions]
-    if not parts:
-        return pd.DataFrame()
-    whole = pd.concat(parts, ignore_index=True)
-    return whole.iloc[:: -(-len(whole) // MAX_CURVE_ROWS)]
 
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
