@@ -17,47 +17,44 @@ from scipy.stats import multivariate_normal
 import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
+    SDIRK_GAMMA,
+    CoefficientLikelihood,
+    ForcePoint,
+    ForceProblem,
+    _with_updated_motions,
+    force_sensitivities,
+    integrate_responses,
+    motions_of,
+    splines,
+    uniform_splines,
+)
+from vinetrack.diagnosis.force_laws import (
     CONSTANT_AT_START,
     KEPT_VARIANCE,
     LENGTH_SCALES,
     RELATIVE_AMPLITUDES,
-    SDIRK_GAMMA,
     ZERO_AT_START,
     Domain,
+    Law,
     SmoothForce,
     candidate_domains,
     covariance_modes,
-    force_sensitivities,
-    integrate_responses,
-    motions_of,
-    on_tracks,
-    splines,
-    uniform_splines,
 )
-from vinetrack.diagnosis.force_laws import Law, SearchPoint, _with_updated_motions, normal_equations
 from vinetrack.diagnosis.learned_force import (
     LEARNED_COLUMNS,
     NEGLIGIBLE_LOG_RATIO,
-    CoefficientLikelihood,
     ForcePosterior,
     LearnedForce,
     marginal_likelihood,
     variable_weights,
 )
-from vinetrack.diagnosis.missing_force import (
-    FORCE_COLUMNS,
-    DetectedLaw,
-    LinearMisfit,
-    MissingForce,
-    linear_misfit,
-    missing_force,
-)
+from vinetrack.diagnosis.missing_force import FORCE_COLUMNS, DetectedLaw, MissingForce, force_problem, missing_force
 from vinetrack.diagnosis.propose import Proposal, effect_text, propose, table_name, table_text
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import State, own_effects
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE
+from vinetrack.inference.sensitivity import PRESSURE
 
 GROWTH = Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
 BOTH = Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, math.inf))
@@ -218,39 +215,36 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium() 
 
 
 @pytest.fixture(scope="module")
-def slowed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, LinearMisfit]:
+def slowed(tmp_path_factory: pytest.TempPathFactory) -> ForceProblem:
     """Vines with a friction along the growth, fitted by the model without it."""
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path_factory.mktemp("slowed"))
-    fit = vt.fit(vt.base_model(), pairs, profile=False)
-    return fit, linear_misfit(fit)
+    return force_problem(vt.fit(vt.base_model(), pairs, profile=False))
 
 
-def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(
-    slowed: tuple[Fit, LinearMisfit],
-) -> None:
+def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(slowed: ForceProblem) -> None:
     """The score of a trial's pressure deviation against a finite difference of the cost."""
-    fit, linear = slowed
-    domain = next(each for each in candidate_domains(linear.motions) if each.variables == ("growth", "pressure"))
+    tracks = slowed.on_tracks()
+    domain = next(each for each in candidate_domains(tracks.motions) if each.variables == ("growth", "pressure"))
     growth, pressure = (uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
     force = -0.5 * np.outer(*steep).ravel()
-    effects = linear.inversion.trial_effects
-    motions = on_tracks(linear.inversion, effects, linear.motions)
-    point = SearchPoint(fit.solution.state.theta, effects, SmoothForce(domain, np.eye(domain.size)), force, motions)
-    settled = point
-    for _ in range(12):  # where a point far off the tracks is settled depends on where it begins
-        settled = _with_updated_motions(fit, settled)
+    settled = replace(
+        tracks, force=SmoothForce(domain, np.eye(domain.size)), amplitude=force, motions_include_force=True
+    )
+
+    def at(point: ForcePoint, times: int) -> ForcePoint:
+        for _ in range(times):
+            point = _with_updated_motions(slowed.fit, point)
+        return point
+
+    settled = at(settled, 12)  # where a point far off the tracks is settled depends on where it begins
     trial = 0
-    mine = point.theta.size + domain.size + trial * N_TRIAL_EFFECTS + PRESSURE
-    slope = normal_equations(fit, linear.inversion, settled).score[mine]
+    slope = slowed.linearised(settled).grams[trial, PRESSURE, -1]
     costs = []
     for step in (-1e-4, 1e-4):
         effects = settled.trial_effects.copy()
         effects[trial, PRESSURE] += step
-        moved = replace(settled, trial_effects=effects)
-        for _ in range(3):
-            moved = _with_updated_motions(fit, moved)
-        costs.append(normal_equations(fit, linear.inversion, moved).cost)
+        costs.append(slowed.linearised(at(replace(settled, trial_effects=effects), 3)).cost)
     assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.005)
 
 

@@ -1,13 +1,14 @@
-"""Linear inversion for missing forces: generalised least squares with model parameters and trial effects free.
+"""Forces that a model lacks, estimated from positions: one linear problem, with all other unknowns free.
 
-The fit is linearised about its parameters and about given trial effects. With a force of amplitudes f, positions are
+Positions are linearised about motions that lie on the tracks, whatever the model says. With a force of amplitudes f,
 
-    y = J δθ + Z b_i + S f + e
+    y = J δθ + Z b_i + S f + d + e
 
 J the sensitivities to the model parameters θ, Z those to the effects b_i of trial i (release, origin, pressure, B), S
-those to the force amplitudes (`vinetrack.diagnosis.force_inversion`), and e AR(1) noise of the tracks. θ and b_i
-have normal priors. The trial effects are eliminated trial by trial, the model parameters over all trials (Schur
-complements of the normal equations), so that only equations for f remain.
+those to the force, d the response to what the model's forces lack along these motions (their defect), and e AR(1) noise
+of the tracks. θ, b_i and f have normal priors. The trial effects are eliminated trial by trial, the model parameters
+over all trials (Schur complements), so that only equations for f remain. For the final word motions respond to the
+force in full, and the same equations give the steps.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -26,12 +28,12 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, Scatter
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.dynamics.simulate import SimulationError, Trajectory, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, FitState, trial_effect_prior
-from vinetrack.inference.optimiser import FixedTerms, solve, track_correlation, variance_floor
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Job
+from vinetrack.inference.marginal_likelihood import trial_effect_prior
+from vinetrack.inference.optimiser import track_correlation, variance_floor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Job
 from vinetrack.inference.whitening import whiten
 
 # ------------------------------------------------------------------------------
@@ -350,241 +352,6 @@ def _responses(motions: Sequence[FittedMotion], acceleration: Floats) -> tuple[F
     return dx, dv
 
 
-INDEPENDENT_POINTS_PER_TRIAL = 10.0  # Effective number of independent residuals in one trial (chosen)
-
-
-PARAMETER_CUTOFF = 1e-11  # Relative eigenvalue below which a combination of model parameters is not estimable (derived)
-
-# Penalties on second differences among which generalised cross-validation chooses, relative to the mean information
-# about a coefficient (chosen)
-SMOOTHING_PENALTIES = np.geomspace(1e-6, 1e2, 17)
-
-
-@dataclass(frozen=True)
-class ForceEstimate:
-    """Least-squares estimate of force amplitudes, N, and the fall of χ² that they bring. `sigma` is the root mean
-    square standard error of an amplitude. `parameter_shift` is how far the model parameters move along, in the fit's
-    own scaling.
-    """
-
-    delta_chi2: float
-    amplitude: Floats
-    sigma: float
-    parameter_shift: Floats
-    degrees_of_freedom: int
-
-    @property
-    def delta_chi2_beyond_chance(self) -> float:
-        """The fall of χ² in excess of its expectation under no force; at least 0."""
-        return max(self.delta_chi2 - self.degrees_of_freedom, 0.0)
-
-
-class LinearInversion:
-    """A fit linearised about its parameters and given trial effects, ready to estimate any number of forces. The noise
-    variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial have
-    the standard deviations estimated from replicates.
-    """
-
-    def __init__(self, fit: Fit, trial_effects: Floats, scatter: Scatter) -> None:
-        data, problem = fit.predictor.data, fit.solution.problem
-        rho = track_correlation(data)
-        noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
-        self.scatter = scatter
-        spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
-        fitted = fit.solution.state
-        state = FitState(fitted.theta, trial_effects, spread, rho, np.maximum(noise, variance_floor(data)))
-        parameters_held = replace(problem, free=np.zeros_like(problem.free))
-        noise_held = FixedTerms(spread, (rho, state.variance))
-        # 8: most iterations of the trial effects (chosen)
-        solution = solve(fit.predictor, parameters_held, state, noise_held, warm=True, most_iterations=8)
-        self.data, self.problem = data, problem
-        self.state, self.columns = solution.state, solution.columns
-        self.trial_effect_precision = trial_effect_prior(problem, self.state)[1]
-        self.prior_score = -problem.prior_precision * (state.theta - problem.prior_mean)
-        self.conditions = [trial_data.trial.condition for trial_data in data]
-        self.n_points = float(sum(trial_data.time_s.size for trial_data in data))
-
-    @property
-    def trial_effects(self) -> Floats:
-        """The trial effects about which everything is linear, shape (n_trials, 4)."""
-        return self.state.trial_effects
-
-    def estimate_each(self, sensitivities: Sequence[Floats], columns: Sequence[int]) -> list[ForceEstimate]:
-        """Estimate each of several forces with none of the others present. Shapes: sensitivities (n_points,
-        n_columns).
-        """
-        products = self._products_without_trial_effects(sensitivities)
-        matrix, cross, total = self._sums_over_trials(products)
-        parameter_response = scaled_pseudo_inverse(matrix, PARAMETER_CUTOFF) @ cross
-        reduced = total - cross.T @ parameter_response
-        ends = np.concatenate([[0], np.cumsum(columns)])
-        return [
-            self._estimate(products, parameter_response, reduced, slice(a, b))
-            for a, b in itertools.pairwise(ends.tolist())
-        ]
-
-    def estimate_jointly(self, sensitivities: Sequence[Floats]) -> ForceEstimate:
-        """Estimate all force amplitudes together, the same in every trial. Shapes: sensitivities (n_points,
-        n_columns).
-        """
-        return self.estimate_each(sensitivities, [sensitivities[0].shape[1]])[0]
-
-    def estimate_by_condition(self, sensitivities: Sequence[Floats]) -> ForceEstimate:
-        """Estimate all force amplitudes together, with separate amplitudes for each condition. Shapes: sensitivities
-        (n_points, n_columns).
-        """
-        names = list(dict.fromkeys(self.conditions))
-        count = sensitivities[0].shape[1]
-        of_conditions = []
-        for condition, of_trial in zip(self.conditions, sensitivities, strict=True):
-            block = np.zeros((len(of_trial), count * len(names)))
-            k = names.index(condition) * count
-            block[:, k : k + count] = of_trial
-            of_conditions.append(block)
-        return self.estimate_jointly(of_conditions)
-
-    @cached_property
-    def chi2_without_force(self) -> float:
-        """χ² with model parameters and trial effects re-estimated and no force added."""
-        products = self._products_without_trial_effects([np.zeros((len(c), 0)) for c in self.columns])
-        matrix, cross, total = self._sums_over_trials(products)
-        covariance = scaled_pseudo_inverse(matrix, PARAMETER_CUTOFF)
-        return float(total[-1, -1] - cross[:, -1] @ covariance @ cross[:, -1])
-
-    def bic(self, delta_chi2: float, n_parameters: int, largest_delta_chi2: float) -> float:
-        """Bayesian information criterion of a force, relative to the force that explains most: smaller is better. The
-        misfit that not even the best force explains is counted as further noise: it inflates the variance of every
-        independent residual. Source: Schwarz, Annals of Statistics 6, 461 (1978), with χ² divided by that inflation.
-        """
-        independent_points = INDEPENDENT_POINTS_PER_TRIAL * len(self.data)
-        unexplained = max(self.chi2_without_force - largest_delta_chi2 - self.n_points, 0.0)
-        misfit = (largest_delta_chi2 - delta_chi2) / (1 + unexplained / independent_points)
-        return misfit + n_parameters * math.log(independent_points)
-
-    def smooth_force_by_condition(
-        self, sensitivities: Sequence[Floats], parameter_shift: Floats
-    ) -> dict[str, tuple[Floats, Floats]]:
-        """Estimate a smooth force in every condition: spline coefficients and their covariance. The coefficients
-        minimise χ² plus a penalty on their second differences (a P-spline, Eilers & Marx 1996). One penalty for all
-        conditions is chosen by generalised cross-validation. Returns dict of (coefficients, covariance): By condition;
-        shapes (n_columns,) in N and (n_columns, n_columns) in N². Shapes: sensitivities (n_points, n_columns);
-        parameter_shift (n_free,).
-        """
-        products = self._products_without_trial_effects(sensitivities)
-        k = self.problem.index.shape[1]
-        shift_of_keys = np.append(parameter_shift, 0.0)[self.problem.index]
-        names = list(dict.fromkeys(self.conditions))
-        condition_of_trial = np.array([names.index(condition) for condition in self.conditions])
-        count = sensitivities[0].shape[1]
-        information, score = np.zeros((len(names), count, count)), np.zeros((len(names), count))
-        residual_products = products[:, k:, -1] - np.einsum("nlk,nk->nl", products[:, k:, :k], shift_of_keys)
-        np.add.at(information, condition_of_trial, products[:, k:-1, k:-1])
-        np.add.at(score, condition_of_trial, residual_products[:, :-1])
-        second_difference = np.diff(np.eye(count), 2, axis=0)
-        unit = float(np.mean(np.einsum("nkk->n", information))) / count
-        roughness = unit * (second_difference.T @ second_difference + 1e-6 * np.eye(count))
-        best: tuple[float, Floats, Floats] | None = None
-        independent_points = INDEPENDENT_POINTS_PER_TRIAL * len(self.data)
-        unpenalised = np.linalg.solve(information + 1e-9 * roughness, score[:, :, None])[:, :, 0]
-        largest_gain = float(np.sum(score * unpenalised))
-        for penalty in SMOOTHING_PENALTIES:
-            inverse = np.linalg.inv(information + penalty * roughness)
-            coefficients = np.einsum("nkl,nl->nk", inverse, score)
-            lost_gain = largest_gain - float(
-                np.sum(2 * coefficients * score) - np.einsum("nk,nkl,nl->", coefficients, information, coefficients)
-            )
-            degrees_of_freedom = float(np.einsum("nkl,nlk->", inverse, information))
-            cross_validation = (lost_gain + independent_points) / max(independent_points - degrees_of_freedom, 1.0) ** 2
-            if best is None or cross_validation < best[0]:
-                best = cross_validation, coefficients, inverse
-        assert best is not None
-        residual_dof = max(self.n_points - count * len(names), 1.0)
-        unmoved = not parameter_shift.any()
-        inflation = max(1.0, (self.chi2_without_force - largest_gain) / residual_dof) if unmoved else 1.0
-        return {name: (best[1][i], inflation * best[2][i]) for i, name in enumerate(names)}
-
-    def _products_without_trial_effects(self, sensitivities: Sequence[Floats]) -> Floats:
-        """Cross products of [parameters, forces, residual] of each trial, its trial effects eliminated. Shape
-        (n_trials, n_keys + n_forces + 1, the same again).
-        """
-        products = []
-        for i, (columns, of_force) in enumerate(zip(self.columns, sensitivities, strict=True)):
-            deviations = self.state.trial_effects[i, list(DEVIATION_COLUMNS)]
-            residual = columns[:, -1] + columns[:, list(DEVIATION_COLUMNS)] @ deviations
-            rows = np.column_stack([columns[:, :-1], of_force, residual])
-            white = whiten(rows, self.data[i].first, self.state.rho, self.data[i].relative_sd)
-            gram = white.T @ white / self.state.variance[i]
-            effects, others = slice(None, N_TRIAL_EFFECTS), slice(N_TRIAL_EFFECTS, None)
-            of_effects = gram[effects, effects] + np.diag(self.trial_effect_precision[i])
-            eliminated = gram[others, effects] @ np.linalg.solve(of_effects, gram[effects, others])
-            products.append(gram[others, others] - eliminated)
-        return np.array(products)
-
-    def _sums_over_trials(self, products: Floats) -> tuple[Floats, Floats, Floats]:
-        """Normal equations over all trials, with the priors of the p model parameters. Blocks: parameters by parameters
-        (p, p); parameters by [forces, residual] (p, L + 1); the latter by themselves.
-        """
-        k, p = self.problem.index.shape[1], self.prior_score.size
-        index = self.problem.index
-        matrix, cross = np.zeros((p + 1, p + 1)), np.zeros((p + 1, products.shape[1] - k))
-        np.add.at(matrix, (index[:, :, None], index[:, None, :]), products[:, :k, :k])
-        np.add.at(cross, index, products[:, :k, k:])
-        matrix, cross = matrix[:p, :p] + np.diag(self.problem.prior_precision), cross[:p].copy()
-        cross[:, -1] += self.prior_score
-        held = ~self.problem.free | ~(np.diag(matrix) > 0)
-        matrix[held, :] = matrix[:, held] = cross[held] = 0.0
-        return matrix, cross, products[:, k:, k:].sum(axis=0)
-
-    def _estimate(self, products: Floats, parameter_response: Floats, reduced: Floats, columns: slice) -> ForceEstimate:
-        """The force whose amplitudes are in `columns`, from the equations with all other unknowns eliminated. Its
-        standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
-        """
-        # Part of the largest information below which a force amplitude is not estimable (chosen)
-        least_relative_information = 1e-9
-        information, score = reduced[columns, columns], reduced[columns, -1]
-        size = np.diag(information)
-        estimable = size > least_relative_information * max(float(size.max()), 1e-300)
-        if not estimable.any():
-            return ForceEstimate(0.0, np.zeros(score.size), math.inf, np.zeros(parameter_response.shape[0]), 0)
-        covariance = scaled_pseudo_inverse(information, least_relative_information, estimable)
-        amplitude = covariance @ score
-        shift = parameter_response[:, -1] - parameter_response[:, columns] @ amplitude
-        scores = self._scores_by_trial(products, parameter_response[:, columns], columns, amplitude, shift)
-        n_trials = len(scores)
-        residual_dof = max(n_trials - shift.size - score.size, 1)
-        robust = covariance @ (scores.T @ scores * n_trials / residual_dof) @ covariance
-        sigma = math.sqrt(max(float(np.trace(covariance)), float(np.trace(robust))) / score.size)
-        return ForceEstimate(float(score @ amplitude), amplitude, sigma, shift, int(np.count_nonzero(estimable)))
-
-    def _scores_by_trial(
-        self, products: Floats, parameter_response: Floats, columns: slice, amplitude: Floats, shift: Floats
-    ) -> Floats:
-        """Contribution of each trial to the score of the amplitudes at the estimate, shape (n_trials, n_columns)."""
-        k = self.problem.index.shape[1]
-        index = self.problem.index
-        shift_of_keys = np.append(shift, 0.0)[index]
-        forces = slice(k + columns.start, k + columns.stop)
-        residual_products = (
-            products[:, :, -1]
-            - np.einsum("nqk,nk->nq", products[:, :, :k], shift_of_keys)
-            - products[:, :, forces] @ amplitude
-        )
-        response_of_keys = np.vstack([parameter_response, np.zeros((1, parameter_response.shape[1]))])[index]
-        return np.asarray(
-            residual_products[:, forces] - np.einsum("nkl,nk->nl", response_of_keys, residual_products[:, :k])
-        )
-
-
-def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.bool_] | None = None) -> Floats:
-    """Pseudo-inverse of a symmetric matrix after scaling its diagonal to 1. Returns zero in the rows and columns that
-    do not take part. Shapes: matrix (n, n); estimable (n,) → (n, n).
-    """
-    diagonal = np.diag(matrix)
-    scale = np.where(diagonal > 0 if estimable is None else estimable, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
-    inverse = np.linalg.pinv(matrix * scale[:, None] * scale, rcond=cutoff, hermitian=True)
-    return np.asarray(inverse * scale[:, None] * scale)
-
-
 # ------------------------------------------------------------------------------
 # Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
 #
@@ -598,11 +365,6 @@ def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.b
 
 # Penalties on second differences, relative to the information from positions (chosen)
 SMOOTHED_MOTIONS_SMOOTHING_PENALTIES = np.geomspace(1e-8, 1e2, 21)
-
-
-def on_tracks(inversion: LinearInversion, trial_effects: Floats, motions: Sequence[FittedMotion]) -> list[FittedMotion]:
-    """Move motions onto their tracks and evaluate the model along them. Shapes: trial_effects (n_trials, 4)."""
-    return [_on_track(inversion.data[i], trial_effects[i], motion) for i, motion in enumerate(motions)]
 
 
 def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
@@ -662,252 +424,455 @@ def _penalised_fit(design: Floats, values: Floats) -> Floats:
 
 
 # ------------------------------------------------------------------------------
-# Smooth forces over one variable or two: cubic B-splines with a Gaussian-process prior on their coefficients.
-#
-# The coefficients are the values of a Gaussian process at the centres of the splines, with covariance
-#
-#     a² Π_d (1 + s_d + s_d²/3) exp(−s_d),   s_d = √5 |u_d − u'_d|/ℓ_d
-#
-# where u are the variables scaled to the range that the trials visited: the Matérn kernel of order 5/2 (Rasmussen &
-# Williams 2006, §4.2). Its functions are twice differentiable. The squared-exponential kernel exp(−½ s²), whose
-# functions
-# are infinitely smooth, gives bands that are far too narrow for a force such as a power of the growth: in a linear fit
-# to
-# draws they contain a third of the points instead of nearly all. The model is a penalised spline with an amplitude a,
-# N,
-# and length scales ℓ_d as hyperparameters (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015).
-
-# What a force may depend on, and the attribute of a motion that holds it
-VARIABLES = {
-    "growth": "lead_position_m",
-    "speed": "tail_velocity_m_s",
-    "time": "time_s",
-    "pressure": "pressure_Pa",
-}
-
-SPLINES_ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
-# Splines along a variable, when it is alone and when it is one of two (chosen)
-SPLINES_IN_PAIR = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
-
-# Length scales that are averaged over, as parts of the visited range (chosen)
-LENGTH_SCALES = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
-
-# Amplitudes that are averaged over, as parts of the largest drive (chosen)
-RELATIVE_AMPLITUDES = np.geomspace(0.003, 0.3, 9)
-
-KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4  # Relative variances below which a mode is dropped (chosen)
-
-# What a force may be where growth begins
-ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
+# One linear problem for every question about a force: least squares about a set of motions, all other unknowns free.
 
 
-def standard_error(basis: Floats, covariance: Floats) -> Floats:
-    """Standard error of a linear combination of coefficients, for each row of a basis. Shapes: basis (n, n_splines);
-    covariance (n_splines, n_splines) → (n,).
-    """
-    return np.asarray(np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis)))
-
-
-@lru_cache(maxsize=256)
-def covariance_modes(count: int, length: float, *, zero_at_start: bool = False) -> tuple[Floats, Floats]:
-    """Eigenvectors and eigenvalues of the covariance of a unit-variance process at the centres of the splines. Returns
-    eigenvectors, variances. Shape (count, count).
-    """
-    knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, count - 2), [1.0] * 3])
-    at = np.array([knots[k + 1 : k + 4].mean() for k in range(count)])
-    distance = math.sqrt(5) * np.abs(at[:, None] - at) / length
-    covariance = (1 + distance + distance**2 / 3) * np.exp(-distance)
-    if zero_at_start:
-        covariance = covariance - np.outer(covariance[:, 0], covariance[0])
-    variances, eigenvectors = np.linalg.eigh(covariance)
-    variances = np.maximum(variances, 0.0)
-    # Cached and shared, so made read-only: the same few are needed thousands of times.
-    for array in (eigenvectors, variances):
-        array.flags.writeable = False
-    return eigenvectors, variances
-
-
-@dataclass(frozen=True)
-class Domain:
-    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
-    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
-    """
-
-    variables: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    counts: tuple[int, ...]
-    log_scale: tuple[float, ...]
-
-    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
-        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
-        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
-        """
-        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
-        return [
-            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
-            if math.isfinite(log_scale)
-            else (at - low) / (high - low)
-            for at, low, high, log_scale in limits
-        ]
-
-    @property
-    def name(self) -> str:
-        """The variables joined by +: `growth`, `growth+speed`."""
-        return "+".join(self.variables)
-
-    @property
-    def size(self) -> int:
-        """Total number of splines (products of splines, for two variables)."""
-        return math.prod(self.counts)
-
-    def values_along(self, motion: FittedMotion) -> list[Floats]:
-        """The variables along a motion, SI, each of shape (n_times,)."""
-        return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
-
-    def basis(self, values: Sequence[Floats]) -> Floats:
-        """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, size)."""
-        indices, products = self._nonzero_products(values)
-        design = np.zeros((len(indices), self.size))
-        np.put_along_axis(design, indices, products, axis=1)
-        return design
-
-    def evaluate(self, values: Sequence[Floats], coefficients: Floats) -> Floats:
-        """Sum of all splines times their coefficients at these values. Shapes: values (n,); coefficients (size,) →
-        (n,).
-        """
-        indices, products = self._nonzero_products(values)
-        return np.asarray(np.einsum("ns,ns->n", products, coefficients[indices]))
-
-    def _nonzero_products(self, values: Sequence[Floats]) -> tuple[np.ndarray, Floats]:
-        """Indices and values of the nonzero products of splines, shape (n, 4^n_variables)."""
-        indices, products = np.zeros((len(values[0]), 1), dtype=int), np.ones((len(values[0]), 1))
-        for position, count in zip(self.normalised(values), self.counts, strict=True):
-            first, splines = nonzero_splines(position, uniform_knots(count))
-            along_axis = first[:, None] + np.arange(N_NONZERO)
-            indices = (indices[:, :, None] * count + along_axis[:, None, :]).reshape(len(position), -1)
-            products = (products[:, :, None] * splines[:, None, :]).reshape(len(position), -1)
-        return indices, products
-
-    @property
-    def start_axis(self) -> int:
-        """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
-        return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
-
-    @property
-    def start_conditions(self) -> tuple[str, ...]:
-        """What a force over these variables may be where growth begins."""
-        if self.start_axis < 0:
-            return (FREE_AT_START,)
-        return (
-            (ZERO_AT_START, CONSTANT_AT_START)
-            if len(self.variables) == 1
-            else (ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START)
-        )
-
-    def prior_modes(
-        self, lengths: Sequence[float], at_start: str = FREE_AT_START, least_variance: float = KEPT_VARIANCE
-    ) -> Floats:
-        """Square root of the prior covariance: coefficients of the splines for each mode at unit amplitude. Shape
-        (size, n_modes).
-        """
-        start_axis = self.start_axis
-        by_axis = [
-            covariance_modes(count, length, zero_at_start=k == start_axis)
-            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
-        ]
-        columns = [_product(by_axis, least_variance)]
-        if start_axis >= 0 and at_start == CONSTANT_AT_START:
-            columns.append(np.ones((self.size, 1)))
-        if start_axis >= 0 and at_start == FREE_AT_START:
-            # 3.0: prior amplitude of the force where growth begins, as a multiple of that of the rest of
-            # the surface (chosen)
-            constant_along_start_axis = [
-                (np.ones((count, 1)), np.array([3.0**2])) if k == start_axis else modes
-                for k, (count, modes) in enumerate(zip(self.counts, by_axis, strict=True))
-            ]
-            columns.append(_product(constant_along_start_axis, least_variance))
-        return np.hstack(columns)
-
-
-def _product(by_axis: Sequence[tuple[Floats, Floats]], least_variance: float) -> Floats:
-    """Modes of a product of processes, scaled by the root of their variance, shape (n_splines, n_modes kept)."""
-    variances: Floats = np.ones(1)
-    for _, of_axis in by_axis:
-        variances = np.asarray(np.kron(variances, of_axis))
-    kept = np.flatnonzero(variances > least_variance * variances.max())
-    vectors: Floats = np.ones((1, kept.size))
-    indices = np.unravel_index(kept, [of_axis.size for _, of_axis in by_axis])
-    for (eigenvectors, _), index in zip(by_axis, indices, strict=True):
-        vectors = (vectors[:, None, :] * eigenvectors[None, :, index]).reshape(-1, kept.size)
-    return np.asarray(vectors * np.sqrt(variances[kept]))
-
-
-@dataclass(frozen=True)
-class SmoothForce:
-    """A force over a domain whose amplitudes have independent normal priors of standard deviation `sd_N`. `modes`,
-    shape (n_splines, n_amplitudes), are the spline coefficients for unit amplitudes. An infinite `sd_N` leaves the
-    amplitudes free.
-    """
-
-    domain: Domain
-    modes: Floats
-    sd_N: float = math.inf
+class Force(Protocol):
+    """Forces that are searched for: those of unit amplitudes along a motion, and the prior of the amplitudes."""
 
     @property
     def amplitude_precision(self) -> float:
-        """Prior precision of each amplitude, 1/N²."""
-        return self.sd_N**-2
-
-    @property
-    def shape_names(self) -> tuple[str, ...]:
-        """No shape parameters: the amplitudes are the only unknowns."""
-        return ()
-
-    def size_of(self, name: str) -> float:  # pragma: no cover
-        """Not applicable: there are no shape parameters."""
-        raise KeyError(name)
-
-    def shifted(self, name: str, by: float) -> SmoothForce:  # pragma: no cover
-        """Not applicable: there are no shape parameters."""
-        raise KeyError(name, by)
-
-    def within_growth(self, growth_m: float) -> SmoothForce:  # noqa: ARG002
-        """Return itself: the force is constant beyond the visited range."""
-        return self
-
-    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
-        """The force with these amplitudes along a motion. Shapes: amplitude (n_columns,) → (n_times,)."""
-        return self.domain.evaluate(self.domain.values_along(motion), self.modes @ amplitude)
+        """Prior precision of each amplitude, 1/N²; 0 where it is free."""
 
     def unit_force(self, motion: FittedMotion) -> Floats:
-        """The force of each unit amplitude along a motion. Shape (n_times, n_columns)."""
-        return np.asarray(self.domain.basis(self.domain.values_along(motion)) @ self.modes)
+        """The force of each unit amplitude along a motion. Shape (n_times, n_amplitudes)."""
+
+    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
+        """The force with these amplitudes along a motion. Shapes: amplitude (n_amplitudes,) → (n_times,)."""
 
 
-def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
-    """Every variable alone, then every pair, over the ranges that the motions visit."""
-    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
-    ranges: dict[str, tuple[float, float, float]] = {}
-    for name, attribute in VARIABLES.items():
-        by_trial = [
-            np.asarray(getattr(motion, attribute))[motion.time_s <= motion.counts_until_s] for motion in motions
-        ]
-        # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
-        high = max(float(np.quantile(values, 0.98) if name == "speed" else values.max()) for values in by_trial)
-        low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
-        # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
-        if high - low > 0.02 * abs(high):
-            if name == "pressure":
-                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
-            typical = float(np.median([np.median(values) for values in by_trial]))
-            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
-            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
+PARAMETER_CUTOFF = 1e-11  # Relative eigenvalue below which a combination of model parameters is not estimable (derived)
+LEAST_INFORMATION = 1e-9  # Part of the largest information below which an amplitude is not estimable (chosen)
+STEP_CUTOFF = 1e-12  # The same for a combination of all unknowns in a step (derived)
 
-    def domain(names: tuple[str, ...], counts: dict[str, int]) -> Domain:
-        lows, highs, log_scales = zip(*(ranges[name] for name in names), strict=True)
-        return Domain(names, lows, highs, tuple(counts[name] for name in names), log_scales)
 
-    return [domain((name,), SPLINES_ALONE) for name in ranges] + [
-        domain(pair, SPLINES_IN_PAIR) for pair in itertools.combinations(ranges, 2)
+@dataclass(frozen=True)
+class FreeForce:
+    """Forces of free amplitudes: any functions of the motion."""
+
+    unit_force: Callable[[FittedMotion], Floats]
+    amplitude_precision: float = 0.0
+
+    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
+        """The force with these amplitudes along a motion. Shapes: amplitude (n_amplitudes,) → (n_times,)."""
+        return np.asarray(self.unit_force(motion) @ amplitude)
+
+
+@dataclass(frozen=True)
+class ForcePoint:
+    """Values of all unknowns, and the motions that they are linearised about. Where `motions_include_force`, the
+    motions are those of these parameters and this force. Otherwise they are others near by, and their defect (by how
+    much they violate the equation of motion) is carried as a residual.
+    """
+
+    theta: Floats
+    trial_effects: Floats
+    force: Force
+    amplitude: Floats
+    motions: Sequence[FittedMotion]
+    motions_include_force: bool = False
+
+    def asking(self, force: Force) -> ForcePoint:
+        """The same motions, to ask what another force explains: its amplitudes are 0, and the defect is all of it."""
+        count = force.unit_force(self.motions[0]).shape[1]
+        return replace(self, force=force, amplitude=np.zeros(count), motions_include_force=False)
+
+
+@dataclass(frozen=True)
+class ForceEstimate:
+    """Least-squares estimate of force amplitudes, N, and the fall of χ² that they bring. `sigma` is the root mean
+    square standard error of an amplitude. `parameter_shift` is how far the model parameters move along, in the fit's
+    own scaling.
+    """
+
+    delta_chi2: float
+    amplitude: Floats
+    sigma: float
+    parameter_shift: Floats
+    degrees_of_freedom: int
+
+    @property
+    def delta_chi2_beyond_chance(self) -> float:
+        """The fall of χ² in excess of its expectation under no force; at least 0."""
+        return max(self.delta_chi2 - self.degrees_of_freedom, 0.0)
+
+
+@dataclass(frozen=True)
+class CoefficientLikelihood:
+    """Quadratic log-likelihood of the amplitudes, all other unknowns integrated out. `information` and `score` are about
+    amplitudes of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to the best amplitudes. `log_determinant` is
+    that of the information on all other unknowns.
+    """
+
+    information: Floats
+    score: Floats
+    chi2_at_zero: float
+    delta_chi2: float
+    log_determinant: float
+
+    @property
+    def least_chi2(self) -> float:
+        """χ² of the best coefficients, without regard to the smoothness prior."""
+        return self.chi2_at_zero - self.delta_chi2
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all entries are finite: far outside the visited range the equations overflow."""
+        parts = (self.information, self.score, self.chi2_at_zero, self.delta_chi2, self.log_determinant)
+        return all(bool(np.isfinite(part).all()) for part in parts)
+
+
+class ForceProblem:
+    """A fit, the noise of its tracks, and the priors of its parameters and trial effects: what is asked of forces. The
+    noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial
+    have the standard deviations estimated from replicates.
+    """
+
+    def __init__(self, fit: Fit, scatter: Scatter) -> None:
+        self.fit, self.data, self.scatter = fit, fit.predictor.data, scatter
+        self.prior = fit.solution.problem
+        self.rho = track_correlation(self.data)
+        noise = np.array([trial_data.noise_m**2 for trial_data in self.data]) * (1 - self.rho**2)
+        self.variance = np.maximum(noise, variance_floor(self.data))
+        spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
+        state = replace(fit.solution.state, spread=spread)
+        self.effects_mean, self.effects_precision = trial_effect_prior(self.prior, state)
+        self.conditions = [trial_data.trial.condition for trial_data in self.data]
+        self.n_points = float(sum(trial_data.time_s.size for trial_data in self.data))
+
+    def on_tracks(self) -> ForcePoint:
+        """The motions that lie on the tracks, whatever the model says, at the parameters of the fit."""
+        effects = np.zeros_like(self.effects_mean)
+        effects[:, :2] = self.effects_mean[:, :2]
+        motions = motions_of(self.fit, effects)
+        on_tracks = [_on_track(self.data[i], effects[i], motion) for i, motion in enumerate(motions)]
+        none = FreeForce(lambda motion: np.zeros((motion.time_s.size, 0)))
+        return ForcePoint(self.fit.solution.state.theta, effects, none, np.zeros(0), on_tracks)
+
+    @property
+    def independent_points(self) -> float:
+        """Effective number of independent residuals where a model leaves more than noise."""
+        # 10.0: of one trial (chosen)
+        return 10.0 * len(self.data)
+
+    def bic(self, chi2_without_force: float, delta_chi2: float, n_parameters: int, largest_delta_chi2: float) -> float:
+        """Bayesian information criterion of a force, relative to the force that explains most: smaller is better. The
+        misfit that not even the best force explains is counted as further noise: it inflates the variance of every
+        independent residual. Source: Schwarz, Annals of Statistics 6, 461 (1978), with χ² divided by that inflation.
+        """
+        unexplained = max(chi2_without_force - largest_delta_chi2 - self.n_points, 0.0)
+        misfit = (largest_delta_chi2 - delta_chi2) / (1 + unexplained / self.independent_points)
+        return misfit + n_parameters * math.log(self.independent_points)
+
+    def linearised(self, point: ForcePoint) -> LinearForce:
+        """Positions as linear functions of all unknowns about a point."""
+        accelerations = _acceleration_derivatives(self.fit, point)
+        sensitivities = acceleration_sensitivities(self.fit, point.trial_effects, point.motions, accelerations)
+        grams = []
+        for i, trial_data in enumerate(self.data):
+            position, velocity = _observed(point.motions[i], trial_data.time_s - point.trial_effects[i, RELEASE])
+            residual = trial_data.lead_position_m - point.trial_effects[i, ORIGIN] - position
+            of_trial = sensitivities[i]
+            if not point.motions_include_force:
+                of_trial, of_defect = of_trial[:, :-1], of_trial[:, -1]
+                residual = residual - of_defect
+            rows = np.column_stack([-velocity, np.ones(residual.size), of_trial, residual])
+            used = _points_before_end(trial_data, point.trial_effects[i])
+            relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
+            white = whiten(rows[used], trial_data.first[used], self.rho, relative_sd)
+            grams.append(white.T @ white / self.variance[i])
+        return LinearForce(self, point, np.array(grams))
+
+
+class LinearForce:
+    """The normal equations about a point. `cost` is χ² there with all priors. Trial by trial the unknowns are its
+    effects, the model parameters that it depends on, and the amplitudes of the force; the effects are eliminated in
+    each trial, then the parameters over all trials (Schur complements).
+    """
+
+    def __init__(self, problem: ForceProblem, point: ForcePoint, grams: Floats) -> None:
+        self.problem, self.point, self.grams = problem, point, grams
+        prior, p, q = problem.prior, point.theta.size, point.amplitude.size
+        off = point.trial_effects - problem.effects_mean
+        from_mean = point.theta - prior.prior_mean
+        each = np.arange(N_TRIAL_EFFECTS)
+        grams[:, each, each] += problem.effects_precision
+        grams[:, each, -1] -= problem.effects_precision * off
+        grams[:, -1, each] = grams[:, each, -1]
+        self.prior_precision = np.concatenate([prior.prior_precision, np.full(q, point.force.amplitude_precision)])
+        self.prior_score = -self.prior_precision * np.concatenate([from_mean, point.amplitude])
+        self.cost = float(grams[:, -1, -1].sum() + np.sum(problem.effects_precision * off**2))
+        self.cost += float(self.prior_precision @ np.concatenate([from_mean, point.amplitude]) ** 2)
+        # Places of a trial's parameters and amplitudes among all; parameters that it does not depend on come last.
+        keys = np.where(prior.index >= 0, prior.index, p + q)
+        self.places = np.hstack([keys, np.broadcast_to(p + np.arange(q), (len(keys), q))])
+        self.eliminated, self.response = self._without_effects(0.0)
+
+    def _without_effects(self, damping: float) -> tuple[Floats, Floats]:
+        """Products of [parameters, amplitudes, residual] of each trial, its effects eliminated, and the response of the
+        effects to those. Shapes (n_trials, m, m), (n_trials, 4, m).
+        """
+        effects, others = slice(None, N_TRIAL_EFFECTS), slice(N_TRIAL_EFFECTS, None)
+        of_effects = self.grams[:, effects, effects] * (1 + damping * np.eye(N_TRIAL_EFFECTS))
+        response = np.linalg.solve(of_effects, self.grams[:, effects, others])
+        return self.grams[:, others, others] - self.grams[:, others, effects] @ response, np.asarray(response)
+
+    def _blocks(self, products: Floats) -> tuple[Floats, Floats, Floats]:
+        """Normal equations over all trials, with priors: parameters by themselves (p, p), by [amplitudes, residual]
+        (p, q + 1), and the latter by themselves.
+        """
+        prior = self.problem.prior
+        k, p = prior.index.shape[1], prior.prior_mean.size
+        index = np.where(prior.index >= 0, prior.index, p)
+        parameters, cross = np.zeros((p + 1, p + 1)), np.zeros((p + 1, products.shape[1] - k))
+        np.add.at(parameters, (index[:, :, None], index[:, None, :]), products[:, :k, :k])
+        np.add.at(cross, index, products[:, :k, k:])
+        parameters, cross = parameters[:p, :p] + np.diag(self.prior_precision[:p]), cross[:p]
+        cross[:, -1] += self.prior_score[:p]
+        rest = products[:, k:, k:].sum(axis=0)
+        rest[:-1, :-1] += np.diag(self.prior_precision[p:])
+        rest[:-1, -1] += self.prior_score[p:]
+        held = ~prior.free | ~(np.diag(parameters) > 0)
+        parameters[held, :] = parameters[:, held] = cross[held] = 0.0
+        return parameters, cross, rest
+
+    @cached_property
+    def blocks(self) -> tuple[Floats, Floats, Floats]:
+        """The normal equations with the trial effects eliminated; see `_blocks`."""
+        return self._blocks(self.eliminated)
+
+    @cached_property
+    def parameter_response(self) -> Floats:
+        """Steps of the parameters by [each amplitude, the residual], shape (p, q + 1)."""
+        parameters, cross, _ = self.blocks
+        return np.asarray(scaled_pseudo_inverse(parameters, PARAMETER_CUTOFF) @ cross)
+
+    @cached_property
+    def chi2_without_force(self) -> float:
+        """χ² with parameters and trial effects estimated anew, and the amplitudes as they are at the point."""
+        gained = float(self.blocks[1][:, -1] @ self.parameter_response[:, -1])
+        return self.cost - float((self.grams[:, -1, -1] - self.eliminated[:, -1, -1]).sum()) - gained
+
+    def estimates(self, widths: Sequence[int]) -> list[ForceEstimate]:
+        """Each of several forces estimated with none of the others present: so many amplitudes each, in order."""
+        _, cross, rest = self.blocks
+        reduced = rest - cross.T @ self.parameter_response
+        ends = np.concatenate([[0], np.cumsum(widths)])
+        return [self._estimate(reduced, slice(a, b)) for a, b in itertools.pairwise(ends.tolist())]
+
+    def _estimate(self, reduced: Floats, columns: slice) -> ForceEstimate:
+        """The force whose amplitudes are in `columns`, from the equations with all other unknowns eliminated. Its
+        standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
+        """
+        information, score = reduced[columns, columns], reduced[columns, -1]
+        size = np.diag(information)
+        estimable = size > LEAST_INFORMATION * max(float(size.max()), 1e-300)
+        response = self.parameter_response
+        if not estimable.any():
+            return ForceEstimate(0.0, np.zeros(score.size), math.inf, np.zeros(len(response)), 0)
+        covariance = scaled_pseudo_inverse(information, LEAST_INFORMATION, estimable)
+        amplitude = covariance @ score
+        shift = response[:, -1] - response[:, columns] @ amplitude
+        scores = self._scores_by_trial(columns, amplitude, shift)
+        residual_dof = max(len(scores) - shift.size - score.size, 1)
+        robust = covariance @ (scores.T @ scores * len(scores) / residual_dof) @ covariance
+        sigma = math.sqrt(max(float(np.trace(covariance)), float(np.trace(robust))) / score.size)
+        return ForceEstimate(float(score @ amplitude), amplitude, sigma, shift, int(np.count_nonzero(estimable)))
+
+    def _scores_by_trial(self, columns: slice, amplitude: Floats, shift: Floats) -> Floats:
+        """Contribution of each trial to the score of the amplitudes at the estimate, shape (n_trials, n_columns)."""
+        index, products = self.problem.prior.index, self.eliminated
+        k = index.shape[1]
+        forces = slice(k + columns.start, k + columns.stop)
+        residual_products = (
+            products[:, :, -1]
+            - np.einsum("nqk,nk->nq", products[:, :, :k], np.append(shift, 0.0)[index])
+            - products[:, :, forces] @ amplitude
+        )
+        response = self.parameter_response[:, columns]
+        of_keys = np.vstack([response, np.zeros((1, response.shape[1]))])[index]
+        return np.asarray(residual_products[:, forces] - np.einsum("nkl,nk->nl", of_keys, residual_products[:, :k]))
+
+    def likelihood(self) -> CoefficientLikelihood:
+        """Integrate out all unknowns but the amplitudes, after scaling each unknown to unit information."""
+        # Information, where each unknown alone has 1, below which a combination of unknowns is not estimable (derived)
+        least_information = 1e-8
+        parameters, cross, rest = self.blocks
+        size = np.diag(parameters)
+        unit = 1 / np.sqrt(size[size > 0])
+        values, vectors = np.linalg.eigh(parameters[np.ix_(size > 0, size > 0)] * unit[:, None] * unit)
+        estimable = values > least_information
+        root = vectors[:, estimable] / np.sqrt(values[estimable])
+        explained = root.T @ (cross[size > 0] * unit[:, None])
+        reduced = rest - explained.T @ explained
+        of_effects = self.grams[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS]
+        own = np.einsum("nkk->k", self.grams)[-len(rest) : -1] + self.prior_precision[size.size :]
+        scale = np.sqrt(own)
+        inverse_scale = np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)
+        strength, directions = np.linalg.eigh(reduced[:-1, :-1] * inverse_scale[:, None] * inverse_scale)
+        # Directions that other unknowns reproduce have information only from rounding.
+        directions, strength = directions[:, strength > least_information], strength[strength > least_information]
+        back = scale[:, None] * directions
+        local_score = directions.T @ (reduced[:-1, -1] * inverse_scale)
+        at_point = scale * self.point.amplitude @ directions
+        cost = self.chi2_without_force
+        return CoefficientLikelihood(
+            information=(back * strength) @ back.T,
+            score=back @ (local_score + strength * at_point),
+            chi2_at_zero=cost + 2 * float(local_score @ at_point) + float(strength @ at_point**2),
+            delta_chi2=float(np.sum((local_score + strength * at_point) ** 2 / strength)),
+            log_determinant=float(np.log(values[estimable]).sum() + np.log(size[size > 0]).sum())
+            + float(np.linalg.slogdet(of_effects)[1].sum()),
+        )
+
+    def step(self, damping: float) -> ForcePoint:
+        """The point of a damped Gauss–Newton step: releases limited, parameters inside their bounds."""
+        point, prior, p = self.point, self.problem.prior, self.point.theta.size
+        products, response = self._without_effects(damping)
+        parameters, cross, rest = self._blocks(products)
+        matrix = np.block([[parameters, cross[:, :-1]], [cross[:, :-1].T, rest[:-1, :-1]]])
+        matrix += damping * np.diag(np.diag(matrix))
+        step = scaled_pseudo_inverse(matrix, STEP_CUTOFF) @ np.concatenate([cross[:, -1], rest[:-1, -1]])
+        of_effects = response[:, :, -1] - np.einsum(
+            "nem,nm->ne", response[:, :, :-1], np.append(step, 0.0)[self.places]
+        )
+        release_limit_s = 2 * np.array([trial_data.frame_s for trial_data in self.problem.data])
+        of_effects[:, RELEASE] = np.clip(of_effects[:, RELEASE], -release_limit_s, release_limit_s)
+        return replace(
+            point,
+            theta=np.clip(point.theta + step[:p], prior.lower, prior.upper),
+            trial_effects=point.trial_effects + of_effects,
+            amplitude=point.amplitude + step[p:],
+        )
+
+
+# A force that slows a vine down keeps it longer where the force acts, so that the linear estimate of a force of a tenth
+# of the drive comes out a fifth too large. Below, motions respond to the force in full, and damped Gauss-Newton steps
+# find all unknowns. The search starts on the tracks: simulated without the force, motions would run ahead of them.
+
+CONVERGENCE_TOLERANCE = 1e-3  # Relative fall of χ² below which the search ends (chosen)
+
+
+def optimise_force(problem: ForceProblem, start: ForcePoint) -> LinearForce | None:
+    """The most probable force, all other unknowns free: first with the motions held where they are, then with motions
+    that respond to the force.
+    """
+    if not start.motions_include_force:
+        settled = _descend(problem, start)
+        start = replace(start if settled is None else settled.point, motions_include_force=True)
+    return _descend(problem, start)
+
+
+def _descend(problem: ForceProblem, point: ForcePoint) -> LinearForce | None:
+    """The normal equations at the point of least cost on the way down (Levenberg and Marquardt)."""
+    best: LinearForce | None = None
+    damping = 1e-3  # First damping factor (chosen)
+    # 12: most Gauss-Newton steps (chosen)
+    for _ in range(12):
+        try:
+            with np.errstate(all="raise", under="ignore"):
+                linear = problem.linearised(_with_updated_motions(problem.fit, point))
+        except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
+            linear = None
+        if linear is not None and (best is None or linear.cost < best.cost):
+            converged = best is not None and linear.cost > (1 - CONVERGENCE_TOLERANCE) * best.cost
+            best, damping = linear, 0.2 * damping
+            if converged:
+                break
+        elif best is None:
+            break
+        else:
+            damping = 10 * damping
+        point = best.step(damping)
+    return best
+
+
+def _with_updated_motions(fit: Fit, point: ForcePoint) -> ForcePoint:
+    """The point with its motions corrected for its parameters and, where they include it, its force."""
+    jobs = fit.predictor.jobs(point.theta, point.trial_effects)
+    motions = [with_model_terms(_with_parameters_of_job(fit, *pair)) for pair in zip(point.motions, jobs, strict=True)]
+    # 2: corrections of the motions at each step (chosen)
+    corrections = 2 if point.motions_include_force else 0
+    along = lambda motion: point.force.force(motion, point.amplitude)  # noqa: E731
+    return replace(point, motions=with_force(motions, along, corrections))
+
+
+def _points_before_end(trial_data: FitTrial, trial_effects: Floats) -> slice:
+    """The points before the end of growth, since a corrected motion does not end where its model would."""
+    length_m = trial_data.trial.length_m if math.isfinite(trial_data.trial.length_m) else math.inf
+    # 0.96: part of the length up to which points are used (chosen)
+    after_end = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > 0.96 * length_m)
+    return slice(0, int(after_end[0]) if after_end.size else trial_data.time_s.size)
+
+
+def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
+    """Observed position and velocity of the leading edge, by cubic interpolation between the points of the grid."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    curve = CubicHermiteSpline(motion.time_s, motion.lead_position_m, motion.lead_velocity_m_s)
+    at = np.clip(since_s, 0.0, motion.time_s[-1])
+    moving = (since_s > 0) & (since_s < motion.time_s[-1])
+    offset = np.interp(at, motion.time_s, motion.observation_offset_m)
+    slope = np.interp(at, motion.time_s, motion.observed_slope)
+    return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * slope, 0.0)
+
+
+def _acceleration_derivatives(fit: Fit, point: ForcePoint) -> list[Floats]:
+    """Derivatives of the acceleration along each motion, shape (n_times, n): by pressure and B of the trial, every
+    model parameter, every amplitude. Where the motions do not include the force, a last column holds their defect.
+    """
+    # Step of finite differences, in the fit's scaling of parameters (derived)
+    step = 1e-3
+    predictor, theta, effects, force = fit.predictor, point.theta, point.trial_effects, point.force
+    by_effect = [
+        predictor.jobs(theta, effects + step * np.eye(N_TRIAL_EFFECTS)[k]) for k in (PRESSURE, DAMPING_DEVIATION)
     ]
+    by_parameter = [predictor.jobs(theta + step * unit, effects) for unit in np.eye(theta.size)]
+    derivatives = []
+    for i, motion in enumerate(point.motions):
+        affected = (predictor.has_pressure_deviation[i], predictor.has_damping_deviation[i])
+        changed = [jobs[i] if affects else None for jobs, affects in zip(by_effect, affected, strict=True)]
+        changed += [by_parameter[k][i] if k >= 0 else None for k in predictor.layout.index[i]]
+        columns = [
+            np.zeros_like(motion.time_s)
+            if job is None
+            else (_acceleration(fit, point, motion, job) - motion.model_acceleration) / step
+            for job in changed
+        ]
+        columns.append(force.unit_force(motion) / motion.mass_kg[:, None])
+        if not point.motions_include_force:
+            of_force = force.force(motion, point.amplitude) / motion.mass_kg
+            columns.append(motion.model_acceleration + of_force - motion.acceleration)
+        derivatives.append(np.column_stack(columns))
+    return derivatives
+
+
+def _acceleration(fit: Fit, point: ForcePoint, motion: FittedMotion, job: Job) -> Floats:
+    """Acceleration along a motion with a job's parameters, with the change of a force that depends on the pressure."""
+    changed = _with_parameters_of_job(fit, motion, job)
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    terms = evaluate(changed.model, changed.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
+    pressure_Pa = np.broadcast_to(terms.pressure_Pa, y.shape)
+    if not point.amplitude.any() or np.array_equal(pressure_Pa, motion.pressure_Pa):
+        return terms.acceleration_m_s2
+    before, after = (
+        point.force.force(at, point.amplitude) for at in (motion, replace(motion, pressure_Pa=pressure_Pa))
+    )
+    return np.asarray(terms.acceleration_m_s2 + (after - before) / motion.mass_kg)
+
+
+def _with_parameters_of_job(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
+    """The same motion, its model and trial with the parameters of a job."""
+    values = dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True))
+    trial = trial_of_job(fit.predictor.data[job.trial].trial, job)
+    return replace(motion, model=fit.model.with_values(values), trial=trial)
+
+
+def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.bool_] | None = None) -> Floats:
+    """Pseudo-inverse of a symmetric matrix after scaling its diagonal to 1. Returns zero in the rows and columns that
+    do not take part. Shapes: matrix (n, n); estimable (n,) → (n, n).
+    """
+    diagonal = np.diag(matrix)
+    scale = np.where(diagonal > 0 if estimable is None else estimable, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+    inverse = np.linalg.pinv(matrix * scale[:, None] * scale, rcond=cutoff, hermitian=True)
+    return np.asarray(inverse * scale[:, None] * scale)

@@ -6,33 +6,18 @@ law has two amplitudes, of a sine and a cosine. Laws with a position or a scale 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_inversion import (
-    FittedMotion,
-    ForceEstimate,
-    LinearInversion,
-    SmoothForce,
-    acceleration_sensitivities,
-    scaled_pseudo_inverse,
-    trial_of_job,
-    with_force,
-    with_model_terms,
-)
+from vinetrack.diagnosis.force_inversion import N_NONZERO, FittedMotion, nonzero_splines, uniform_knots
 from vinetrack.diagnosis.remarks import remark
-from vinetrack.dynamics.audit import evaluate
-from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import YIELD_PRESSURE, Fit
-from vinetrack.inference.marginal_likelihood import trial_effect_prior
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Job
-from vinetrack.inference.whitening import whiten
 
 # Number of positions of a local force, and its widths as parts of the growth (chosen)
 PATCH_CENTRES, PATCH_WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
@@ -79,31 +64,6 @@ class Law:
         """Whether it acts over less than a millimetre, which no camera that films the whole growth resolves."""
         # 1e-3: least width of a local force that is reported (chosen)
         return self.kind == "patch" and not self.high - max(self.low, 0.0) > 1e-3
-
-    @property
-    def amplitude_precision(self) -> float:
-        """Prior precision of its amplitudes, 1/N²: 0, because they are free."""
-        return 0.0
-
-    @property
-    def shape_names(self) -> tuple[str, ...]:
-        """Names of its shape parameters."""
-        return ("low", "high") if self.kind == "patch" else ("scale",) * self.n_shapes
-
-    def size_of(self, name: str) -> float:
-        """Scale on which a shape parameter changes the law."""
-        return self.high - self.low if self.kind == "patch" else float(getattr(self, name))
-
-    def shifted(self, name: str, by: float) -> Law:
-        """The law with one shape parameter changed."""
-        return replace(self, **{name: getattr(self, name) + by})
-
-    def within_growth(self, growth_m: float) -> Law:
-        """The law with the ends of a patch kept inside the growth, apart from its rounded edges."""
-        if self.kind != "patch":
-            return self
-        edge = EDGE_FRACTION * (self.high - self.low)
-        return replace(self, low=max(self.low, -edge), high=min(self.high, growth_m + edge))
 
     def unit_force(self, motion: FittedMotion) -> Floats:
         """The force of each unit amplitude along a motion. Shape (n_times, n_amplitudes)."""
@@ -274,350 +234,235 @@ def _visited_range(motions: Sequence[FittedMotion]) -> _Range:
 
 
 # ------------------------------------------------------------------------------
-# Nonlinear least squares for a missing force, with model parameters and trial effects free.
+# Smooth forces over one variable or two: cubic B-splines with a Gaussian-process prior on their coefficients.
 #
-# The linear inversion (`vinetrack.diagnosis.force_inversion`) tells laws apart; but a force that slows a vine down
-# keeps it longer where the force acts, so that the linear estimate of a force of a tenth of the drive comes out a
-# fifth too large. Here the motions respond to the force in full (`vinetrack.diagnosis.force_inversion.with_force`),
-# and Gauss-Newton steps, damped as by Levenberg and Marquardt where needed, find the amplitudes, the shape parameters
-# of the law, the model parameters and the trial effects. The search starts from the fitted motions, which lie near
-# the tracks: simulated from the parameters of the model without the force, they would run ahead of the tracks.
+# The coefficients are the values of a Gaussian process at the centres of the splines, with covariance
+#
+#     a² Π_d (1 + s_d + s_d²/3) exp(−s_d),   s_d = √5 |u_d − u'_d|/ℓ_d
+#
+# where u are the variables scaled to the range that the trials visited: the Matérn kernel of order 5/2 (Rasmussen &
+# Williams 2006, §4.2). Its functions are twice differentiable. The squared-exponential kernel exp(−½ s²), whose
+# functions
+# are infinitely smooth, gives bands that are far too narrow for a force such as a power of the growth: in a linear fit
+# to
+# draws they contain a third of the points instead of nearly all. The model is a penalised spline with an amplitude a,
+# N,
+# and length scales ℓ_d as hyperparameters (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015).
 
-MAX_STEPS, MOTION_CORRECTIONS = 12, 2  # Most Gauss-Newton steps, and corrections of the motions at each (chosen)
+# What a force may depend on, and the attribute of a motion that holds it
+VARIABLES = {
+    "growth": "lead_position_m",
+    "speed": "tail_velocity_m_s",
+    "time": "time_s",
+    "pressure": "pressure_Pa",
+}
+
+SPLINES_ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
+# Splines along a variable, when it is alone and when it is one of two (chosen)
+SPLINES_IN_PAIR = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
+
+# Length scales that are averaged over, as parts of the visited range (chosen)
+LENGTH_SCALES = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
+
+# Amplitudes that are averaged over, as parts of the largest drive (chosen)
+RELATIVE_AMPLITUDES = np.geomspace(0.003, 0.3, 9)
+
+KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4  # Relative variances below which a mode is dropped (chosen)
+
+# What a force may be where growth begins
+ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
 
 
-# Damping factors of Levenberg and Marquardt, for steps that must lower the cost (chosen)
-FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
-
-UNDAMPED_SUCCESS = 0.5  # Part of χ² above which the undamped steps have failed (chosen)
-
-# Step of finite differences, in the fit's scaling of parameters, and relative for shape parameters (derived)
-DIFFERENCE_STEP = 1e-3
+def standard_error(basis: Floats, covariance: Floats) -> Floats:
+    """Standard error of a linear combination of coefficients, for each row of a basis. Shapes: basis (n, n_splines);
+    covariance (n_splines, n_splines) → (n,).
+    """
+    return np.asarray(np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis)))
 
 
-CONVERGENCE_TOLERANCE = 1e-3  # Relative fall of χ² below which the search ends (chosen)
-
-SHAPE_CUTOFF = 1e-12  # Relative eigenvalue of the scaled normal matrix below which a direction does not move (derived)
+@lru_cache(maxsize=256)
+def covariance_modes(count: int, length: float, *, zero_at_start: bool = False) -> tuple[Floats, Floats]:
+    """Eigenvectors and eigenvalues of the covariance of a unit-variance process at the centres of the splines. Returns
+    eigenvectors, variances. Shape (count, count).
+    """
+    knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, count - 2), [1.0] * 3])
+    at = np.array([knots[k + 1 : k + 4].mean() for k in range(count)])
+    distance = math.sqrt(5) * np.abs(at[:, None] - at) / length
+    covariance = (1 + distance + distance**2 / 3) * np.exp(-distance)
+    if zero_at_start:
+        covariance = covariance - np.outer(covariance[:, 0], covariance[0])
+    variances, eigenvectors = np.linalg.eigh(covariance)
+    variances = np.maximum(variances, 0.0)
+    # Cached and shared, so made read-only: the same few are needed thousands of times.
+    for array in (eigenvectors, variances):
+        array.flags.writeable = False
+    return eigenvectors, variances
 
 
 @dataclass(frozen=True)
-class RefinedLaw:
-    """A law after the nonlinear fit: amplitudes and the standard error of one, N, and the χ² that remains.
-    `parameter_shift` is how far the model parameters moved, in the fit's own scaling.
+class Domain:
+    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
+    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
     """
 
-    law: Law
-    amplitude: Floats
-    sigma: float
-    chi2: float
-    parameter_shift: Floats
+    variables: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    counts: tuple[int, ...]
+    log_scale: tuple[float, ...]
 
-
-@dataclass(frozen=True)
-class SearchPoint:
-    """The unknowns at one point of a search, and the motions that they are linearised about. Where
-    `motions_include_force`, the motions are those of these parameters and this force. Otherwise they are others near
-    by, and their defect (by how much they violate the equation of motion) is carried as a residual.
-    """
-
-    theta: Floats
-    trial_effects: Floats
-    law: Law | SmoothForce
-    amplitude: Floats
-    motions: list[FittedMotion]
-    motions_include_force: bool = True
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """Gauss-Newton equations `matrix` · step = `score` at a point, and the cost there (χ² with all priors). Unknowns in
-    order: model parameters, amplitudes, shape parameters, effects of each trial.
-    """
-
-    cost: float
-    matrix: Floats
-    score: Floats
-
-
-def refine_law(
-    fit: Fit,
-    inversion: LinearInversion,
-    motions: Sequence[FittedMotion],
-    law: Law,
-    linear: ForceEstimate,
-    *,
-    thorough: bool = False,
-) -> RefinedLaw | None:
-    """Fit a law by nonlinear least squares, starting from the linear inversion."""
-    start = SearchPoint(inversion.state.theta, inversion.trial_effects, law, 0.0 * linear.amplitude, list(motions))
-    best = _gauss_newton(fit, inversion, start, 0.0)
-    if thorough and (best is None or best[1].cost > UNDAMPED_SUCCESS * inversion.chi2_without_force):
-        best = _gauss_newton(fit, inversion, start, FIRST_DAMPING)
-    if best is None:
-        return None
-    point, normal = best
-    p, q = point.theta.size, point.amplitude.size
-    inflation = max(1.0, normal.cost / inversion.n_points)
-    covariance = scaled_pseudo_inverse(normal.matrix, SHAPE_CUTOFF)
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0) * inflation)
-    relative = linear.sigma / max(float(np.hypot.reduce(linear.amplitude)), 1e-300)
-    return RefinedLaw(
-        law=point.law if isinstance(point.law, Law) else law,
-        amplitude=point.amplitude,
-        sigma=max(float(np.sqrt(np.mean(sigma[p : p + q] ** 2))), relative * float(np.hypot.reduce(point.amplitude))),
-        chi2=normal.cost,
-        parameter_shift=point.theta - inversion.state.theta,
-    )
-
-
-def optimise_smooth_force(fit: Fit, inversion: LinearInversion, start: SearchPoint) -> SearchPoint | None:
-    """Find the most probable smooth force under the prior of its amplitudes, with all other unknowns free."""
-    begin = start if start.motions_include_force else _settled_on_tracks(fit, inversion, start)
-    best = _gauss_newton(fit, inversion, begin, LEAST_DAMPING)
-    return None if best is None else best[0]
-
-
-def _gauss_newton(
-    fit: Fit, inversion: LinearInversion, start: SearchPoint, damping: float
-) -> tuple[SearchPoint, NormalEquations] | None:
-    """The point of least cost on the way from `start`; without damping the first steps may raise the cost."""
-    # The first steps are undamped Gauss-Newton steps, taken even where the cost rises (chosen)
-    undamped_steps, steps_with_shape_held = 5, 2
-    best: tuple[SearchPoint, NormalEquations] | None = None
-    point, undamped = start, 0 if damping else undamped_steps
-    for iteration in range(MAX_STEPS):
-        try:
-            with np.errstate(all="raise", under="ignore"):
-                point = _with_updated_motions(fit, point)
-                normal = normal_equations(fit, inversion, point)
-        except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
-            break
-        before = best
-        if best is None or normal.cost < best[1].cost:
-            best = point, normal
-        if iteration < undamped:
-            point = _step(inversion, point, normal, 0.0, shape_free=iteration >= steps_with_shape_held)
-            continue
-        if undamped and best[1].cost > UNDAMPED_SUCCESS * inversion.chi2_without_force:
-            break
-        if before is not None and best is not before:
-            damping *= 0.3
-            if best[1].cost > before[1].cost * (1 - CONVERGENCE_TOLERANCE):
-                break
-        elif before is not None and iteration > undamped:
-            damping = max(5 * damping, LEAST_DAMPING)
-        point = _step(inversion, *best, damping, shape_free=iteration >= steps_with_shape_held)
-    return best
-
-
-def _settled_on_tracks(fit: Fit, inversion: LinearInversion, start: SearchPoint) -> SearchPoint:
-    """All unknowns optimised with the motions held on the tracks, where only the parameters enter nonlinearly."""
-    damping, best, point = FIRST_DAMPING, None, start
-    # 10: most steps on motions that lie on the tracks, before motions respond to the force (chosen)
-    for _ in range(10):
-        try:
-            with np.errstate(all="raise", under="ignore"):
-                point = _with_updated_motions(fit, point)
-                normal = normal_equations(fit, inversion, point)
-        except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
-            normal = None
-        if normal is not None and (best is None or normal.cost < best[1].cost):
-            best, damping = (point, normal), 0.1 * damping
-        else:
-            damping *= 30
-        if best is None:
-            break
-        point = replace(_step(inversion, *best, damping, shape_free=True), motions_include_force=False)
-    return replace(start if best is None else best[0], motions_include_force=True)
-
-
-def normal_equations(fit: Fit, inversion: LinearInversion, point: SearchPoint) -> NormalEquations:
-    """Gauss-Newton equations of all unknowns at a point."""
-    theta, trial_effects, q, s = point.theta, point.trial_effects, point.amplitude.size, len(point.law.shape_names)
-    problem = inversion.problem
-    p, n = theta.size, trial_effects.shape[0]
-    sensitivities = acceleration_sensitivities(fit, trial_effects, point.motions, _acceleration_derivatives(fit, point))
-    centre, precision = trial_effect_prior(problem, inversion.state)
-    size = p + q + s + n * N_TRIAL_EFFECTS
-    matrix, score = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
-    cost = float(np.sum(precision * (trial_effects - centre) ** 2))
-    cost += float(np.sum(problem.prior_precision * (theta - problem.prior_mean) ** 2))
-    cost += point.law.amplitude_precision * float(point.amplitude @ point.amplitude)
-    for i, trial_data in enumerate(fit.predictor.data):
-        position, velocity = _observed(point.motions[i], trial_data.time_s - trial_effects[i, RELEASE])
-        residual = trial_data.lead_position_m - trial_effects[i, ORIGIN] - position
-        of_trial = sensitivities[i]
-        if not point.motions_include_force:
-            of_trial, of_defect = of_trial[:, :-1], of_trial[:, -1]
-            residual = residual - of_defect
-        rows = np.column_stack([of_trial[:, 2:], -velocity, np.ones(residual.size), of_trial[:, :2], residual])
-        used = _points_before_end(trial_data, trial_effects[i])
-        relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
-        white = whiten(rows[used], trial_data.first[used], inversion.state.rho, relative_sd) / math.sqrt(
-            inversion.state.variance[i]
-        )
-        gram = white.T @ white
-        effects = p + q + s + i * N_TRIAL_EFFECTS + np.arange(N_TRIAL_EFFECTS)
-        keys = np.where(problem.index[i] >= 0, problem.index[i], size)
-        index = np.concatenate([keys, p + np.arange(q + s), effects])
-        matrix[np.ix_(index, index)] += gram[:-1, :-1]
-        np.add.at(score, index, gram[:-1, -1])
-        matrix[effects, effects] += precision[i]
-        score[effects] -= precision[i] * (trial_effects[i] - centre[i])
-        cost += float(gram[-1, -1])
-    matrix, score = matrix[:size, :size], score[:size]
-    matrix[np.arange(p), np.arange(p)] += problem.prior_precision
-    score[:p] -= problem.prior_precision * (theta - problem.prior_mean)
-    matrix[np.arange(p, p + q), np.arange(p, p + q)] += point.law.amplitude_precision
-    score[p : p + q] -= point.law.amplitude_precision * point.amplitude
-    held = np.flatnonzero(~problem.free)
-    matrix[held, :] = matrix[:, held] = score[held] = 0.0
-    return NormalEquations(cost, matrix, score)
-
-
-def _step(
-    inversion: LinearInversion, point: SearchPoint, normal: NormalEquations, damping: float, *, shape_free: bool
-) -> SearchPoint:
-    """The next point, with steps of shape parameters and releases limited and parameters kept inside their bounds."""
-    p, q = point.theta.size, point.amplitude.size
-    law = point.law
-    matrix = normal.matrix + damping * np.diag(np.diag(normal.matrix))
-    if not shape_free:
-        held = p + q + np.arange(len(law.shape_names))
-        matrix[held, :] = matrix[:, held] = 0.0
-    step = scaled_pseudo_inverse(matrix, SHAPE_CUTOFF) @ normal.score
-    for k, name in enumerate(law.shape_names):
-        # 0.2: part of its size by which a shape parameter may move in one step (chosen)
-        limit = 0.2 * law.size_of(name)
-        law = law.shifted(name, float(np.clip(step[p + q + k], -limit, limit)))
-    law = law.within_growth(max(float(motion.lead_position_m.max()) for motion in point.motions))
-    release_limit_s = 2 * np.array([trial_data.frame_s for trial_data in inversion.data])
-    trial_effects = point.trial_effects + step[p + q + len(law.shape_names) :].reshape(-1, N_TRIAL_EFFECTS)
-    trial_effects[:, RELEASE] = point.trial_effects[:, RELEASE] + np.clip(
-        trial_effects[:, RELEASE] - point.trial_effects[:, RELEASE], -release_limit_s, release_limit_s
-    )
-    theta = np.clip(point.theta + step[:p], inversion.problem.lower, inversion.problem.upper)
-    return replace(
-        point,
-        theta=theta,
-        trial_effects=trial_effects,
-        law=law,
-        amplitude=point.amplitude + step[p : p + q],
-    )
-
-
-def _with_updated_motions(fit: Fit, point: SearchPoint) -> SearchPoint:
-    """The point with its motions corrected for its parameters and, where they include it, its force."""
-    jobs = fit.predictor.jobs(point.theta, point.trial_effects)
-    motions = [with_model_terms(_with_parameters_of_job(fit, *pair)) for pair in zip(point.motions, jobs, strict=True)]
-    corrections = MOTION_CORRECTIONS if point.motions_include_force else 0
-    return replace(point, motions=with_force(motions, lambda motion: _force_along(point, motion), corrections))
-
-
-def _force_along(point: SearchPoint, motion: FittedMotion) -> Floats:
-    law = point.law
-    # Summing many splines with their coefficients costs far less than evaluating each.
-    if isinstance(law, SmoothForce):
-        return law.force(motion, point.amplitude)
-    return law.unit_force(motion) @ point.amplitude
-
-
-def _points_before_end(trial_data: FitTrial, trial_effects: Floats) -> slice:
-    """The points before the end of growth, since a corrected motion does not end where its model would."""
-    length_m = trial_data.trial.length_m if math.isfinite(trial_data.trial.length_m) else math.inf
-    # 0.96: part of the length up to which points are used (chosen)
-    after_end = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > 0.96 * length_m)
-    return slice(0, int(after_end[0]) if after_end.size else trial_data.time_s.size)
-
-
-def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
-    """Observed position and velocity of the leading edge, by cubic interpolation between the points of the grid."""
-    from scipy.interpolate import CubicHermiteSpline
-
-    curve = CubicHermiteSpline(motion.time_s, motion.lead_position_m, motion.lead_velocity_m_s)
-    at = np.clip(since_s, 0.0, motion.time_s[-1])
-    moving = (since_s > 0) & (since_s < motion.time_s[-1])
-    offset = np.interp(at, motion.time_s, motion.observation_offset_m)
-    slope = np.interp(at, motion.time_s, motion.observed_slope)
-    return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * slope, 0.0)
-
-
-def _acceleration_derivatives(fit: Fit, point: SearchPoint) -> list[Floats]:
-    """Derivatives of the acceleration along each motion, shape (n_times, n). By [pressure and B of the trial, every
-    model parameter, amplitudes, shape parameters]. Where the motions do not include the force, a last column holds
-    their defect.
-    """
-    layout, theta = fit.predictor.layout, point.theta
-    jobs = fit.predictor.jobs(theta, point.trial_effects)
-    damping = fit.predictor.damping_column
-    derivatives = []
-    for i, (motion, job) in enumerate(zip(point.motions, jobs, strict=True)):
-        varied = [job._replace(pressure_deviation=job.pressure_deviation + DIFFERENCE_STEP)]
-        varied.append(
-            _with_parameter(job, damping, job.row[damping] * math.exp(DIFFERENCE_STEP)) if damping >= 0 else job
-        )
-        for column, key in enumerate(layout.keys):
-            number = layout.free[layout.index[i, column]] if layout.index[i, column] >= 0 else None
-            if number is None:
-                varied.append(job)
-                continue
-            at = theta[layout.index[i, column]]
-            change = number.from_scaled(at + DIFFERENCE_STEP) - number.from_scaled(at)
-            if key == YIELD_PRESSURE:
-                varied.append(job._replace(yield_pressure_Pa=job.yield_pressure_Pa + change))
-            else:
-                k = layout.model.parameter_names.index(key)
-                if number.logarithmic:
-                    factor = number.from_scaled(at + DIFFERENCE_STEP) / number.from_scaled(at)
-                    varied.append(_with_parameter(job, k, job.row[k] * factor))
-                else:
-                    varied.append(_with_parameter(job, k, job.row[k] + change))
-        has_deviation = (fit.predictor.has_pressure_deviation[i], fit.predictor.has_damping_deviation[i])
-        affected = [*has_deviation, *[True] * len(layout.keys)]
-        columns = [
-            (_acceleration(fit, point, motion, changed_job) - motion.model_acceleration) / DIFFERENCE_STEP
-            if affects and changed_job is not job
-            else 0.0 * motion.model_acceleration
-            for changed_job, affects in zip(varied, affected, strict=True)
+    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
+        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
+        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
+        """
+        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
+        return [
+            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
+            if math.isfinite(log_scale)
+            else (at - low) / (high - low)
+            for at, low, high, log_scale in limits
         ]
-        defect = (
-            []
-            if point.motions_include_force
-            else [motion.model_acceleration + _force_along(point, motion) / motion.mass_kg - motion.acceleration]
+
+    @property
+    def name(self) -> str:
+        """The variables joined by +: `growth`, `growth+speed`."""
+        return "+".join(self.variables)
+
+    @property
+    def size(self) -> int:
+        """Total number of splines (products of splines, for two variables)."""
+        return math.prod(self.counts)
+
+    def values_along(self, motion: FittedMotion) -> list[Floats]:
+        """The variables along a motion, SI, each of shape (n_times,)."""
+        return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
+
+    def basis(self, values: Sequence[Floats]) -> Floats:
+        """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, size)."""
+        indices, products = self._nonzero_products(values)
+        design = np.zeros((len(indices), self.size))
+        np.put_along_axis(design, indices, products, axis=1)
+        return design
+
+    def evaluate(self, values: Sequence[Floats], coefficients: Floats) -> Floats:
+        """Sum of all splines times their coefficients at these values. Shapes: values (n,); coefficients (size,) →
+        (n,).
+        """
+        indices, products = self._nonzero_products(values)
+        return np.asarray(np.einsum("ns,ns->n", products, coefficients[indices]))
+
+    def _nonzero_products(self, values: Sequence[Floats]) -> tuple[np.ndarray, Floats]:
+        """Indices and values of the nonzero products of splines, shape (n, 4^n_variables)."""
+        indices, products = np.zeros((len(values[0]), 1), dtype=int), np.ones((len(values[0]), 1))
+        for position, count in zip(self.normalised(values), self.counts, strict=True):
+            first, splines = nonzero_splines(position, uniform_knots(count))
+            along_axis = first[:, None] + np.arange(N_NONZERO)
+            indices = (indices[:, :, None] * count + along_axis[:, None, :]).reshape(len(position), -1)
+            products = (products[:, :, None] * splines[:, None, :]).reshape(len(position), -1)
+        return indices, products
+
+    @property
+    def start_axis(self) -> int:
+        """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
+        return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
+
+    @property
+    def start_conditions(self) -> tuple[str, ...]:
+        """What a force over these variables may be where growth begins."""
+        if self.start_axis < 0:
+            return (FREE_AT_START,)
+        return (
+            (ZERO_AT_START, CONSTANT_AT_START)
+            if len(self.variables) == 1
+            else (ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START)
         )
-        derivatives.append(np.column_stack([*columns, _law_derivatives(point, motion), *defect]))
-    return derivatives
+
+    def prior_modes(
+        self, lengths: Sequence[float], at_start: str = FREE_AT_START, least_variance: float = KEPT_VARIANCE
+    ) -> Floats:
+        """Square root of the prior covariance: coefficients of the splines for each mode at unit amplitude. Shape
+        (size, n_modes).
+        """
+        start_axis = self.start_axis
+        by_axis = [
+            covariance_modes(count, length, zero_at_start=k == start_axis)
+            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
+        ]
+        columns = [_product(by_axis, least_variance)]
+        if start_axis >= 0 and at_start == CONSTANT_AT_START:
+            columns.append(np.ones((self.size, 1)))
+        if start_axis >= 0 and at_start == FREE_AT_START:
+            # 3.0: prior amplitude of the force where growth begins, as a multiple of that of the rest of
+            # the surface (chosen)
+            constant_along_start_axis = [
+                (np.ones((count, 1)), np.array([3.0**2])) if k == start_axis else modes
+                for k, (count, modes) in enumerate(zip(self.counts, by_axis, strict=True))
+            ]
+            columns.append(_product(constant_along_start_axis, least_variance))
+        return np.hstack(columns)
 
 
-def _acceleration(fit: Fit, point: SearchPoint, motion: FittedMotion, job: Job) -> Floats:
-    """Acceleration along a motion with a job's parameters, with the change of a force that depends on the pressure."""
-    changed = _with_parameters_of_job(fit, motion, job)
-    y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    terms = evaluate(changed.model, changed.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
-    if not point.amplitude.any() or np.array_equal(np.broadcast_to(terms.pressure_Pa, y.shape), motion.pressure_Pa):
-        return terms.acceleration_m_s2
-    at_pressure = replace(motion, pressure_Pa=np.broadcast_to(terms.pressure_Pa, y.shape))
-    return terms.acceleration_m_s2 + (_force_along(point, at_pressure) - _force_along(point, motion)) / motion.mass_kg
+def _product(by_axis: Sequence[tuple[Floats, Floats]], least_variance: float) -> Floats:
+    """Modes of a product of processes, scaled by the root of their variance, shape (n_splines, n_modes kept)."""
+    variances: Floats = np.ones(1)
+    for _, of_axis in by_axis:
+        variances = np.asarray(np.kron(variances, of_axis))
+    kept = np.flatnonzero(variances > least_variance * variances.max())
+    vectors: Floats = np.ones((1, kept.size))
+    indices = np.unravel_index(kept, [of_axis.size for _, of_axis in by_axis])
+    for (eigenvectors, _), index in zip(by_axis, indices, strict=True):
+        vectors = (vectors[:, None, :] * eigenvectors[None, :, index]).reshape(-1, kept.size)
+    return np.asarray(vectors * np.sqrt(variances[kept]))
 
 
-def _law_derivatives(point: SearchPoint, motion: FittedMotion) -> Floats:
-    """Derivatives of the acceleration by each amplitude and each shape parameter of the law."""
-    unit_force = point.law.unit_force(motion)
-    by_shape = [
-        (point.law.shifted(name, step).unit_force(motion) - unit_force) @ point.amplitude / step
-        for name, step in ((name, DIFFERENCE_STEP * point.law.size_of(name)) for name in point.law.shape_names)
+@dataclass(frozen=True)
+class SmoothForce:
+    """A force over a domain whose amplitudes have independent normal priors of standard deviation `sd_N`. `modes`,
+    shape (n_splines, n_amplitudes), are the spline coefficients for unit amplitudes. An infinite `sd_N` leaves the
+    amplitudes free.
+    """
+
+    domain: Domain
+    modes: Floats
+    sd_N: float = math.inf
+
+    @property
+    def amplitude_precision(self) -> float:
+        """Prior precision of each amplitude, 1/N²."""
+        return self.sd_N**-2
+
+    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
+        """The force with these amplitudes along a motion. Shapes: amplitude (n_columns,) → (n_times,)."""
+        return self.domain.evaluate(self.domain.values_along(motion), self.modes @ amplitude)
+
+    def unit_force(self, motion: FittedMotion) -> Floats:
+        """The force of each unit amplitude along a motion. Shape (n_times, n_columns)."""
+        return np.asarray(self.domain.basis(self.domain.values_along(motion)) @ self.modes)
+
+
+def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
+    """Every variable alone, then every pair, over the ranges that the motions visit."""
+    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
+    ranges: dict[str, tuple[float, float, float]] = {}
+    for name, attribute in VARIABLES.items():
+        by_trial = [
+            np.asarray(getattr(motion, attribute))[motion.time_s <= motion.counts_until_s] for motion in motions
+        ]
+        # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
+        high = max(float(np.quantile(values, 0.98) if name == "speed" else values.max()) for values in by_trial)
+        low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
+        # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
+        if high - low > 0.02 * abs(high):
+            if name == "pressure":
+                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
+            typical = float(np.median([np.median(values) for values in by_trial]))
+            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
+            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
+
+    def domain(names: tuple[str, ...], counts: dict[str, int]) -> Domain:
+        lows, highs, log_scales = zip(*(ranges[name] for name in names), strict=True)
+        return Domain(names, lows, highs, tuple(counts[name] for name in names), log_scales)
+
+    return [domain((name,), SPLINES_ALONE) for name in ranges] + [
+        domain(pair, SPLINES_IN_PAIR) for pair in itertools.combinations(ranges, 2)
     ]
-    return np.column_stack([unit_force, *by_shape]) / motion.mass_kg[:, None]
-
-
-def _with_parameters_of_job(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
-    """The same motion, its model and trial with the parameters of a job."""
-    values = dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True))
-    trial = trial_of_job(fit.predictor.data[job.trial].trial, job)
-    return replace(motion, model=fit.model.with_values(values), trial=trial)
-
-
-def _with_parameter(job: Job, column: int, value: float) -> Job:
-    row = job.row.copy()
-    row[column] = value
-    return job._replace(row=row)

@@ -22,6 +22,14 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
+    CONVERGENCE_TOLERANCE,
+    CoefficientLikelihood,
+    FittedMotion,
+    ForcePoint,
+    ForceProblem,
+    optimise_force,
+)
+from vinetrack.diagnosis.force_laws import (
     CONSTANT_AT_START,
     FREE_AT_START,
     LENGTH_SCALES,
@@ -29,24 +37,12 @@ from vinetrack.diagnosis.force_inversion import (
     SEARCHED_VARIANCE,
     VARIABLES,
     Domain,
-    FittedMotion,
-    LinearInversion,
     SmoothForce,
     candidate_domains,
-    motions_of,
-    on_tracks,
     standard_error,
-)
-from vinetrack.diagnosis.force_laws import (
-    CONVERGENCE_TOLERANCE,
-    NormalEquations,
-    SearchPoint,
-    normal_equations,
-    optimise_smooth_force,
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.remarks import joined
-from vinetrack.inference.fit_result import Fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,31 +58,6 @@ if TYPE_CHECKING:
 # Log-likelihood below that of the best hyperparameters at which a set of them is left out of the mean and the band
 # (chosen)
 NEGLIGIBLE_LOG_RATIO = 5.0
-
-
-@dataclass(frozen=True)
-class CoefficientLikelihood:
-    """Quadratic log-likelihood of the spline coefficients, all other unknowns integrated out. `information` and `score`
-    are about coefficients of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to the best coefficients.
-    `log_determinant` is that of the information on all other unknowns.
-    """
-
-    information: Floats
-    score: Floats
-    chi2_at_zero: float
-    delta_chi2: float
-    log_determinant: float
-
-    @property
-    def least_chi2(self) -> float:
-        """χ² of the best coefficients, without regard to the smoothness prior."""
-        return self.chi2_at_zero - self.delta_chi2
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether all entries are finite: far outside the visited range the equations overflow."""
-        parts = (self.information, self.score, self.chi2_at_zero, self.delta_chi2, self.log_determinant)
-        return all(bool(np.isfinite(part).all()) for part in parts)
 
 
 @dataclass(frozen=True)
@@ -168,39 +139,6 @@ class VariableChoice:
         likely = max(self.posteriors, key=lambda each: each.log_evidence)
         modes = self.domain.prior_modes(likely.length_scales, at_start, SEARCHED_VARIANCE)
         return SmoothForce(self.domain, modes, likely.surface.sd_N)
-
-
-def coefficient_likelihood(point: SearchPoint, normal: NormalEquations) -> CoefficientLikelihood:
-    """Integrate out all unknowns but the force coefficients, after scaling each unknown to unit information."""
-    # Information, where each unknown alone has 1, below which a combination of unknowns is not estimable
-    # (derived)
-    least_information = 1e-8
-    p, q = point.theta.size, point.amplitude.size
-    size = np.diag(normal.matrix)
-    unit = np.where(size > 0, 1 / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
-    matrix, score = normal.matrix * unit[:, None] * unit, normal.score * unit
-    force = np.arange(p, p + q)
-    nuisance = np.concatenate([np.arange(p), np.arange(p + q, score.size)])
-    nuisance = nuisance[size[nuisance] > 0]
-    values, vectors = np.linalg.eigh(matrix[np.ix_(nuisance, nuisance)])
-    estimable = values > least_information
-    root = vectors[:, estimable] / np.sqrt(values[estimable])
-    cross, nuisance_score = root.T @ matrix[np.ix_(nuisance, force)], root.T @ score[nuisance]
-    strength, directions = np.linalg.eigh(matrix[np.ix_(force, force)] - cross.T @ cross)
-    # Directions that the nuisance parameters reproduce have information only from rounding.
-    directions, strength = directions[:, strength > least_information], strength[strength > least_information]
-    scale = np.where(unit[force] > 0, 1 / np.where(unit[force] > 0, unit[force], 1.0), 0.0)
-    back = scale[:, None] * directions
-    local_score = directions.T @ (score[force] - cross.T @ nuisance_score)
-    at_point = scale * point.amplitude @ directions
-    cost = normal.cost - float(nuisance_score @ nuisance_score)
-    return CoefficientLikelihood(
-        information=(back * strength) @ back.T,
-        score=back @ (local_score + strength * at_point),
-        chi2_at_zero=cost + 2 * float(local_score @ at_point) + float(strength @ at_point**2),
-        delta_chi2=float(np.sum((local_score + strength * at_point) ** 2 / strength)),
-        log_determinant=float(np.sum(np.log(values[estimable]))) - 2 * float(np.sum(np.log(unit[nuisance]))),
-    )
 
 
 def marginal_likelihood(
@@ -475,33 +413,35 @@ class _RefinedChoice:
     """A choice of variables after the nonlinear fit: where the search ended, and the likelihood there."""
 
     choice: VariableChoice
-    point: SearchPoint
+    point: ForcePoint
     likelihood: CoefficientLikelihood
 
 
-def learned_force(
-    fit: Fit, inversion: LinearInversion, motions: Sequence[FittedMotion], replicates: int
-) -> LearnedForce | None:
+def learned_force(problem: ForceProblem) -> LearnedForce | None:
     """Estimate the missing force over the variables with the highest marginal likelihood."""
-    if inversion.chi2_without_force < LEAST_CHI2_PER_POINT * inversion.n_points:
+    tracks = problem.on_tracks()
+    chi2_without_force = problem.linearised(tracks).chi2_without_force
+    if chi2_without_force < LEAST_CHI2_PER_POINT * problem.n_points:
         return None
-    largest_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
-    linear = _linear_choices(fit, inversion, largest_N)
+    largest_N = max(
+        float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in tracks.motions
+    )
+    linear = _linear_choices(problem, tracks, largest_N)
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
     if linear is None or linear.log_bayes_factor(linear.choices[0][0]) < 18.0:
         return None
-    refined = _refined_choices(fit, inversion, linear, largest_N)
+    refined = _refined_choices(problem, linear, largest_N)
     if not refined:
         return None
-    refined = _restarted_from_best(fit, inversion, refined, linear.inflation, largest_N)
-    inflation = max(min(each.likelihood.least_chi2 for each in refined) / inversion.n_points, 1.0)
+    refined = _restarted_from_best(problem, refined, linear.inflation, largest_N)
+    inflation = max(min(each.likelihood.least_chi2 for each in refined) / problem.n_points, 1.0)
     choices = [marginal_likelihood(each.choice.domain, each.likelihood, inflation, largest_N) for each in refined]
     chi2 = min(choice.best().chi2 for choice in choices)
-    noise_chi2 = inversion.n_points
+    noise_chi2 = problem.n_points
     # 0.95: part of the misfit that the refined force must take away to be reported (chosen)
-    if inversion.chi2_without_force - chi2 < 0.95 * (inversion.chi2_without_force - noise_chi2):
+    if chi2_without_force - chi2 < 0.95 * (chi2_without_force - noise_chi2):
         return None
-    correlation_error = _correlation_error(inversion, inflation)
+    correlation_error = _correlation_error(problem, inflation)
     error = max(0.5 * CONVERGENCE_TOLERANCE * chi2 / inflation, correlation_error)
     weights = variable_weights(choices, error)
     choice, solution = max(
@@ -514,9 +454,9 @@ def learned_force(
     losses = {name: (value - least_chi2[best.domain.name]) / inflation for name, value in least_chi2.items()}
     threshold = ANSWER_SET_DELTA_CHI2 * error
     alternatives = not_excluded(best.domain, weights, losses, threshold, linear.domains, linear.motions)
-    misfit = max(inversion.chi2_without_force - inversion.n_points, 1e-300)
+    misfit = max(chi2_without_force - problem.n_points, 1e-300)
     table = _table(best, solution.motions)
-    explained = min(max((inversion.chi2_without_force - best.chi2) / misfit, 0.0), 1.0)
+    explained = min(max((chi2_without_force - best.chi2) / misfit, 0.0), 1.0)
     sentence = force_sentence(best, weights, alternatives, explained, table, choice.undecided_N)
     return LearnedForce(
         best=best,
@@ -528,7 +468,7 @@ def learned_force(
         ),
         explained=explained,
         table=table,
-        sentence=" ".join([sentence, *remarks(replicates, linear.domains, alternatives)]),
+        sentence=" ".join([sentence, *remarks(problem.scatter.dof, linear.domains, alternatives)]),
         undecided_N=choice.undecided_N,
     )
 
@@ -540,8 +480,8 @@ class _LinearChoices:
     leaves.
     """
 
-    choices: list[tuple[VariableChoice, SearchPoint]]
-    motions: list[FittedMotion]
+    choices: list[tuple[VariableChoice, ForcePoint]]
+    motions: Sequence[FittedMotion]
     inflation: float
     log_evidence_without_force: float
 
@@ -555,46 +495,31 @@ class _LinearChoices:
         return choice.log_evidence - self.log_evidence_without_force
 
 
-def _linear_choices(fit: Fit, inversion: LinearInversion, largest_N: float) -> _LinearChoices | None:
-    """Linearise about motions on the tracks and compute the marginal likelihood of every choice of variables."""
-    effects = np.zeros_like(inversion.trial_effects)
-    effects[:, : inversion.problem.release_origin_mean.shape[1]] = inversion.problem.release_origin_mean
-    motions = on_tracks(inversion, effects, motions_of(fit, effects))
-    forces = [SmoothForce(domain, np.eye(domain.size)) for domain in candidate_domains(motions)]
-    starts = [
-        SearchPoint(
-            inversion.state.theta,
-            effects,
-            force,
-            np.zeros(force.domain.size),
-            list(motions),
-            motions_include_force=False,
-        )
-        for force in forces
-    ]
-    likelihoods = [coefficient_likelihood(start, normal_equations(fit, inversion, start)) for start in starts]
+def _linear_choices(problem: ForceProblem, tracks: ForcePoint, largest_N: float) -> _LinearChoices | None:
+    """The marginal likelihood of every choice of variables, about motions on the tracks."""
+    forces = [SmoothForce(domain, np.eye(domain.size)) for domain in candidate_domains(tracks.motions)]
+    starts = [tracks.asking(force) for force in forces]
+    likelihoods = [problem.linearised(start).likelihood() for start in starts]
     if not all(likelihood.is_finite for likelihood in likelihoods):
         return None
-    inflation = max(min(likelihood.least_chi2 for likelihood in likelihoods) / inversion.n_points, 1.0)
+    inflation = max(min(likelihood.least_chi2 for likelihood in likelihoods) / problem.n_points, 1.0)
     without_force = -0.5 * likelihoods[0].chi2_at_zero / inflation - 0.5 * likelihoods[0].log_determinant
     choices = [
         (marginal_likelihood(force.domain, likelihood, inflation, largest_N), start)
         for force, start, likelihood in zip(forces, starts, likelihoods, strict=True)
     ]
     choices.sort(key=lambda pair: -pair[0].log_evidence)
-    return _LinearChoices(choices, motions, inflation, without_force)
+    return _LinearChoices(choices, tracks.motions, inflation, without_force)
 
 
-def _correlation_error(inversion: LinearInversion, inflation: float) -> float:
+def _correlation_error(problem: ForceProblem, inflation: float) -> float:
     """Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer."""
     # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
-    points_per_part = max(inversion.n_points / (20 * len(inversion.data)), 1.0)
+    points_per_part = max(problem.n_points / (20 * len(problem.data)), 1.0)
     return (1 + (inflation - 1) * points_per_part) / inflation
 
 
-def _refined_choices(
-    fit: Fit, inversion: LinearInversion, linear: _LinearChoices, largest_N: float
-) -> list[_RefinedChoice]:
+def _refined_choices(problem: ForceProblem, linear: _LinearChoices, largest_N: float) -> list[_RefinedChoice]:
     """The best choices of each number of variables after the nonlinear fit, without those that cannot be simulated. One
     variable is refined too, even where two are more likely: far from the solution the linear inversion errs, most for
     what has few coefficients.
@@ -604,7 +529,7 @@ def _refined_choices(
         for size, count in CHOICES_REFINED.items()
         for pair in [pair for pair in linear.choices if len(pair[0].domain.variables) == size][:count]
     ]
-    refined = [_refined(fit, inversion, start, choice, linear.inflation, largest_N) for choice, start in best_of_size]
+    refined = [_refined(problem, start, choice, linear.inflation, largest_N) for choice, start in best_of_size]
     return [
         _RefinedChoice(choice, *solution)
         for (choice, _), solution in zip(best_of_size, refined, strict=True)
@@ -613,8 +538,7 @@ def _refined_choices(
 
 
 def _restarted_from_best(
-    fit: Fit,
-    inversion: LinearInversion,
+    problem: ForceProblem,
     refined: Sequence[_RefinedChoice],
     inflation: float,
     largest_N: float,
@@ -638,26 +562,25 @@ def _restarted_from_best(
         # 1e-3: relative singular value below which a force along the motions does not determine a combination
         # of splines (chosen)
         amplitude = np.asarray(np.linalg.lstsq(basis, force_N, rcond=1e-3)[0])
-        start = replace(best.point, law=SmoothForce(choice.domain, np.eye(choice.domain.size)), amplitude=amplitude)
-        again = _refined(fit, inversion, start, choice, inflation, largest_N)
+        start = replace(best.point, force=SmoothForce(choice.domain, np.eye(choice.domain.size)), amplitude=amplitude)
+        again = _refined(problem, start, choice, inflation, largest_N)
         if again is not None and again[1].least_chi2 < each.likelihood.least_chi2:
             kept[-1] = _RefinedChoice(choice, *again)
     return kept
 
 
 def _refined(
-    fit: Fit,
-    inversion: LinearInversion,
-    point: SearchPoint,
+    problem: ForceProblem,
+    point: ForcePoint,
     choice: VariableChoice,
     inflation: float,
     largest_N: float,
-) -> tuple[SearchPoint, CoefficientLikelihood] | None:
+) -> tuple[ForcePoint, CoefficientLikelihood] | None:
     """The nonlinear fit of a force over given variables, alternating between the force and its hyperparameters. The
     force is constrained to be constant at the start of growth, and freed in a last round if that is more likely.
     """
     hyperparameter_updates = 2  # Rounds of optimising the force and then its amplitude and length scales (chosen)
-    solution: tuple[SearchPoint, CoefficientLikelihood] | None = None
+    solution: tuple[ForcePoint, CoefficientLikelihood] | None = None
     every_spline = SmoothForce(choice.domain, np.eye(choice.domain.size))
     for update in range(hyperparameter_updates + 1):
         likely = choice.best()
@@ -667,16 +590,16 @@ def _refined(
         # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
         surface = replace(surface, sd_N=surface.sd_N / math.sqrt(inflation))
         amplitude = np.asarray(np.linalg.lstsq(surface.modes, point.amplitude, rcond=None)[0])
-        optimum = optimise_smooth_force(fit, inversion, replace(point, law=surface, amplitude=amplitude))
+        optimum = optimise_force(problem, replace(point, force=surface, amplitude=amplitude))
         if optimum is None:
             break
-        point = replace(optimum, law=every_spline, amplitude=surface.modes @ optimum.amplitude)
-        likelihood = coefficient_likelihood(point, normal_equations(fit, inversion, point))
+        point = replace(optimum.point, force=every_spline, amplitude=surface.modes @ optimum.point.amplitude)
+        likelihood = problem.linearised(point).likelihood()
         # New hyperparameters may lead to a worse fit: the last solution is then kept.
         if not likelihood.is_finite or (solution is not None and likelihood.least_chi2 > solution[1].least_chi2):
             break
         solution = point, likelihood
-        inflation = max(likelihood.least_chi2 / inversion.n_points, 1.0)
+        inflation = max(likelihood.least_chi2 / problem.n_points, 1.0)
         choice = marginal_likelihood(choice.domain, likelihood, inflation, largest_N)
     return solution
 

@@ -23,18 +23,20 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.drift import replicate_scatter, residual_courses
 from vinetrack.diagnosis.force_inversion import (
+    LEAST_INFORMATION,
+    PARAMETER_CUTOFF,
     FittedMotion,
     ForceEstimate,
-    LinearInversion,
-    force_sensitivities,
-    motions_of,
+    ForcePoint,
+    ForceProblem,
+    FreeForce,
+    optimise_force,
+    scaled_pseudo_inverse,
     splines,
-    standard_error,
     uniform_splines,
 )
-from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid, refine_law
+from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid, standard_error
 from vinetrack.diagnosis.learned_force import LearnedForce, learned_force
-from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
@@ -44,59 +46,7 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# The misfit of a fit, linearised in a missing force: the starting point of every search for that force.
-
-# Splines of a force along the growth of one condition, and the extra knots in the first tenth of it (chosen)
-N_SPLINES, EARLY_KNOTS = 15, (0.01, 0.03, 0.06)
-
-
-@dataclass(frozen=True)
-class LinearMisfit:
-    """A fit linearised about one set of trial effects, and a smooth force estimated in every condition."""
-
-    inversion: LinearInversion
-    motions: list[FittedMotion]
-    longest: dict[str, float]
-    sensitivities: list[Floats]
-    smooth_force: ForceEstimate
-
-
-def linear_misfit(fit: Fit) -> LinearMisfit:
-    """Linearise about the trial effects of the fit or about those estimated trial by trial. Of the two, the one is
-    taken whose misfit a smooth force in every condition explains further.
-    """
-    try:
-        scatter = replicate_scatter(fit, residual_courses(fit)[0])
-        starts = [fit.solution.state.trial_effects, align_trials(fit).trial_effects]
-        linearised = [_linearised(fit, LinearInversion(fit, trial_effects, scatter)) for trial_effects in starts]
-    except SimulationError as error:
-        raise FitError(f"The model cannot be simulated: {error}") from error
-    return min(linearised, key=lambda each: each.inversion.chi2_without_force - each.smooth_force.delta_chi2)
-
-
-def growth_splines(part: Floats) -> Floats:
-    """Splines of a force along the growth, narrower at the start, where the vine accelerates. Shapes: part (n,) → (n,
-    N_SPLINES).
-    """
-    uniform_knots = np.linspace(0.0, 1.0, N_SPLINES - 2 - len(EARLY_KNOTS))[1:]
-    return splines(part, np.concatenate([[0.0, *EARLY_KNOTS], uniform_knots]))
-
-
-def _linearised(fit: Fit, inversion: LinearInversion) -> LinearMisfit:
-    motions = motions_of(fit, inversion.trial_effects)
-    # In a condition where the model predicts no motion, every position is at the start of growth.
-    longest = {motion.trial.condition: float(np.finfo(float).tiny) for motion in motions}
-    for motion in motions:
-        longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
-    sensitivities = force_sensitivities(
-        fit, inversion.trial_effects, motions, lambda m: growth_splines(m.lead_position_m / longest[m.trial.condition])
-    )
-    return LinearMisfit(inversion, motions, longest, sensitivities, inversion.estimate_by_condition(sensitivities))
-
-
-# ------------------------------------------------------------------------------
 # Simple laws ranked by how well they explain the misfit of a fit.
-
 
 # Multiple of the largest drive, weight and inertia of the trials above which a force is not reported (chosen)
 MAX_DRIVE_RATIO = 10.0
@@ -125,91 +75,151 @@ class RankedLaw:
         return self.law.words(self.estimate.amplitude.tolist(), self.estimate.sigma)
 
 
-def ranked_laws(fit: Fit, linear: LinearMisfit) -> list[RankedLaw]:
-    """Rank the best law of each kind: those detected first, then by BIC. All laws of a grid are estimated by the linear
-    inversion, then laws near the best of each kind. The first few are fitted by nonlinear least squares and all are
-    ranked again.
-    """
-    inversion, motions = linear.inversion, linear.motions
+# Splines of a force along the growth of one condition, and the extra knots in the first tenth of it (chosen)
+N_SPLINES, EARLY_KNOTS = 15, (0.01, 0.03, 0.06)
 
-    def sensitivities(laws: Sequence[Law]) -> list[Floats]:
-        return force_sensitivities(
-            fit,
-            inversion.trial_effects,
-            motions,
-            lambda motion: np.column_stack([law.unit_force(motion) for law in laws]),
+
+def growth_splines(part: Floats) -> Floats:
+    """Splines of a force along the growth, narrower at the start, where the vine accelerates. Shapes: part (n,) → (n,
+    N_SPLINES).
+    """
+    uniform_knots = np.linspace(0.0, 1.0, N_SPLINES - 2 - len(EARLY_KNOTS))[1:]
+    return splines(part, np.concatenate([[0.0, *EARLY_KNOTS], uniform_knots]))
+
+
+class ForcesByCondition:
+    """A force whose amplitudes are free in every condition: the equations of each condition, with the trial effects
+    eliminated. `information` (n_conditions, q, q) and `score` (n_conditions, q) of the amplitudes, `cross`
+    (n_conditions, p, q) with the model parameters. `delta_chi2` is the fall of χ² from `chi2_without_force`.
+    """
+
+    def __init__(self, problem: ForceProblem, point: ForcePoint, unit_force: Callable[[FittedMotion], Floats]) -> None:
+        linear = problem.linearised(point.asking(FreeForce(unit_force)))
+        self.linear, self.chi2_without_force = linear, linear.chi2_without_force
+        self.names = list(dict.fromkeys(problem.conditions))
+        condition = np.array([self.names.index(name) for name in problem.conditions])
+        prior, products = problem.prior, linear.eliminated
+        k, p, q = prior.index.shape[1], prior.prior_mean.size, linear.point.amplitude.size
+        self.information, self.score = np.zeros((len(self.names), q, q)), np.zeros((len(self.names), q))
+        cross = np.zeros((len(self.names), p + 1, q))
+        np.add.at(self.information, condition, products[:, k:-1, k:-1])
+        np.add.at(self.score, condition, products[:, k:-1, -1])
+        np.add.at(cross, (condition[:, None], prior.places), products[:, :k, k:-1])
+        self.cross = cross[:, :p] * prior.free[:, None]
+        parameters, parameter_score = linear.blocks[0], linear.blocks[1][:, -1]
+        sizes = np.einsum("nkk->nk", self.information)
+        estimable = sizes > LEAST_INFORMATION * max(float(sizes.max()), 1e-300)
+        inverses = np.array(
+            [
+                scaled_pseudo_inverse(information, LEAST_INFORMATION, which)
+                for information, which in zip(self.information, estimable, strict=True)
+            ]
         )
+        response = self.cross @ inverses
+        parameters = parameters - np.einsum("npq,nrq->pr", response, self.cross)
+        left = parameter_score - np.einsum("npq,nq->p", response, self.score)
+        gained = float(left @ scaled_pseudo_inverse(parameters, PARAMETER_CUTOFF) @ left)
+        gained -= float(parameter_score @ linear.parameter_response[:, -1])
+        self.delta_chi2 = gained + float(np.einsum("nk,nkl,nl->", self.score, inverses, self.score))
+        self.delta_chi2_beyond_chance = max(self.delta_chi2 - int(np.count_nonzero(estimable)), 0.0)
 
-    return _refined(fit, inversion, motions, _ranked(inversion, sensitivities, motions, linear.smooth_force))
-
-
-def _ranked(
-    inversion: LinearInversion,
-    sensitivities: Callable[[Sequence[Law]], list[Floats]],
-    motions: Sequence[FittedMotion],
-    smooth_force: ForceEstimate,
-) -> list[RankedLaw]:
-    """The best law of each kind by the linear inversion, best first: over the grid, then near the best of each kind."""
-
-    def estimates(laws: Sequence[Law]) -> list[tuple[Law, ForceEstimate]]:
-        each = inversion.estimate_each(sensitivities(laws), [law.n_amplitudes for law in laws])
-        return [
-            (law, estimate)
-            for law, estimate in zip(laws, each, strict=True)
-            if estimate.degrees_of_freedom or law.kind == "constant"
-        ]
-
-    estimated, largest_N = estimates(laws_on_grid(motions)), _largest_N(motions)
-    largest_delta_chi2 = max(smooth_force.delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
-    best = _best_of_kinds(_with_bic(inversion, estimated, largest_delta_chi2, largest_N))
-    estimated += estimates([law for ranked in best for law in laws_near(ranked.law, motions)])
-    largest_delta_chi2 = max(largest_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
-    return sorted(
-        _best_of_kinds(_with_bic(inversion, estimated, largest_delta_chi2, largest_N)), key=_detected_then_bic
-    )
-
-
-def _refined(
-    fit: Fit, inversion: LinearInversion, motions: Sequence[FittedMotion], laws: list[RankedLaw]
-) -> list[RankedLaw]:
-    """The laws ranked again, the best of them after a nonlinear fit, if its χ² hardly exceeds that of the linear fit.
-    Where the linear fit of the best law leaves only noise, the others keep their linear fits.
-    """
-    chi2 = inversion.chi2_without_force
-    # 3, 1.5: laws that are fitted by nonlinear least squares, if the best linear fit leaves more than this
-    # multiple of the noise; otherwise the best alone (chosen)
-    rough = chi2 - laws[0].estimate.delta_chi2 > 1.5 * inversion.n_points
-    estimates = [law.estimate for law in laws]
-    for k, ranked in enumerate(laws[: 3 if rough else 1]):
-        linear = ranked.estimate
-        # 0.5, 1.5: part of χ² that a law must take away to be refined (chosen)
-        if not ranked.is_detected or linear.delta_chi2 < 0.5 * chi2:
-            continue
-        full = refine_law(fit, inversion, motions, ranked.law, linear, thorough=k == 0)
-        if full is not None and full.chi2 < max(1.5 * (chi2 - linear.delta_chi2), inversion.n_points):
-            estimates[k] = ForceEstimate(
-                chi2 - full.chi2, full.amplitude, full.sigma, full.parameter_shift, linear.degrees_of_freedom
+    def curves(self, parameter_shift: Floats) -> dict[str, tuple[Floats, Floats]]:
+        """A smooth force in every condition at given model parameters: coefficients, N, shape (q,), and their
+        covariance. The coefficients minimise χ² plus a penalty on their second differences (a P-spline, Eilers & Marx
+        1996). One penalty for all conditions is chosen by generalised cross-validation. Shapes: parameter_shift
+        (n_free,).
+        """
+        information, score = self.information, self.score - np.einsum("npq,p->nq", self.cross, parameter_shift)
+        n_points, count = self.linear.problem.n_points, score.shape[1]
+        second_difference = np.diff(np.eye(count), 2, axis=0)
+        unit = float(np.mean(np.einsum("nkk->n", information))) / count
+        roughness = unit * (second_difference.T @ second_difference + 1e-6 * np.eye(count))
+        best: tuple[float, Floats, Floats] | None = None
+        independent_points = self.linear.problem.independent_points
+        unpenalised = np.linalg.solve(information + 1e-9 * roughness, score[:, :, None])[:, :, 0]
+        largest_gain = float(np.sum(score * unpenalised))
+        # Penalties, relative to the mean information about a coefficient (chosen)
+        for penalty in np.geomspace(1e-6, 1e2, 17):
+            inverse = np.linalg.inv(information + penalty * roughness)
+            coefficients = np.einsum("nkl,nl->nk", inverse, score)
+            lost_gain = largest_gain - float(
+                np.sum(2 * coefficients * score) - np.einsum("nk,nkl,nl->", coefficients, information, coefficients)
             )
-            laws = [*laws[:k], replace(ranked, law=full.law), *laws[k + 1 :]]
-    largest_delta_chi2 = max(estimate.delta_chi2 for estimate in estimates)
-    estimated = list(zip((law.law for law in laws), estimates, strict=True))
-    return sorted(_with_bic(inversion, estimated, largest_delta_chi2, _largest_N(motions)), key=_detected_then_bic)
+            degrees_of_freedom = float(np.einsum("nkl,nlk->", inverse, information))
+            cross_validation = (lost_gain + independent_points) / max(independent_points - degrees_of_freedom, 1.0) ** 2
+            if best is None or cross_validation < best[0]:
+                best = cross_validation, coefficients, inverse
+        assert best is not None
+        unmoved = not parameter_shift.any()
+        left = (self.chi2_without_force - largest_gain) / max(n_points - score.size, 1.0)
+        inflation = max(1.0, left) if unmoved else 1.0
+        return {name: (best[1][i], inflation * best[2][i]) for i, name in enumerate(self.names)}
 
 
-def _with_bic(
-    inversion: LinearInversion,
-    estimated: Sequence[tuple[Law, ForceEstimate]],
-    largest_delta_chi2: float,
-    largest_N: float,
-) -> list[RankedLaw]:
+@dataclass(frozen=True)
+class Misfit:
+    """What a fit leaves unexplained, seen from one set of motions: χ² without a force, that of a smooth force in every
+    condition (its fall beyond chance), and the best law of each kind, best first.
+    """
+
+    point: ForcePoint
+    chi2_without_force: float
+    by_condition: ForcesByCondition
+    laws: list[RankedLaw]
+
+    @property
+    def chi2_with_law(self) -> float:
+        """χ² that the first law leaves."""
+        return self.chi2_without_force - self.laws[0].estimate.delta_chi2
+
+
+def misfit_of(problem: ForceProblem) -> Misfit:
+    """The misfit seen from the tracks or, where that leaves less, from the motions under the law that is best there.
+    Tracks are smoothed too much to show a force over a few millimetres in its place; the vine under a law is not.
+    """
+    on_tracks = _seen_from(problem, problem.on_tracks())
+    best = on_tracks.laws[0]
+    if not best.is_detected:
+        return on_tracks
+    optimum = optimise_force(problem, on_tracks.point.asking(FreeForce(best.law.unit_force)))
+    if optimum is None:
+        return on_tracks
+    under_law = _seen_from(problem, optimum.point)
+    return min(on_tracks, under_law, key=lambda misfit: misfit.chi2_with_law)
+
+
+def _seen_from(problem: ForceProblem, point: ForcePoint) -> Misfit:
+    """The best law of each kind: over the grid, then near the best of each kind."""
+    longest = _longest(point.motions)
+    smooth = ForcesByCondition(
+        problem, point, lambda motion: growth_splines(motion.lead_position_m / longest[motion.trial.condition])
+    )
+    chi2, largest_N = smooth.chi2_without_force, _largest_N(point.motions)
+
+    def ranked(estimated: Sequence[tuple[Law, ForceEstimate]]) -> list[RankedLaw]:
+        largest = max(smooth.delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
+        laws = [
+            RankedLaw(law, one, problem.bic(chi2, one.delta_chi2, law.n_parameters, largest), largest_N=largest_N)
+            for law, one in estimated
+        ]
+        return sorted(_best_of_kinds(laws), key=_detected_then_bic)
+
+    estimated = _estimates(problem, point, laws_on_grid(point.motions))
+    near = [law for best in ranked(estimated) for law in laws_near(best.law, point.motions)]
+    laws = ranked(estimated + _estimates(problem, point, near))
+    return Misfit(point, chi2, smooth, laws)
+
+
+def _estimates(problem: ForceProblem, point: ForcePoint, laws: Sequence[Law]) -> list[tuple[Law, ForceEstimate]]:
+    """Each law estimated alone."""
+    if not laws:
+        return []
+    all_laws = FreeForce(lambda motion: np.column_stack([law.unit_force(motion) for law in laws]))
+    each = problem.linearised(point.asking(all_laws)).estimates([law.n_amplitudes for law in laws])
     return [
-        RankedLaw(
-            law,
-            estimate,
-            inversion.bic(estimate.delta_chi2, law.n_parameters, largest_delta_chi2),
-            largest_N=largest_N,
-        )
-        for law, estimate in estimated
+        (law, estimate)
+        for law, estimate in zip(laws, each, strict=True)
+        if estimate.degrees_of_freedom or law.kind == "constant"
     ]
 
 
@@ -239,10 +249,6 @@ def _best_of_kinds(laws: Sequence[RankedLaw]) -> list[RankedLaw]:
 
 FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
 LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
-
-# Splines of a force that depends on one variable alone, the same in all trials
-SPLINES_OF_VARIABLE = {"growth": 24, "speed": 10, "time": 10}
-
 
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
 
@@ -287,45 +293,56 @@ class MissingForce:
 @in_one_blas_thread
 def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
     """Estimate the force that a fit lacks and compare it with simple laws."""
-    linear = linear_misfit(fit)
-    inversion, motions = linear.inversion, linear.motions
-    ranked = ranked_laws(fit, linear)
-    by_variable = _explained_by_variable(fit, inversion, motions)
+    problem = force_problem(fit)
+    misfit = misfit_of(problem)
+    point, best = misfit.point, misfit.laws[0]
+    by_variable = _explained_by_variable(problem, point)
     explicable = max(
         [
             1e-300,
-            linear.smooth_force.delta_chi2_beyond_chance,
+            misfit.by_condition.delta_chi2_beyond_chance,
             *by_variable.values(),
-            *(law.estimate.delta_chi2_beyond_chance for law in ranked),
+            *(law.estimate.delta_chi2_beyond_chance for law in misfit.laws),
         ]
     )
-    laws = [replace(law, explained=law.estimate.delta_chi2_beyond_chance / explicable) for law in ranked]
+    laws = [replace(law, explained=law.estimate.delta_chi2_beyond_chance / explicable) for law in misfit.laws]
     depends_on = {name: delta_chi2 / explicable for name, delta_chi2 in by_variable.items()}
     best = laws[0]
-    shift = best.estimate.parameter_shift
     named = best.explained >= LEAST_EXPLAINED_TO_NAME and best.is_detected
-    curves = inversion.smooth_force_by_condition(linear.sensitivities, shift if named else np.zeros_like(shift))
+    as_fitted = fit.solution.state.theta - point.theta
+    curves = misfit.by_condition.curves(best.estimate.parameter_shift if named else as_fitted)
+    beyond_noise = misfit.chi2_without_force - problem.n_points
+    # NaN where the misfit hardly exceeds the noise
+    reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
     return MissingForce(
-        table=_force_table(motions, linear.longest, curves),
+        table=_force_table(point.motions, curves),
         laws=_law_table(laws),
         depends_on=depends_on,
-        sentence=_sentence(laws, depends_on, _misfit_reduction(inversion, explicable)),
+        sentence=_sentence(laws, depends_on, reduction),
         detected=tuple(_detected(law) for law in laws if law.is_detected),
-        learned=_learned(fit, linear) if learn else None,
+        learned=_learned(problem) if learn else None,
     )
 
 
 @in_one_blas_thread
 def learn_missing_force(fit: Fit) -> LearnedForce | None:
     """Estimate the force that a fit lacks as a smooth function, without comparing it with laws."""
-    return _learned(fit, linear_misfit(fit))
+    return _learned(force_problem(fit))
 
 
-def _learned(fit: Fit, linear: LinearMisfit) -> LearnedForce | None:
+def force_problem(fit: Fit) -> ForceProblem:
+    """What is asked of forces beside a fit, with the scatter of its replicates."""
+    try:
+        return ForceProblem(fit, replicate_scatter(fit, residual_courses(fit)[0]))
+    except SimulationError as error:
+        raise FitError(f"The model cannot be simulated: {error}") from error
+
+
+def _learned(problem: ForceProblem) -> LearnedForce | None:
     """The force as a smooth function; None also where the motions under it cannot be simulated."""
     try:
         with np.errstate(all="raise", under="ignore"):
-            return learned_force(fit, linear.inversion, linear.motions, linear.inversion.scatter.dof)
+            return learned_force(problem)
     except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
         return None
 
@@ -334,35 +351,41 @@ def _detected(ranked: RankedLaw) -> DetectedLaw:
     return DetectedLaw(ranked.law, tuple(ranked.estimate.amplitude.tolist()), ranked.explained, ranked.words)
 
 
-def _explained_by_variable(fit: Fit, inversion: LinearInversion, motions: Sequence[FittedMotion]) -> dict[str, float]:
+def _explained_by_variable(problem: ForceProblem, point: ForcePoint) -> dict[str, float]:
     """Fall of χ² beyond chance with a smooth force of one variable, and with a constant force in each condition."""
     values_of = {
         "growth": lambda m: m.lead_position_m,
         "speed": lambda m: m.tail_velocity_m_s,
         "time": lambda m: m.time_s,
     }
-    explained = {}
-    for name, count in SPLINES_OF_VARIABLE.items():
-        highest = max(float(values_of[name](motion).max()) for motion in motions)
-        sensitivities = force_sensitivities(
-            fit,
-            inversion.trial_effects,
-            motions,
-            lambda m, values=values_of[name], h=highest, n=count: uniform_splines(values(m) / h, n),  # type: ignore[misc]
+    # Splines of a force that depends on one variable alone, the same in all trials (chosen)
+    counts = {"growth": 24, "speed": 10, "time": 10}
+    highest = {name: max(float(of(motion).max()) for motion in point.motions) for name, of in values_of.items()}
+    forces = FreeForce(
+        lambda motion: np.hstack(
+            [uniform_splines(values_of[name](motion) / highest[name], count) for name, count in counts.items()]
         )
-        explained[name] = inversion.estimate_jointly(sensitivities).delta_chi2_beyond_chance
-    constant = force_sensitivities(fit, inversion.trial_effects, motions, lambda m: np.ones((m.time_s.size, 1)))
-    explained["condition"] = inversion.estimate_by_condition(constant).delta_chi2_beyond_chance
-    return explained
+    )
+    estimates = problem.linearised(point.asking(forces)).estimates(list(counts.values()))
+    explained = {name: one.delta_chi2_beyond_chance for name, one in zip(counts, estimates, strict=True)}
+    constant = ForcesByCondition(problem, point, lambda motion: np.ones((motion.time_s.size, 1)))
+    return explained | {"condition": constant.delta_chi2_beyond_chance}
 
 
-def _force_table(
-    motions: Sequence[FittedMotion], longest: Mapping[str, float], curves: Mapping[str, tuple[Floats, Floats]]
-) -> pd.DataFrame:
+def _longest(motions: Sequence[FittedMotion]) -> dict[str, float]:
+    """The longest growth of each condition, m; above 0 also where nothing moves."""
+    longest: dict[str, float] = {}
+    for motion in motions:
+        name, growth_m = motion.trial.condition, float(motion.lead_position_m.max())
+        longest[name] = max(longest.get(name, float(np.finfo(float).tiny)), growth_m)
+    return longest
+
+
+def _force_table(motions: Sequence[FittedMotion], curves: Mapping[str, tuple[Floats, Floats]]) -> pd.DataFrame:
     """Force of every condition along its first trial's motion, and the mean over all conditions."""
     import pandas as pd
 
-    rows = []
+    rows, longest = [], _longest(motions)
     for condition, (coefficients, covariance) in curves.items():
         motion = next(m for m in motions if m.trial.condition == condition)
         # 24: points of a curve (chosen)
@@ -424,12 +447,6 @@ def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
         for law in laws
     ]
     return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
-
-
-def _misfit_reduction(inversion: LinearInversion, explicable: float) -> float:
-    """Part of the misfit that a force can take away; NaN where the misfit hardly exceeds the noise."""
-    misfit = inversion.chi2_without_force - inversion.n_points
-    return min(explicable / misfit, 1.0) if misfit > inversion.n_points else math.nan
 
 
 def _sentence(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_reduction: float) -> str:

@@ -29,8 +29,8 @@ from vinetrack.diagnosis.candidate_fits import (
     restart_without,
     start_values,
 )
-from vinetrack.diagnosis.force_inversion import VARIABLES, Domain, uniform_splines
-from vinetrack.diagnosis.force_laws import EDGE_FRACTION
+from vinetrack.diagnosis.force_inversion import uniform_splines
+from vinetrack.diagnosis.force_laws import EDGE_FRACTION, VARIABLES, Domain
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
 from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce, variables_in_words
 from vinetrack.diagnosis.likelihood_ratio import (
