@@ -499,9 +499,9 @@ class ForceEstimate:
 
 @dataclass(frozen=True)
 class CoefficientLikelihood:
-    """Quadratic log-likelihood of the amplitudes, all other unknowns integrated out. `information` and `score` are about
-    amplitudes of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to the best amplitudes. `log_determinant` is
-    that of the information on all other unknowns.
+    """Quadratic log-likelihood of the amplitudes, all other unknowns integrated out. `information` and `score` are
+    about amplitudes of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to the best amplitudes.
+    `log_determinant` is that of the information on all other unknowns.
     """
 
     information: Floats

@@ -22,7 +22,6 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
-    CONVERGENCE_TOLERANCE,
     CoefficientLikelihood,
     FittedMotion,
     ForcePoint,
@@ -227,56 +226,23 @@ def variables_in_words(name: str) -> str:
     return " and ".join(_WORDS[variable] for variable in name.split("+"))
 
 
-def dependent_variables(domain: Domain, singles: Sequence[Domain], motions: Sequence[FittedMotion]) -> list[str]:
-    """Variables that are smooth functions of those of a domain, along all trials."""
-    counts = [np.count_nonzero(motion.time_s <= motion.counts_until_s) for motion in motions]
-    # 40: points of a motion at which one variable is regressed on others (chosen)
-    points = [np.linspace(0, count - 1, 40).astype(int) for count in counts]
-
-    def visited(of: Domain) -> list[Floats]:
-        by_motion = [np.array(of.values_along(motion))[:, at] for motion, at in zip(motions, points, strict=True)]
-        return list(np.hstack(by_motion))
-
-    basis = domain.basis(visited(domain))
-    names = []
-    for single in singles:
-        if single.variables[0] in domain.variables:
-            continue
-        (value,) = single.normalised(visited(single))
-        residual = value - basis @ np.linalg.lstsq(basis, value, rcond=1e-8)[0]
-        # 0.1: part of a variable's variance left by smooth functions of others, up to which it counts as a
-        # function of them (measured)
-        if float(np.var(residual)) < 0.1 * float(np.var(value)):
-            names.append(single.variables[0])
-    return names
-
-
 def not_excluded(
-    best: Domain,
-    weights: Mapping[str, float],
-    losses: Mapping[str, float],
-    threshold: float,
-    others: Sequence[Domain],
-    motions: Sequence[FittedMotion],
+    best: Domain, weights: Mapping[str, float], losses: Mapping[str, float], threshold: float, others: Sequence[Domain]
 ) -> list[str]:
-    """Choices of variables, besides the best, that the trials do not exclude; highest weight first. Among the refined
-    choices: those with enough weight, and those of no more variables than the best whose χ² is hardly larger.
+    """Choices of variables, besides the best, that the trials do not exclude: those with enough weight, and those of no
+    more variables than the best whose χ² is hardly larger; highest weight first.
     """
-    singles = [domain for domain in others if len(domain.variables) == 1]
-    names = []
-    for domain in others:
-        if domain.name == best.name:
-            continue
-        no_larger = len(domain.variables) <= len(best.variables)
-        if domain.name in weights:
-            # 0.05: weight from which a choice of variables is reported with the best (chosen)
-            possible = weights[domain.name] >= 0.05 or (no_larger and losses[domain.name] < threshold)
-        else:
-            implied = {*domain.variables, *dependent_variables(domain, singles, motions)} if no_larger else set()
-            possible = len(domain.variables) == len(best.variables) > 1 and implied >= set(best.variables)
-        if possible:
-            names.append(domain.name)
-    return sorted(names, key=lambda name: -weights.get(name, 0.0))
+    # 0.05: weight from which a choice of variables is reported with the best (chosen)
+    names = [
+        domain.name
+        for domain in others
+        if domain.name != best.name
+        and (
+            weights[domain.name] >= 0.05
+            or (len(domain.variables) <= len(best.variables) and losses[domain.name] < threshold)
+        )
+    ]
+    return sorted(names, key=lambda name: -weights[name])
 
 
 def dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[str]) -> str:
@@ -368,8 +334,6 @@ LEARNED_COLUMNS = (*VARIABLES.values(), "force_N", "sigma_N", "trials", "conditi
 
 LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is estimated (chosen)
 
-CHOICES_REFINED = {1: 1, 2: 3}  # Choices of one variable and of two for which the nonlinear problem is solved (chosen)
-
 
 @dataclass(frozen=True)
 class LearnedForce:
@@ -408,200 +372,110 @@ class LearnedForce:
         }
 
 
-@dataclass(frozen=True)
-class _RefinedChoice:
-    """A choice of variables after the nonlinear fit: where the search ended, and the likelihood there."""
-
-    choice: VariableChoice
-    point: ForcePoint
-    likelihood: CoefficientLikelihood
-
-
 def learned_force(problem: ForceProblem) -> LearnedForce | None:
-    """Estimate the missing force over the variables with the highest marginal likelihood."""
-    tracks = problem.on_tracks()
-    chi2_without_force = problem.linearised(tracks).chi2_without_force
-    if chi2_without_force < LEAST_CHI2_PER_POINT * problem.n_points:
+    """Estimate the missing force over the variables with the highest marginal likelihood. All choices of variables are
+    compared about the same motions: those on the tracks, then twice those under the most likely force.
+    """
+    seen = _choices_seen_from(problem, problem.on_tracks())
+    if seen is None or seen.chi2_without_force < LEAST_CHI2_PER_POINT * problem.n_points:
         return None
-    largest_N = max(
-        float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in tracks.motions
-    )
-    linear = _linear_choices(problem, tracks, largest_N)
+    log_bayes_factors = {each.domain.name: each.log_evidence - seen.log_evidence_without_force for each in seen.choices}
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
-    if linear is None or linear.log_bayes_factor(linear.choices[0][0]) < 18.0:
+    if max(log_bayes_factors.values()) < 18.0:
         return None
-    refined = _refined_choices(problem, linear, largest_N)
-    if not refined:
+    chi2_without_force = seen.chi2_without_force
+    for at_start in (CONSTANT_AT_START, ""):
+        point = _under_most_likely(problem, seen, at_start)
+        again = None if point is None else _choices_seen_from(problem, point)
+        if again is None:
+            return None
+        seen = again
+    # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
+    points_per_part = max(problem.n_points / (20 * len(problem.data)), 1.0)
+    # Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer
+    error = (1 + (seen.inflation - 1) * points_per_part) / seen.inflation
+    weights = variable_weights(seen.choices, error)
+    choice = max(seen.choices, key=lambda each: weights[each.domain.name])
+    best = choice.best(error)
+    misfit = chi2_without_force - problem.n_points
+    explained = (chi2_without_force - best.chi2) / misfit
+    # 0.95: part of the misfit that the force must take away to be reported (chosen)
+    if explained < 0.95:
         return None
-    refined = _restarted_from_best(problem, refined, linear.inflation, largest_N)
-    inflation = max(min(each.likelihood.least_chi2 for each in refined) / problem.n_points, 1.0)
-    choices = [marginal_likelihood(each.choice.domain, each.likelihood, inflation, largest_N) for each in refined]
-    chi2 = min(choice.best().chi2 for choice in choices)
-    noise_chi2 = problem.n_points
-    # 0.95: part of the misfit that the refined force must take away to be reported (chosen)
-    if chi2_without_force - chi2 < 0.95 * (chi2_without_force - noise_chi2):
-        return None
-    correlation_error = _correlation_error(problem, inflation)
-    error = max(0.5 * CONVERGENCE_TOLERANCE * chi2 / inflation, correlation_error)
-    weights = variable_weights(choices, error)
-    choice, solution = max(
-        zip(choices, (each.point for each in refined), strict=True), key=lambda pair: weights[pair[0].domain.name]
-    )
-    # Start conditions are compared at one solution, so that the tolerance of the search cancels.
-    best = choice.best(correlation_error)
     # Choices are excluded by the χ² of their best coefficients, without regard to how smooth those are.
-    least_chi2 = {each.choice.domain.name: each.likelihood.least_chi2 for each in refined}
-    losses = {name: (value - least_chi2[best.domain.name]) / inflation for name, value in least_chi2.items()}
-    threshold = ANSWER_SET_DELTA_CHI2 * error
-    alternatives = not_excluded(best.domain, weights, losses, threshold, linear.domains, linear.motions)
-    misfit = max(chi2_without_force - problem.n_points, 1e-300)
-    table = _table(best, solution.motions)
-    explained = min(max((chi2_without_force - best.chi2) / misfit, 0.0), 1.0)
+    losses = {
+        name: (chi2 - seen.least_chi2[best.domain.name]) / seen.inflation for name, chi2 in seen.least_chi2.items()
+    }
+    alternatives = not_excluded(best.domain, weights, losses, ANSWER_SET_DELTA_CHI2 * error, seen.domains)
+    table, explained = _table(best, seen.point.motions), min(explained, 1.0)
     sentence = force_sentence(best, weights, alternatives, explained, table, choice.undecided_N)
     return LearnedForce(
         best=best,
-        motions=solution.motions,
+        motions=seen.point.motions,
         weights=weights,
         not_excluded=tuple(alternatives),
-        log_bayes_factor=linear.log_bayes_factor(
-            next(choice for choice, _ in linear.choices if choice.domain == best.domain)
-        ),
+        log_bayes_factor=log_bayes_factors[best.domain.name],
         explained=explained,
         table=table,
-        sentence=" ".join([sentence, *remarks(problem.scatter.dof, linear.domains, alternatives)]),
+        sentence=" ".join([sentence, *remarks(problem.scatter.dof, seen.domains, alternatives)]),
         undecided_N=choice.undecided_N,
     )
 
 
 @dataclass(frozen=True)
-class _LinearChoices:
-    """All choices of variables about motions on the tracks, by the linear inversion, most likely first. Each has the
-    point where its nonlinear fit starts. `inflation` is the ratio of residual to noise variance that the best of them
-    leaves.
+class _Choices:
+    """All choices of variables about the motions of a point, most likely first. `inflation` is the ratio of residual to
+    noise variance that the best coefficients of any of them leave, `least_chi2` what those of each leave, by name.
     """
 
-    choices: list[tuple[VariableChoice, ForcePoint]]
-    motions: Sequence[FittedMotion]
+    point: ForcePoint
+    choices: list[VariableChoice]
     inflation: float
+    least_chi2: dict[str, float]
+    chi2_without_force: float
     log_evidence_without_force: float
 
     @property
     def domains(self) -> list[Domain]:
         """The variables of all choices."""
-        return [choice.domain for choice, _ in self.choices]
-
-    def log_bayes_factor(self, choice: VariableChoice) -> float:
-        """Log Bayes factor of a choice against no force."""
-        return choice.log_evidence - self.log_evidence_without_force
+        return [choice.domain for choice in self.choices]
 
 
-def _linear_choices(problem: ForceProblem, tracks: ForcePoint, largest_N: float) -> _LinearChoices | None:
-    """The marginal likelihood of every choice of variables, about motions on the tracks."""
-    forces = [SmoothForce(domain, np.eye(domain.size)) for domain in candidate_domains(tracks.motions)]
-    starts = [tracks.asking(force) for force in forces]
-    likelihoods = [problem.linearised(start).likelihood() for start in starts]
+def _choices_seen_from(problem: ForceProblem, point: ForcePoint) -> _Choices | None:
+    """The marginal likelihood of every choice of variables; None where they cannot be computed."""
+    largest_N = max(float(np.max(np.nan_to_num(m.pressure_Pa) * m.trial.area_m2)) / 2 for m in point.motions)
+    domains = candidate_domains(point.motions)
+    likelihoods = [
+        problem.linearised(point.asking(SmoothForce(domain, np.eye(domain.size)))).likelihood() for domain in domains
+    ]
     if not all(likelihood.is_finite for likelihood in likelihoods):
         return None
     inflation = max(min(likelihood.least_chi2 for likelihood in likelihoods) / problem.n_points, 1.0)
-    without_force = -0.5 * likelihoods[0].chi2_at_zero / inflation - 0.5 * likelihoods[0].log_determinant
+    chi2_without_force = likelihoods[0].chi2_at_zero
     choices = [
-        (marginal_likelihood(force.domain, likelihood, inflation, largest_N), start)
-        for force, start, likelihood in zip(forces, starts, likelihoods, strict=True)
+        marginal_likelihood(domain, likelihood, inflation, largest_N)
+        for domain, likelihood in zip(domains, likelihoods, strict=True)
     ]
-    choices.sort(key=lambda pair: -pair[0].log_evidence)
-    return _LinearChoices(choices, tracks.motions, inflation, without_force)
+    return _Choices(
+        point,
+        sorted(choices, key=lambda choice: -choice.log_evidence),
+        inflation,
+        {domain.name: likelihood.least_chi2 for domain, likelihood in zip(domains, likelihoods, strict=True)},
+        chi2_without_force,
+        -0.5 * chi2_without_force / inflation - 0.5 * likelihoods[0].log_determinant,
+    )
 
 
-def _correlation_error(problem: ForceProblem, inflation: float) -> float:
-    """Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer."""
-    # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
-    points_per_part = max(problem.n_points / (20 * len(problem.data)), 1.0)
-    return (1 + (inflation - 1) * points_per_part) / inflation
-
-
-def _refined_choices(problem: ForceProblem, linear: _LinearChoices, largest_N: float) -> list[_RefinedChoice]:
-    """The best choices of each number of variables after the nonlinear fit, without those that cannot be simulated. One
-    variable is refined too, even where two are more likely: far from the solution the linear inversion errs, most for
-    what has few coefficients.
+def _under_most_likely(problem: ForceProblem, seen: _Choices, at_start: str) -> ForcePoint | None:
+    """The motions under the most probable force of the most likely choice, under one condition at the start of growth
+    or, without a name, the most likely one.
     """
-    best_of_size = [
-        pair
-        for size, count in CHOICES_REFINED.items()
-        for pair in [pair for pair in linear.choices if len(pair[0].domain.variables) == size][:count]
-    ]
-    refined = [_refined(problem, start, choice, linear.inflation, largest_N) for choice, start in best_of_size]
-    return [
-        _RefinedChoice(choice, *solution)
-        for (choice, _), solution in zip(best_of_size, refined, strict=True)
-        if solution is not None
-    ]
-
-
-def _restarted_from_best(
-    problem: ForceProblem,
-    refined: Sequence[_RefinedChoice],
-    inflation: float,
-    largest_N: float,
-) -> list[_RefinedChoice]:
-    """Every choice of two variables searched again from the solution of the best, and the lower χ² kept. The first
-    search starts from the choice's own linear inversion. Where that is far off it may stop in a local minimum, and the
-    choice would be excluded though it could represent the very force of the best.
-    """
-    best = min(refined, key=lambda each: each.likelihood.chi2_at_zero - each.likelihood.delta_chi2)
-    least_chi2 = best.likelihood.least_chi2
-    motions, domain = best.point.motions, best.choice.domain
-    force_N = np.concatenate([domain.basis(domain.values_along(motion)) @ best.point.amplitude for motion in motions])
-    kept = []
-    for each in refined:
-        kept.append(each)
-        choice = each.choice
-        excess = each.likelihood.least_chi2 - least_chi2
-        if choice.domain == domain or len(choice.domain.variables) < 2 or excess < CONVERGENCE_TOLERANCE * least_chi2:
-            continue
-        basis = np.concatenate([choice.domain.basis(choice.domain.values_along(motion)) for motion in motions])
-        # 1e-3: relative singular value below which a force along the motions does not determine a combination
-        # of splines (chosen)
-        amplitude = np.asarray(np.linalg.lstsq(basis, force_N, rcond=1e-3)[0])
-        start = replace(best.point, force=SmoothForce(choice.domain, np.eye(choice.domain.size)), amplitude=amplitude)
-        again = _refined(problem, start, choice, inflation, largest_N)
-        if again is not None and again[1].least_chi2 < each.likelihood.least_chi2:
-            kept[-1] = _RefinedChoice(choice, *again)
-    return kept
-
-
-def _refined(
-    problem: ForceProblem,
-    point: ForcePoint,
-    choice: VariableChoice,
-    inflation: float,
-    largest_N: float,
-) -> tuple[ForcePoint, CoefficientLikelihood] | None:
-    """The nonlinear fit of a force over given variables, alternating between the force and its hyperparameters. The
-    force is constrained to be constant at the start of growth, and freed in a last round if that is more likely.
-    """
-    hyperparameter_updates = 2  # Rounds of optimising the force and then its amplitude and length scales (chosen)
-    solution: tuple[ForcePoint, CoefficientLikelihood] | None = None
-    every_spline = SmoothForce(choice.domain, np.eye(choice.domain.size))
-    for update in range(hyperparameter_updates + 1):
-        likely = choice.best()
-        surface = choice.with_start(CONSTANT_AT_START) if update < hyperparameter_updates else likely.surface
-        if update == hyperparameter_updates and likely.at_start != FREE_AT_START:
-            break
-        # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
-        surface = replace(surface, sd_N=surface.sd_N / math.sqrt(inflation))
-        amplitude = np.asarray(np.linalg.lstsq(surface.modes, point.amplitude, rcond=None)[0])
-        optimum = optimise_force(problem, replace(point, force=surface, amplitude=amplitude))
-        if optimum is None:
-            break
-        point = replace(optimum.point, force=every_spline, amplitude=surface.modes @ optimum.point.amplitude)
-        likelihood = problem.linearised(point).likelihood()
-        # New hyperparameters may lead to a worse fit: the last solution is then kept.
-        if not likelihood.is_finite or (solution is not None and likelihood.least_chi2 > solution[1].least_chi2):
-            break
-        solution = point, likelihood
-        inflation = max(likelihood.least_chi2 / problem.n_points, 1.0)
-        choice = marginal_likelihood(choice.domain, likelihood, inflation, largest_N)
-    return solution
+    choice = seen.choices[0]
+    surface = choice.with_start(at_start) if at_start else choice.best().surface
+    # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
+    surface = replace(surface, sd_N=surface.sd_N / math.sqrt(seen.inflation))
+    optimum = optimise_force(problem, seen.point.asking(surface))
+    return None if optimum is None else optimum.point
 
 
 def _table(best: ForcePosterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
