@@ -22,6 +22,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
+    CONVERGENCE_TOLERANCE,
     CoefficientLikelihood,
     FittedMotion,
     ForcePoint,
@@ -374,7 +375,7 @@ class LearnedForce:
 
 def learned_force(problem: ForceProblem) -> LearnedForce | None:
     """Estimate the missing force over the variables with the highest marginal likelihood. All choices of variables are
-    compared about the same motions: those on the tracks, then twice those under the most likely force.
+    compared about the same motions: those on the tracks, then twice those under the force that leaves least.
     """
     seen = _choices_seen_from(problem, problem.on_tracks())
     if seen is None or seen.chi2_without_force < LEAST_CHI2_PER_POINT * problem.n_points:
@@ -385,18 +386,20 @@ def learned_force(problem: ForceProblem) -> LearnedForce | None:
         return None
     chi2_without_force = seen.chi2_without_force
     for at_start in (CONSTANT_AT_START, ""):
-        point = _under_most_likely(problem, seen, at_start)
+        point = _under_best(problem, seen, at_start)
         again = None if point is None else _choices_seen_from(problem, point)
         if again is None:
             return None
         seen = again
     # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
     points_per_part = max(problem.n_points / (20 * len(problem.data)), 1.0)
-    # Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer
-    error = (1 + (seen.inflation - 1) * points_per_part) / seen.inflation
+    # Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer, and
+    # where the search has ended short of the least χ²
+    correlated = (1 + (seen.inflation - 1) * points_per_part) / seen.inflation
+    error = max(0.5 * CONVERGENCE_TOLERANCE * min(seen.least_chi2.values()) / seen.inflation, correlated)
     weights = variable_weights(seen.choices, error)
     choice = max(seen.choices, key=lambda each: weights[each.domain.name])
-    best = choice.best(error)
+    best = choice.best(correlated)
     misfit = chi2_without_force - problem.n_points
     explained = (chi2_without_force - best.chi2) / misfit
     # 0.95: part of the misfit that the force must take away to be reported (chosen)
@@ -466,16 +469,22 @@ def _choices_seen_from(problem: ForceProblem, point: ForcePoint) -> _Choices | N
     )
 
 
-def _under_most_likely(problem: ForceProblem, seen: _Choices, at_start: str) -> ForcePoint | None:
-    """The motions under the most probable force of the most likely choice, under one condition at the start of growth
-    or, without a name, the most likely one.
+def _under_best(problem: ForceProblem, seen: _Choices, at_start: str) -> ForcePoint | None:
+    """The motions under the most probable force of the most likely variable or of the most likely two, whichever leaves
+    less: far from the solution, two are often the more likely for errors of the linear equations alone. `at_start` is
+    the condition at the start of growth, without a name the most likely one.
     """
-    choice = seen.choices[0]
-    surface = choice.with_start(at_start) if at_start else choice.best().surface
-    # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
-    surface = replace(surface, sd_N=surface.sd_N / math.sqrt(seen.inflation))
-    optimum = optimise_force(problem, seen.point.asking(surface))
-    return None if optimum is None else optimum.point
+    optima = []
+    for size in (1, 2):
+        choice = next((each for each in seen.choices if len(each.domain.variables) == size), None)
+        if choice is None:
+            continue
+        surface = choice.with_start(at_start) if at_start else choice.best().surface
+        # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
+        surface = replace(surface, sd_N=surface.sd_N / math.sqrt(seen.inflation))
+        optima.append(optimise_force(problem, seen.point.asking(surface)))
+    found = [optimum for optimum in optima if optimum is not None]
+    return min(found, key=lambda optimum: optimum.cost).point if found else None
 
 
 def _table(best: ForcePosterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
