@@ -180,12 +180,10 @@ class FittedMotion:
         return self.trial.travel_ratio * self.lead_velocity_m_s
 
 
-def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> list[FittedMotion]:
-    """Simulate the fitted motions with given trial effects and, optionally, other model parameters. Shapes:
-    trial_effects (n_trials, 4); theta (n_free,).
-    """
+def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
+    """Simulate the fitted motions with given trial effects. Shapes: trial_effects (n_trials, 4)."""
     predictor = fit.predictor
-    jobs = predictor.jobs(fit.solution.state.theta if theta is None else theta, trial_effects)
+    jobs = predictor.jobs(fit.solution.state.theta, trial_effects)
     trials = [trial_of_job(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
     # 3.0: frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
     grids = [

@@ -132,14 +132,6 @@ class VariableChoice:
         grid[self.domain.start_axis] = np.full(grid_points, self.domain.low[self.domain.start_axis])
         return float(np.median(free[0].force(grid)[1]))
 
-    def with_start(self, at_start: str) -> SmoothForce:
-        """A force with the most likely hyperparameters, but with this condition at the start of growth. While motions
-        do not yet include the force, their defect at the start would be fitted as a force there.
-        """
-        likely = max(self.posteriors, key=lambda each: each.log_evidence)
-        modes = self.domain.prior_modes(likely.length_scales, at_start, SEARCHED_VARIANCE)
-        return SmoothForce(self.domain, modes, likely.surface.sd_N)
-
 
 def marginal_likelihood(
     domain: Domain, likelihood: CoefficientLikelihood, inflation: float, largest_N: float
@@ -375,7 +367,7 @@ class LearnedForce:
 
 def learned_force(problem: ForceProblem) -> LearnedForce | None:
     """Estimate the missing force over the variables with the highest marginal likelihood. All choices of variables are
-    compared about the same motions: those on the tracks, then twice those under the force that leaves least.
+    compared about the same motions: those on the tracks, then those under the force that leaves least.
     """
     seen = _choices_seen_from(problem, problem.on_tracks())
     if seen is None or seen.chi2_without_force < LEAST_CHI2_PER_POINT * problem.n_points:
@@ -385,12 +377,11 @@ def learned_force(problem: ForceProblem) -> LearnedForce | None:
     if max(log_bayes_factors.values()) < 18.0:
         return None
     chi2_without_force = seen.chi2_without_force
-    for at_start in (CONSTANT_AT_START, ""):
-        point = _under_best(problem, seen, at_start)
-        again = None if point is None else _choices_seen_from(problem, point)
-        if again is None:
-            return None
-        seen = again
+    point = _under_best(problem, seen)
+    again = None if point is None else _choices_seen_from(problem, point)
+    if again is None:
+        return None
+    seen = again
     # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
     points_per_part = max(problem.n_points / (20 * len(problem.data)), 1.0)
     # Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer, and
@@ -469,19 +460,20 @@ def _choices_seen_from(problem: ForceProblem, point: ForcePoint) -> _Choices | N
     )
 
 
-def _under_best(problem: ForceProblem, seen: _Choices, at_start: str) -> ForcePoint | None:
+def _under_best(problem: ForceProblem, seen: _Choices) -> ForcePoint | None:
     """The motions under the most probable force of the most likely variable or of the most likely two, whichever leaves
-    less: far from the solution, two are often the more likely for errors of the linear equations alone. `at_start` is
-    the condition at the start of growth, without a name the most likely one.
+    less: far from the solution, two are often the more likely for errors of the linear equations alone. The force is
+    constant at the start of growth: what motions on the tracks lack there would be fitted as a force.
     """
     optima = []
     for size in (1, 2):
         choice = next((each for each in seen.choices if len(each.domain.variables) == size), None)
         if choice is None:
             continue
-        surface = choice.with_start(at_start) if at_start else choice.best().surface
+        likely = max(choice.posteriors, key=lambda each: each.log_evidence)
+        modes = choice.domain.prior_modes(likely.length_scales, CONSTANT_AT_START, SEARCHED_VARIANCE)
         # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
-        surface = replace(surface, sd_N=surface.sd_N / math.sqrt(seen.inflation))
+        surface = SmoothForce(choice.domain, modes, likely.surface.sd_N / math.sqrt(seen.inflation))
         optima.append(optimise_force(problem, seen.point.asking(surface)))
     found = [optimum for optimum in optima if optimum is not None]
     return min(found, key=lambda optimum: optimum.cost).point if found else None
