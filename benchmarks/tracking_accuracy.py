@@ -270,7 +270,7 @@ def bent_row(name: str, path: Path, scene, drawn: Axis | None, curves: bool) -> 
     moving = int(scene.moving.sum())
     frames = read_frames(inspect_recording(path))
     start = time.perf_counter()
-    search = track.find_growth_axis if curves else lambda small, _: find_axis(small)
+    search = track.find_growth_axis if curves else find_axis
     try:
         with mock.patch.object(track, "find_growth_axis", search):
             tracking = track_frames(frames, trial, CAPTURE_FPS, drawn)

@@ -67,16 +67,17 @@ def test_axis_is_found_in_any_direction_of_growth(angle):
         tip_depth=6, rest_frames=4, end_frames=4, door=True,
     )  # fmt: skip
     scene = plain_scene(plan)
-    axis = find_axis(scene.frames)
+    small = SmallPictures(scene.frames)
+    axis = find_axis(small)
     assert np.degrees(np.arccos(axis.direction @ direction)) < 1.5
     assert abs((start - axis.from_px) @ axis.normal) < 4
-    assert front_share(scene.frames, axis) >= LEAST_FRONT_SHARE
+    assert front_share(small, axis) >= LEAST_FRONT_SHARE
 
 
 def test_pictures_without_motion_are_refused():
     still = np.repeat(plain_scene(Plan(seed=15, width=300, end_px=200, end_frames=1)).frames[:1], 20, axis=0)
     with pytest.raises(RecordingError):
-        find_axis(still)
+        find_axis(SmallPictures(still))
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -125,7 +126,7 @@ def slope_deg(axis: Axis) -> float:
 @pytest.mark.parametrize("growth_px", [90, 140, 220])
 def test_the_axis_is_that_of_the_tube_beside_a_door_as_long_as_its_growth(growth_px: int) -> None:
     small = SmallPictures(beside_a_door(41, growth_px, door_px=100, speed_px=4.0))
-    axis = find_growth_axis(small, small.frames)
+    axis = find_growth_axis(small)
     assert type(axis) is Axis
     assert abs(slope_deg(axis)) < 5
     assert abs((np.array(MOUTH) - axis.from_px) @ axis.normal) < 8

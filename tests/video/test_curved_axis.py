@@ -19,13 +19,13 @@ from vinetrack.video.curved_axis import (
     axis_from_entry,
     axis_through,
     curve_problem,
-    cut_along,
     find_curve,
     find_growth_axis,
     front_share_of_picture,
 )
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.strip import cut_strip
 from vinetrack.video.survey import proposed_axis
 from vinetrack.video.track import Tracking
 
@@ -96,7 +96,7 @@ def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused() -> Non
 def test_rings_about_the_circles_middle_become_level_lines() -> None:
     y, x = np.mgrid[:SIDE, :SIDE].astype(float)
     rings = np.clip(128 + (np.hypot(x - 20, y - 330) - RADIUS), 0, 255)
-    strip = cut_along(np.repeat(rings[None], 4, axis=0).round().astype(np.uint8), quarter(), 12.0)
+    strip = cut_strip(np.repeat(rings[None], 4, axis=0).round().astype(np.uint8), quarter(), 12.0)
     assert strip.values.shape == (4, 25, int(quarter().length_px) + 1)
     # Across is from x towards y seen along the growth: towards the middle, where rings are darker.
     assert np.abs(strip.values[0] - (128 - np.arange(-12, 13))[:, None].astype(float)).max() < 1.6
@@ -208,7 +208,7 @@ def test_its_curve_explains_nearly_all_that_changes_and_points_along_the_growth(
 def test_a_straight_vine_keeps_the_straight_axis_it_had(name: str) -> None:
     plan = Plan(**({"seed": 5, "width": 640, "end_px": 540.0} | HARDER[name]))
     small = SmallPictures(plain_scene(plan).frames)
-    assert find_growth_axis(small, small.frames) == find_axis(small)
+    assert find_growth_axis(small) == find_axis(small)
 
 
 @pytest.mark.parametrize(("length_px", "width_px"), [(21, 2), (3, 10), (9, 3), (14, 1), (40, 40)])

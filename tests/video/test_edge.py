@@ -18,9 +18,9 @@ from vinetrack.core.records import FLAGS, Correction, Track, Trial, with_flag
 from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import preset
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
+from vinetrack.video import track
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, front_share
 from vinetrack.video.calibration import corrected_by_hand
-from vinetrack.video.curved_axis import front_share_function
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
 from vinetrack.video.point_quality import (
     PointQuality,
@@ -381,33 +381,35 @@ def tube() -> np.ndarray:
     return np.clip(luma, 0, 255).astype(np.uint8)
 
 
-def front_share_is(share_beside: float, share_on_axis: float = 1.0):
-    """A front share along the axis given, and another along any other axis."""
-    return lambda axis: share_on_axis if axis is AXIS else share_beside
-
-
 def test_the_strip_is_centred_on_the_tube():
     luma = tube()
-    order = front_share_function(SmallPictures(luma), luma)
-    strip, sides = tube_strip(luma, AXIS, order)
+    small = SmallPictures(luma)
+    strip, sides = tube_strip(luma, AXIS, small)
     assert sides.width_px == pytest.approx(41, abs=2)
     assert strip.axis.from_px[1] == pytest.approx(60, abs=0.8)
-    assert order(strip.axis) > 0.9
+    assert front_share(small, strip.axis) > 0.9
 
 
-def test_a_front_share_at_the_limit_is_a_tube():
-    assert tube_strip(tube(), AXIS, front_share_is(LEAST_FRONT_SHARE, LEAST_FRONT_SHARE)) is not None
+def front_shares(monkeypatch, on_axis, beside):
+    """A front share along the axis given, and another along any other axis."""
+    monkeypatch.setattr(track, "front_share", lambda _, axis: on_axis if axis is AXIS else beside)
+
+
+def test_a_front_share_at_the_limit_is_a_tube(monkeypatch):
+    front_shares(monkeypatch, LEAST_FRONT_SHARE, LEAST_FRONT_SHARE)
+    assert tube_strip(tube(), AXIS, SmallPictures(tube())) is not None
 
 
 @pytest.mark.parametrize(
-    "order",
-    [front_share_is(1.0, LEAST_FRONT_SHARE - 0.01), front_share_is(LEAST_FRONT_SHARE - 0.01)],
+    ("on_axis", "beside"),
+    [(LEAST_FRONT_SHARE - 0.01, 1.0), (1.0, LEAST_FRONT_SHARE - 0.01)],
     ids=["along the axis", "along the middle"],
 )
-def test_without_a_front_only_the_arrival_is_followed(order):
+def test_without_a_front_only_the_arrival_is_followed(monkeypatch, on_axis, beside):
     luma = tube()
-    assert tube_strip(luma, AXIS, order) is None
-    _, positions = follow(luma, TRIAL, AXIS, 0.1, order)
+    front_shares(monkeypatch, on_axis, beside)
+    assert tube_strip(luma, AXIS, SmallPictures(luma)) is None
+    _, positions = follow(luma, TRIAL, AXIS, 0.1, SmallPictures(luma))
     assert not positions.is_edge
     moving = slice(14, 60)
     assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[moving].max() < 3

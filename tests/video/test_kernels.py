@@ -4,45 +4,31 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 from pictures import tracked
 from plain_scene import Plan, plain_scene
 
 from vinetrack.core import threads
-from vinetrack.video import edge_kernels
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video.axis import Axis
 from vinetrack.video.kymograph import (
-    block_means,
     largest_steps,
-    median,
-    ratio_medians,
 )
-from vinetrack.video.strip import _pixels, reference_pixels, sample, warp_all
 
 
 @pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
 def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(length: float, blur: float) -> None:
     half = 6.0 + 0.5 * length + 4 * blur
-    table = edge_kernels.coverage_table(length, blur, half)
+    table = kernels.coverage_table(length, blur, half)
     middle = math.ceil(half) + 1
-    x = (
-        middle
-        - np.arange(table.shape[2])
-        + edge_kernels.TABLE_STEP_PX * np.arange(edge_kernels.SUBPIXEL_STEPS + 1)[:, None]
-    )
+    x = middle - np.arange(table.shape[2]) + kernels.TABLE_STEP_PX * np.arange(kernels.SUBPIXEL_STEPS + 1)[:, None]
     # A box of many Gaussian steps, summed one by one.
     places = np.linspace(-0.5, 0.5, 401) * max(length, 0.02)
     expected = np.zeros_like(x)
     for place in places[1:-1:2]:
         expected += np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2)))((x - place) / blur) / 200
     assert np.abs(table[0] - expected).max() < 2e-5
-    assert (
-        np.abs(table[1, :, 1:-1] - np.gradient(expected, edge_kernels.TABLE_STEP_PX, axis=0)[:, 1:-1]).max()
-        < 0.01 / blur
-    )
+    assert np.abs(table[1, :, 1:-1] - np.gradient(expected, kernels.TABLE_STEP_PX, axis=0)[:, 1:-1]).max() < 0.01 / blur
 
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2
@@ -107,10 +93,9 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     use = np.arange(16) % 3 != 0
     steady, frames = (strip, np.ones(16), np.zeros(16)), np.flatnonzero(use)
     arguments = (*steady, fit, np.zeros(16), LAG, blur, pictures, margin, frames, 0.5 * RIM)
-    sums = "distance_sums", "row_sums", "misfit_sums", "place_sums"
-    found = [getattr(edge_kernels, name)(*arguments).sum(axis=0) for name in sums]
-    half = edge_kernels.coverage_reach(0.0, blur) + margin
-    by_distance, by_row, by_place, logs = np.zeros_like(found[0]), np.zeros((9, 2)), np.zeros((65, 2)), []
+    rows, places, distances, misfit = (sums.sum(axis=0) for sums in kernels.residual_sums(*arguments))
+    half = kernels.coverage_reach(0.0, blur) + margin
+    by_distance, by_row, by_place, squares = np.zeros_like(distances), np.zeros((9, 2)), np.zeros((65, 2)), []
     for t in np.flatnonzero(use):
         columns: dict[int, np.ndarray] = {}
         for u in range(9):
@@ -130,57 +115,13 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
                 i = int(len(by_distance) // 2 - x)
                 columns[i] = columns.get(i, np.zeros(2)) + w * (after - before) * np.array([r, after - before])
                 by_row[u] += w * g * np.array([r, g])
-                logs.append(math.log(1 + r * r / (4.5 * (va + vb))))
+                squares.append(r * r / ((va + vb) / 2 + r * r / 9))
         for i, (top, square) in columns.items():
             by_distance[i] += top**2 / square, 1
-    assert np.allclose(found[0], by_distance, rtol=0.01, atol=0.02)
-    assert np.allclose(found[1], by_row, rtol=0.01, atol=0.02 * np.abs(by_row).max())
-    assert found[2] == pytest.approx([np.sum(logs), len(logs)], rel=1e-3)
-    assert np.allclose(found[3].T, by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
-
-
-@pytest.mark.parametrize("count", [1, 2, 4999, 5000])
-@pytest.mark.parametrize("step", [0.0, 1e-3, 0.5], ids=["free", "fine steps", "coarse steps"])
-def test_a_median_by_histogram_is_the_median(count: int, step: float) -> None:
-    values = np.abs(np.random.default_rng(963).normal(0, 3, count))
-    values = np.round(values / step) * step if step else values
-    values[0] = 1e4 if count > 2 else values[0]  # beyond the last bin
-    for kept in ((values > 0.3) | (count < 3), values >= 0, values < 0.04):
-        expected = np.median(values[kept]) if kept.any() else 0.0
-        assert median(values, kept.astype(float), 16.0) == expected
-
-
-@pytest.mark.parametrize("shake", [None, np.array([[0.6, -0.3], [0.0, 0.2], [-1.2, 0.4]])])
-def test_single_pixels_of_a_strip_are_those_of_the_whole_strip(shake: np.ndarray | None) -> None:
-    rng = np.random.default_rng(964)
-    luma = cv2.GaussianBlur(rng.uniform(0, 255, (3 * 90, 140)).astype(np.float32), (0, 0), 2.5)
-    luma = np.clip((luma - 127) * 6 + 127, 0, 255).astype(np.uint8).reshape(3, 90, 140)
-    axis, rows = Axis((10.0, 30.0), (125.0, 52.0)), [np.arange(-18, -10), np.arange(10, 18)]
-    views = [sample(luma, axis, band, shake) for band in rows]
-    means = [np.median(view, axis=0).astype(np.float32) for view in views]
-    reference = reference_pixels(means, rows)
-    whole = np.concatenate([view[:, 1:-1, 1:-1].reshape(3, -1) for view in views], axis=1).astype(int)
-    apart = np.abs(_pixels(luma, axis, reference, shake).astype(int) - whole)
-    assert apart.max() <= 6
-    assert apart.mean() < 0.5
-
-
-# ---- compiled medians, steps and means are those of NumPy and OpenCV ----
-
-
-@pytest.mark.parametrize("side", [1, 3, 4])
-def test_means_of_blocks_are_those_of_opencv(side):
-    luma = np.random.default_rng(1).integers(0, 256, (3, 12 * side, 20 * side), dtype=np.uint8)
-    small = [cv2.resize(frame, (20, 12), interpolation=cv2.INTER_AREA) for frame in luma]
-    np.testing.assert_array_equal(block_means(luma, side), np.stack(small))
-
-
-def test_ratios_have_the_median_of_numpy():
-    rng = np.random.default_rng(2)
-    pictures = rng.uniform(0, 255, (4, 30, 41)).astype(np.float32)
-    reference = rng.uniform(1, 255, (30, 41)).astype(np.float32)
-    expected = np.median((pictures + np.float32(1)) / reference, axis=(1, 2))
-    np.testing.assert_allclose(ratio_medians(pictures, reference), expected, rtol=1e-6)
+    assert np.allclose(distances, by_distance, rtol=0.01, atol=0.02)
+    assert np.allclose(rows, by_row, rtol=0.01, atol=0.02 * np.abs(by_row).max())
+    assert misfit == pytest.approx([np.sum(squares), len(squares)], rel=1e-3)
+    assert np.allclose(places.T, by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
 
 
 def test_the_largest_step_is_where_means_differ_most():
@@ -192,27 +133,6 @@ def test_the_largest_step_is_where_means_differ_most():
     np.testing.assert_array_equal(when, begin)
     # Of the means of six frames on either side: 6 * 6 / 12 * 50².
     assert np.median(power) == pytest.approx(3 * 50**2, rel=0.05)
-
-
-# ---- sloped strips cut by compiled loops are OpenCV's but for rounding ----
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("slope", [0.004, -0.03, 0.7])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_sloped_strip_is_that_of_opencv(slope, dtype):
-    most = np.iinfo(dtype).max
-    luma = np.random.default_rng(5).integers(0, most, (3, 90, 200), dtype=dtype, endpoint=True)
-    along = np.array([np.cos(slope), np.sin(slope)])
-    # From outside the picture, through it, out of it again.
-    matrix = np.array([[along[0], -along[1], -4.3], [along[1], along[0], 30.6]])
-    strips = warp_all(luma, matrix, 40, 230)
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    for frame, strip in zip(luma, strips, strict=True):
-        expected = cv2.warpAffine(frame, matrix, (230, 40), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        apart = np.abs(strip.astype(int) - expected)
-        assert apart.max() <= 1
-        assert np.mean(apart > 0) < (0.001 if dtype == np.uint8 else 0.1)
 
 
 # ---- threads of the tracker ----

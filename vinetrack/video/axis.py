@@ -9,9 +9,8 @@ change when the path passes them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Trial
 from vinetrack.experiment.schema import SHORTEST_AXIS_PX
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.kymograph import monotone_path_sums, passing_times
+from vinetrack.video.kymograph import collecting_path, monotone_path_sums
 from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures, changed_pixels, order_tolerance
 
 # Least share of all change that one front explains where nothing else of weight moves (chosen)
@@ -66,6 +65,20 @@ class Axis:
         along = self.direction
         return np.array([-along[1], along[0]])
 
+    @property
+    def largest_half_px(self) -> float:
+        """Half the width of the widest strip along the axis whose normals do not cross."""
+        return math.inf
+
+    def direction_at(self, along_px: Floats) -> Floats:
+        """Unit vectors of growth at places along the axis. Shape (..., 2)."""
+        return np.broadcast_to(self.direction, (*np.shape(along_px), 2))
+
+    def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
+        """Find where points of the picture lie along and across the axis, px. Shapes: picture_px (n, 2) → (n,) each."""
+        from_start = np.asarray(picture_px, dtype=float) - self.from_px
+        return from_start @ self.direction, from_start @ self.normal
+
     def points(self, along_px: Floats, across_px: Floats | float = 0.0) -> Floats:
         """Return picture coordinates of points given along and across the axis. Shape (..., 2)."""
         along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
@@ -78,12 +91,8 @@ class Axis:
         return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
 
 
-FrontShare = Callable[[Axis], float]  # Function from an axis to its share of change that is a front passing once
-
-
-def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
-    """Find the growth axis from the motion. Shapes: luma (n_frames, height, width)."""
-    small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+def find_axis(small: SmallPictures, grows: bool = True) -> Axis:
+    """Find the growth axis from the motion."""
     if len(small.frames) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
     best = _line_through(small, small.grown) if grows else _NO_LINE
@@ -113,39 +122,36 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
     return best
 
 
-def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
+def front_share(small: SmallPictures, axis: Axis) -> float:
     """Share of the change along an axis that is one front passing once. Only pixels whose change lasts count
-    (`SmallPictures.grown`); if hardly any of it lasts (MIN_GROWN_PART), all that change count. Shapes: luma (n_frames,
-    height, width).
+    (`SmallPictures.grown`); if hardly any of it lasts (MIN_GROWN_PART), all that change count.
     """
-    small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
-    scaled = _in_small_pictures(axis, small.factor)
-    angle = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
-    band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*small.frames.shape[1:])))
-    near, near_lasting = _pixels_near(small.changed, scaled, band), _pixels_near(small.grown, scaled, band)
-    n_times = small.changed[-1]
+    band = float(np.clip(0.6 * axis.width_px / small.factor, 2.0, 0.2 * np.hypot(*small.frames.shape[1:])))
+    near, near_lasting = (_within(small, pixels, axis, band) for pixels in (small.changed, small.grown))
     if len(near[0]) < 12:
         raise RecordingError("nothing moves along the axis")
     if len(near_lasting[0]) >= max(12, MIN_GROWN_PART * len(near[0])):
         near = near_lasting
-    on_front, _, _ = pixels_on_front(*near, n_times, angle, np.array(scaled.from_px), band)
-    return float(near[3][on_front].sum() / near[3].sum())
+    weight = near[3]
+    return float(weight[pixels_on_front(*near, small.changed[-1], band)].sum() / weight.sum())
 
 
-def _pixels_near(pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Place, time and weight of the pixels nearer to an axis than `band`."""
+def _within(small: SmallPictures, pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Places along and across an axis, time and weight of the pixels nearer to it than `band`, all of the small
+    pictures.
+    """
     x, y, time, weight, _ = pixels
-    inside = np.abs((np.column_stack([x, y]) - axis.from_px) @ axis.normal) < band
-    return x[inside], y[inside], time[inside], weight[inside]
+    along, across = axis.along_and_across((np.column_stack([x, y]) + 0.5) * small.factor - 0.5)
+    along, across = along / small.factor, across / small.factor
+    inside = np.abs(across) < band
+    return along[inside], across[inside], time[inside], weight[inside]
 
 
-def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:
+def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
     """Move and turn a given axis onto the line of what moves within its width, and make it as wide as that. The ends
     keep their places along the axis: only the position across is corrected, by up to half of `given.width_px` and
     MOST_TURN_DEG. Of several bodies within the width, the one that collects more change and lies nearer is taken.
-    Shapes: luma (n_frames, height, width).
     """
-    small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
     scaled, factor = _in_small_pictures(given, small.factor), small.factor
     x, y, time, weight, n_times = small.changed
     reach = max(0.5 * scaled.width_px, 3.0)
@@ -270,21 +276,19 @@ def _best_line(
 
 
 def pixels_on_front(
-    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
-) -> tuple[NDArray[np.bool_], Floats, Floats]:
-    """Find the pixels that change when the best monotone path along a line passes them. Returns mask of the pixels on
-    the front, shape (n_pixels,), and the places of all along and across the line, px. Shapes: x, y, time, weight
-    (n_pixels,).
+    along: Floats, across: Floats, time: Floats, weight: Floats, n_times: int, band: float
+) -> NDArray[np.bool_]:
+    """Mark the pixels that change when the best monotone path along a line passes them, by their places along and
+    across it, px. Shapes: along, across, time, weight (n_pixels,) → (n_pixels,).
     """
-    along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
-    across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
     bin_index = ((along - float(along.min())) / 2).astype(int)
     inside = np.abs(across) < band
     table = np.zeros((n_times, int(bin_index.max()) + 1))
     np.add.at(table, (time[inside].astype(int), bin_index[inside]), weight[inside])
-    passing_time = passing_times(table)
-    on_front = inside & (np.abs(time - passing_time[bin_index]) <= order_tolerance(n_times))
-    return on_front, along, across
+    path = collecting_path(table)
+    passing_time = np.searchsorted(path, np.arange(table.shape[1]) + 0.5)
+    passed = (passing_time > 0) & (passing_time < n_times)
+    return inside & passed[bin_index] & (np.abs(time - passing_time[bin_index]) <= order_tolerance(n_times))
 
 
 def _refined_line(pixels: Pixels, angle: float, middle: Floats, band: float, most_band: float) -> _Line:
@@ -304,7 +308,9 @@ def _refine_once(
 ) -> tuple[float, Floats, float, tuple[float, float], float]:
     """Principal axis of the pixels on the front: direction, point, half width, ends along it, their total weight."""
     along_unit = np.array([np.cos(angle), np.sin(angle)])
-    on_front, _, _ = pixels_on_front(x, y, time, weight, n_times, angle, middle, band)
+    from_middle = np.column_stack([x, y]) - middle
+    along, across = from_middle @ along_unit, from_middle @ np.array([-along_unit[1], along_unit[0]])
+    on_front = pixels_on_front(along, across, time, weight, n_times, band)
     if on_front.sum() < 8:
         raise RecordingError("what moves in the picture follows no line", "give the axis in the settings")
     on_front_weight = weight[on_front]

@@ -8,7 +8,7 @@ straight.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -17,25 +17,9 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, FrontShare, find_axis, front_share, pixels_on_front
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, front_share, pixels_on_front
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import (
-    BAND_GAP_PX,
-    BAND_HEIGHT_PX,
-    REFERENCE_FRAMES,
-    SHAKE_CONVERGED_PX,
-    SHAKE_FLOOR_PX,
-    SHAKE_ROUNDS,
-    SHAKE_STEP_PX,
-    SHIFT_PIXELS,
-    Reference,
-    Strip,
-    camera_unit,
-    cut_strip,
-    register,
-    shifts_agree,
-)
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -216,117 +200,8 @@ def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple
     return None
 
 
-# ------------------------------------------------------------------------------
-# Measure the shake of a camera beside a curved axis: how far each picture moved, by the still background.
-#
-# A shift of the picture is along the curve in one place and across it in another. It is therefore measured in the
-# picture, before anything is straightened, by the same robust least squares as the bands beside a straight strip.
-
-
-def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Floats | None:
-    """Measure how far each picture moved against the others. Shapes: luma (n_frames, height, width) → (n_frames, 2)."""
-    height, width = luma.shape[1:]
-    level = Axis((0.0, 0.0), (float(max(width - 1, 10)), 0.0))
-    y, x = (values.ravel() for values in np.mgrid[2 : height - 2 : 2, 2 : width - 2 : 2])
-    across = np.abs(axis.along_and_across(np.column_stack([x, y]).astype(float))[1])
-    # 120: distance from the tube within which background counts (chosen)
-    still = (across > half_px + BAND_GAP_PX) & (across < half_px + 120)
-    if np.count_nonzero(still) < SHIFT_PIXELS // 10:
-        return None
-    every = max(1, np.count_nonzero(still) // SHIFT_PIXELS)
-    x, y = x[still][::every], y[still][::every]
-    sampled = np.unique(np.linspace(0, len(luma) - 1, REFERENCE_FRAMES).astype(int))
-    picture, unit = np.median(luma[sampled], axis=0), camera_unit(luma)
-    # Both halves of the background must show the same shift; what moves by itself does not.
-    halves = [_reference(picture, x[part], y[part]) for part in (x < np.median(x), x >= np.median(x))]
-    (first, first_sd), (second, second_sd) = (register(luma, level, half, None, unit) for half in halves)
-    shake_px = float(np.median(np.abs(np.concatenate([first[:, 2:], second[:, 2:]]))))
-    sd_sum = float(np.median(first_sd + second_sd))
-    if not shake_px > max(SHAKE_FLOOR_PX, 1.25 * sd_sum) or not shifts_agree(luma, level, halves, unit):
-        return None
-    whole = _reference(picture, x, y)
-    shift = np.zeros((len(luma), 2))
-    for turn in range(SHAKE_ROUNDS):
-        fit, _ = register(luma, level, whole, shift if turn else None, unit)
-        step = np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
-        shift = shift + step
-        if np.abs(step).max() < SHAKE_CONVERGED_PX:
-            break
-        if turn == 0:
-            whole = _reference(np.median(_moved_back(luma[sampled], shift[sampled]), axis=0), x, y)
-    return shift
-
-
-def _reference(picture: Floats, x: NDArray[np.int_], y: NDArray[np.int_]) -> Reference:
-    """Pixels of the background and the basis of the fit: brightness, one, and slopes along rows and columns."""
-    down, right = np.gradient(np.asarray(picture, dtype=float))
-    basis = np.stack([picture[y, x], np.ones(len(x)), -right[y, x], -down[y, x]])
-    return Reference(x.astype(float), y.astype(float), np.ascontiguousarray(basis, dtype=float))
-
-
-def _moved_back(luma: NDArray[Any], shift_px: Floats) -> NDArray[np.float32]:
-    """Pictures shifted back by the shake, bicubic."""
-    import cv2
-
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    size = luma.shape[2], luma.shape[1]
-    return np.stack([
-        cv2.warpAffine(frame.astype(np.float32), np.array([[1, 0, dx], [0, 1, dy]]), size, flags=flags,
-                       borderMode=cv2.BORDER_REPLICATE)
-        for frame, (dx, dy) in zip(luma, shift_px, strict=True)
-    ])  # fmt: skip
-
-
-# ------------------------------------------------------------------------------
-# Cut the strip along an axis, straight or curved; along a curve the picture is straightened by the curve's normals.
-#
-# A straightened picture is a picture like any other: its middle is a level axis, its columns are one pixel of arc
-# length apart, and everything that works on straight strips works on it. The curve is then moved onto the middle of
-# the tube that grew.
-
 STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
 CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
-
-
-@dataclass(frozen=True)
-class StraightenedPictures:
-    """Pictures along a curve: `luma`, shape (n_frames, n_across, n_along), and the level `axis` along its middle."""
-
-    luma: NDArray[Any]
-    axis: Axis
-
-
-def straightened(
-    luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None
-) -> StraightenedPictures:
-    """Straighten pictures along a curve by bicubic interpolation. Shapes: luma (n_frames, height, width); shake_px
-    (n_frames, 2).
-    """
-    import cv2
-
-    above, below = (_rows_on_side(axis, half_px, side, luma.shape[1:]) for side in (-1, 1))
-    n_along = int(np.floor(axis.length_px)) + 1
-    rows = np.arange(-above, below + 1, dtype=float)
-    source = axis.points(np.arange(n_along, dtype=float)[None, :], rows[:, None]).astype(np.float32)
-    x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
-    out = np.empty((len(luma), len(rows), n_along), luma.dtype)
-    shake = np.zeros((len(luma), 2)) if shake_px is None else shake_px
-    for frame, straight, (dx, dy) in zip(luma, out, shake.astype(np.float32), strict=True):
-        cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=straight, borderMode=cv2.BORDER_REPLICATE)
-    return StraightenedPictures(out, Axis((0.0, float(above)), (n_along - 1.0, float(above)), axis.width_px))
-
-
-def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
-    """Cut, level and stabilise the strip about an axis, straight or curved; see `strip.cut_strip`. Shapes: luma
-    (n_frames, height, width).
-    """
-    if not isinstance(axis, CurvedAxis):
-        return cut_strip(luma, axis, half_px)
-    half = min(half_px, max(axis.largest_half_px - 1, 2.0))
-    shake_px = picture_shake(luma, axis, half) if before is None else before.shake_px
-    straight = straightened(luma, axis, half, shake_px)
-    strip = replace(cut_strip(straight.luma, straight.axis, half, still=True), axis=axis)
-    return strip if shake_px is None else replace(strip, shift_px=shake_px, stabilised=True)
 
 
 def path_error_px(axis: Axis) -> float:
@@ -341,31 +216,6 @@ def curve_note(axis: CurvedAxis) -> str:
         f"the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those along a curve that"
         " was found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
     )
-
-
-def shake_along(strip: Strip, edge_px: Floats) -> Floats:
-    """Return how far a shaken camera moved each picture along the axis, at the edge. Shapes: edge_px (n_frames,) →
-    (n_frames,).
-    """
-    if not isinstance(strip.axis, CurvedAxis):
-        return strip.shift_px[:, 0]
-    place_px = np.where(np.isfinite(edge_px), edge_px, 0.5 * strip.axis.length_px)
-    return np.asarray(np.sum(strip.shift_px * strip.axis.direction_at(place_px), axis=1))
-
-
-def front_share_on_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
-    """Share of the change along a curve that is one front passing once; see `axis.front_share`. Shapes: luma (n_frames,
-    height, width).
-    """
-    straight = straightened(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
-    return front_share(SmallPictures(straight.luma), straight.axis)
-
-
-def front_share_function(small: SmallPictures, luma: NDArray[Any]) -> FrontShare:
-    """Return the function from an axis to its front share, for straight and curved axes. Shapes: luma (n_frames,
-    height, width).
-    """
-    return lambda axis: front_share_on_curve(luma, axis) if isinstance(axis, CurvedAxis) else front_share(small, axis)
 
 
 def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
@@ -416,18 +266,6 @@ def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
     return out
 
 
-def _rows_on_side(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int, ...]) -> int:
-    """Rows on one side: those wanted, and as many more as stay in the picture along the whole curve, uncrossed."""
-    wanted = int(np.ceil(half_px))
-    most = min(wanted + BAND_GAP_PX + BAND_HEIGHT_PX[1], int(axis.largest_half_px))
-    along = np.linspace(0.0, axis.length_px, int(axis.length_px) + 2)
-    for reach in range(most, wanted, -1):
-        place = axis.points(along, side * float(reach))
-        if ((place > -0.5) & (place < [shape[1] - 0.5, shape[0] - 0.5])).all():
-            return reach
-    return wanted
-
-
 # ------------------------------------------------------------------------------
 # Find the curve along which a vine grew, from the region of pixels that changed.
 #
@@ -442,10 +280,8 @@ CURVE_GAIN = 1.35
 BAND_RATIO, EQUAL_SHARE = 1.25, 0.98
 
 
-def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
-    """Find the growth axis from the motion: a straight line, or a curve where that explains far more of the change.
-    Shapes: luma (n_frames, height, width).
-    """
+def find_growth_axis(small: SmallPictures) -> Axis:
+    """Find the growth axis from the motion: a straight line, or a curve where that explains far more of the change."""
     try:
         straight: Axis | None = find_axis(small)
         line_error = None
@@ -460,7 +296,7 @@ def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
     curve = find_curve(small, band) if line_too_wide or line_share * CURVE_GAIN < 1 else None
     if curve is not None:
         needed = max(LEAST_FRONT_SHARE, line_share * (EQUAL_SHARE if line_too_wide else CURVE_GAIN))
-        if front_share_of_picture(small, curve) >= needed and _front_follows(luma, curve):
+        if front_share_of_picture(small, curve) >= needed and front_share(small, curve) >= LEAST_FRONT_SHARE:
             return curve
     if straight is None:
         assert line_error is not None
@@ -473,16 +309,11 @@ def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
     x, y, time, weight, n_times = small.grown
     if len(x) < 12:
         return 0.0
-    places = (np.column_stack([x, y]) + 0.5) * small.factor - 0.5
-    if isinstance(axis, CurvedAxis):
-        along, across = axis.along_and_across(places)
-    else:
-        along, across = (places - axis.from_px) @ axis.direction, (places - axis.from_px) @ axis.normal
+    along, across = axis.along_and_across((np.column_stack([x, y]) + 0.5) * small.factor - 0.5)
     band = max(0.6 * axis.width_px / small.factor, 2.0)
     if not (np.abs(across) < band * small.factor).any():
         return 0.0
-    in_small_px = along / small.factor, across / small.factor, time, weight
-    on_front, _, _ = pixels_on_front(*in_small_px, n_times, 0.0, np.zeros(2), band)
+    on_front = pixels_on_front(along / small.factor, across / small.factor, time, weight, n_times, band)
     return float(weight[on_front].sum() / weight.sum())
 
 
@@ -534,14 +365,6 @@ def _changed_band(small: SmallPictures) -> Band | None:
     depth = np.asarray(distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1])
     half = float(np.quantile(depth[region], 0.9))
     return Band(region, depth, when, 2 * half + 1)
-
-
-def _front_follows(luma: NDArray[Any], curve: CurvedAxis) -> bool:
-    """Whether one front passes along a curve in the full picture."""
-    try:
-        return front_share_on_curve(luma, curve) >= LEAST_FRONT_SHARE
-    except RecordingError:
-        return False
 
 
 def _largest_region(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -30,7 +30,6 @@ from vinetrack.video.edge_state import (
     blur_lengths,
     clear_of_start,
     core_frames,
-    distance_sums,
     estimate_appearance,
     find_exposure,
     find_shading,
@@ -40,6 +39,7 @@ from vinetrack.video.edge_state import (
     informative_frames,
     initial_state,
     moving_frames,
+    residuals,
     search_edges,
     seen_exposure,
 )
@@ -803,7 +803,7 @@ def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) 
     edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
     state = estimate_appearance(strip, state, 4 * strip.noise + 4)
-    by_distance = distance_sums(strip, state, fit, core_frames(state, fit))
+    by_distance = residuals(strip, state, fit, core_frames(state, fit)).by_distance
     counted = by_distance[:, 1] > 4
     ratio = np.where(counted, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
     smoothed = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")

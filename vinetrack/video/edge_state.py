@@ -6,15 +6,14 @@ The shape of the tip, the optical blur and the exposure are estimated in `vinetr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_parts
-from vinetrack.video import edge_kernels
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.edge_kernels import coverage_reach
 from vinetrack.video.strip import Strip
@@ -78,7 +77,7 @@ def informative_frames(edge: Floats) -> NDArray[np.bool_]:
     """Return the frames that determine film, background and tip shape. They are the frames in motion, and MEMORY_CUTOFF
     memories before and after. Shapes: edge (n_frames,) → (n_frames,).
     """
-    moving, reach = np.flatnonzero(moving_frames(edge)), math.ceil(MEMORY_FRAMES * edge_kernels.MEMORY_CUTOFF)
+    moving, reach = np.flatnonzero(moving_frames(edge)), math.ceil(MEMORY_FRAMES * kernels.MEMORY_CUTOFF)
     frames = np.arange(len(edge))
     return np.asarray((frames >= moving[0] - reach) & (frames <= moving[-1] + reach))
 
@@ -96,17 +95,17 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     ridge_weight = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)
     neighbour_decay = 0.93  # Factor by which the weight of neighbours falls per column (derived)
     early, late = _passage_frames(state, strip.values.shape[2])
-    sums = edge_kernels.gather(
+    sums = kernels.gather(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
         MEMORY_FRAMES, state.appearance, clip, state.shading,
     )  # fmt: skip
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
-    appearance = edge_kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
+    appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     film_all_along = _film_at_start(state, appearance)
     if film_all_along.any():
         sums[5:8, :, film_all_along] = 0.0
-        appearance = edge_kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
+        appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     return replace(state, appearance=appearance)
 
 
@@ -197,45 +196,38 @@ def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
     return padded
 
 
-def distance_sums(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Sum the residuals of a fit by distance from the edge; see `residual_kernels.distance_sums`. Shapes: fit
-    (n_frames, 6); use (n_frames,) → (n_bins, 2).
+class Residuals(NamedTuple):
+    """What a fit leaves, summed over frames; see `edge_kernels.residual_sums`. Shapes (n_across, 2), (2, n_distances),
+    (n_bins, 2) and (2,).
     """
-    return _frame_sums(edge_kernels.distance_sums, strip, state, fit, use, MARGIN_PX)
+
+    by_row: Floats
+    by_place: Floats
+    by_distance: Floats
+    misfit: Floats
 
 
-def place_sums(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Sum the residuals of a fit by distance from each row's own edge; see `residual_kernels.place_sums`. Shape
-    (n_distances, 2).
-    """
-    return _frame_sums(edge_kernels.place_sums, strip, state, fit, use, MARGIN_PX).T
-
-
-def row_sums(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Sum the residuals of a fit by row; see `residual_kernels.row_sums`. Shape (n_across, 2)."""
-    return _frame_sums(edge_kernels.row_sums, strip, state, fit, use, MARGIN_PX)
-
-
-def misfit(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX) -> float:
-    """Return the robust misfit of a fit; see `residual_kernels.misfit_sums`."""
-    total, count = _frame_sums(edge_kernels.misfit_sums, strip, state, fit, use, margin_px)
-    return float(total / max(count, 1))
-
-
-def _frame_sums(
-    kernel: Callable[..., Floats], strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float
-) -> Floats:
-    """Call one of `residual_kernels` and sum what it returns over the frames of `use`."""
+def residuals(
+    strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX
+) -> Residuals:
+    """Sum what a fit leaves over the frames of `use`. Shapes: fit (n_frames, 6); use (n_frames,)."""
     filled, frames, shading = np.nan_to_num(fit), np.flatnonzero(use), _padded_shading(state, margin_px)
     filled[:, 0] = state.edge
 
-    def sums(first: int, last: int) -> Floats:
-        return kernel(
+    def sums(first: int, last: int) -> tuple[Floats, ...]:
+        return kernels.residual_sums(
             strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.appearance,
             margin_px, frames[first:last], shading,
         )  # fmt: skip
 
-    return np.asarray(np.concatenate(in_parts(sums, len(frames), FEWEST_FITS)).sum(axis=0))
+    parts = in_parts(sums, len(frames), FEWEST_FITS)
+    return Residuals(*(np.concatenate(part).sum(axis=0) for part in zip(*parts, strict=True)))
+
+
+def misfit(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX) -> float:
+    """Return the robust misfit of a fit."""
+    total, count = residuals(strip, state, fit, use, margin_px).misfit
+    return float(total / max(count, 1))
 
 
 def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
@@ -272,7 +264,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
-        by_row = row_sums(strip, state, fit, slow)
+        by_row = residuals(strip, state, fit, slow).by_row
         step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
         step = np.clip(step, -largest_lag_step_px, largest_lag_step_px)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
@@ -307,9 +299,9 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """
     core = core_frames(state, fit)
     for _ in range(2):
-        by_place = place_sums(strip, state, fit, core)
-        middle = len(by_place) // 2
-        residual, weight = by_place[middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1].T
+        by_place = residuals(strip, state, fit, core).by_place
+        middle = by_place.shape[1] // 2
+        residual, weight = by_place[:, middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1]
         step = residual / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
         # (0.25, 0.5, 0.25): smoothing kernel of the tip's shading (chosen)
         state = replace(state, shading=np.convolve(state.shading + step, (0.25, 0.5, 0.25), mode="same"))

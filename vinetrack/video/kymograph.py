@@ -28,129 +28,7 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# Compiled medians (by histogram instead of sorting), largest changes, and paths through pixels that change in order.
-#
-# Medians are exact; the range of the values must be known.
-
-LEVELS = 256  # Range of the values of the histogram (derived)
-BINS_PER_LEVEL = 16  # Histogram bins per grey level; the median is then sought within one or two bins (chosen)
-
-
-@njit(cache=True, nogil=True)
-def median(values: np.ndarray, keep: np.ndarray, bins_per_unit: float) -> float:
-    """Median of the values with `keep` > 0; the mean of the two middle ones for an even number. Shapes: values, keep
-    (n,).
-    """
-    last = LEVELS * BINS_PER_LEVEL - 1
-    place = np.empty(len(values), np.int32)
-    bins = np.zeros(last + 1, np.int32)
-    count = 0
-    for k in range(len(values)):
-        place[k] = min(int(values[k] * bins_per_unit), last) if keep[k] > 0 else -1
-    for k in range(len(values)):
-        if place[k] >= 0:
-            bins[place[k]] += 1
-            count += 1
-    if count == 0:
-        return 0.0
-    lower, upper = (count - 1) // 2, count // 2
-    below, first = 0, 0
-    while below + bins[first] <= lower:
-        below += bins[first]
-        first += 1
-    second, within = first, bins[first]
-    while below + within <= upper:
-        second += 1
-        within += bins[second]
-    candidates = np.empty(within, values.dtype)
-    j = 0
-    for k in range(len(values)):
-        if first <= place[k] <= second:
-            candidates[j] = values[k]
-            j += 1
-    return 0.5 * (_order_statistic(candidates, lower - below) + _order_statistic(candidates, upper - below))
-
-
-@njit(cache=True, nogil=True)
-def _order_statistic(values: np.ndarray, rank: int) -> float:
-    """Return the value of a rank, counted from 0, by repeated histograms until few values remain."""
-    # 300: number of values up to which they are sorted directly (chosen)
-    while len(values) > 300:
-        low, high = values.min(), values.max()
-        if low == high:
-            return float(low)
-        last = LEVELS * BINS_PER_LEVEL - 1
-        place = np.minimum((values - low) * (last / (high - low)), last).astype(np.int64)
-        bins = np.bincount(place, minlength=last + 1)
-        below, chosen = 0, 0
-        while below + bins[chosen] <= rank:
-            below += bins[chosen]
-            chosen += 1
-        if bins[chosen] == len(values):
-            break
-        values, rank = values[place == chosen], rank - below
-    return float(np.sort(values)[rank])
-
-
-@njit(cache=True, nogil=True)
-def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Median ratio of each picture, plus one grey level, to a reference. Shapes: pictures (n, height, width); reference
-    (height, width) → (n,).
-    """
-    n, height, width = pictures.shape
-    out, ratio, keep = np.empty(n, np.float32), np.empty(height * width, np.float32), np.ones(height * width, np.int8)
-    for t in range(n):
-        for y in range(height):
-            for x in range(width):
-                ratio[y * width + x] = (pictures[t, y, x] + np.float32(1.0)) / reference[y, x]
-        # Ratios need a finer histogram than grey levels: bins of 1/1024.
-        out[t] = median(ratio, keep, 64.0 * BINS_PER_LEVEL)
-    return out
-
-
-@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
-    """Mean of the `count` largest absolute changes of single pixels from each picture to the next. Shapes: pictures (n,
-    n_pixels) → (n - 1,).
-    """
-    n, pixels = pictures.shape
-    count = min(count, pixels)
-    out, change = np.zeros(n - 1, np.float32), np.empty(pixels, np.float32)
-    bins, totals = np.zeros(LEVELS * BINS_PER_LEVEL, np.int64), np.zeros(LEVELS * BINS_PER_LEVEL)
-    limit = np.float32(0.0)
-    for t in range(n - 1):
-        before, after = pictures[t], pictures[t + 1]
-        for k in range(pixels):
-            change[k] = abs(after[k] - before[k])
-        # Most pixels change too little to count: only changes near the limit of the previous picture are binned.
-        while True:
-            bins[:], totals[:] = 0, 0.0
-            counted = 0
-            for start in range(0, pixels, 16):
-                chunk = change[start : start + 16]
-                largest = np.float32(0.0)
-                for value in chunk:
-                    largest = max(largest, value)
-                if largest < limit:
-                    continue
-                for value in chunk:
-                    if value >= limit:
-                        place = min(int(value * BINS_PER_LEVEL), LEVELS * BINS_PER_LEVEL - 1)
-                        bins[place] += 1
-                        totals[place] += value
-                        counted += 1
-            if counted >= count:
-                break
-            limit = np.float32(0.0)
-        total, taken, place = 0.0, 0, LEVELS * BINS_PER_LEVEL - 1
-        while taken + bins[place] < count:
-            taken += bins[place]
-            total += totals[place]
-            place -= 1
-        total += (count - taken) * totals[place] / max(bins[place], 1)
-        out[t] = total / count
-        limit = np.float32(0.7 * place / BINS_PER_LEVEL)
-    return out
+# Compiled: the largest change of each pixel, and paths through pixels that change in order.
 
 
 @njit(cache=True, nogil=True)
@@ -182,42 +60,6 @@ def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.nda
     return step_frame, best
 
 
-def block_means(luma: NDArray[Any], side: int) -> NDArray[np.float32]:
-    """Shrink pictures by a whole factor: means of square blocks, rounded to whole grey levels as in OpenCV. Shapes:
-    luma (n, height, width) → (n, height / side, width / side).
-    """
-    n, height, width = luma.shape
-    out = np.empty((n, height // side, width // side), np.float32)
-    in_parts(lambda first, last: _block_means(luma[first:last], side, out[first:last]), n, FEWEST_PICTURES)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _block_means(luma: np.ndarray, side: int, out: np.ndarray) -> None:
-    """Write the means of square blocks into `out`; see `block_means`."""
-    n, height, width = luma.shape
-    total = np.empty(width, np.int32)
-    weight = np.float32(1.0 / (side * side))
-    for t in range(n):
-        for y in range(height // side):
-            total[:] = 0
-            for j in range(side):
-                row = luma[t, y * side + j]
-                for x in range(width):
-                    total[x] += row[x]
-            line = out[t, y]
-            if side == 4:  # the usual case: with a constant number of terms the compiler vectorises the sum
-                for x in range(width // 4):
-                    k = 4 * x
-                    line[x] = np.rint((total[k] + total[k + 1] + total[k + 2] + total[k + 3]) * weight)
-                continue
-            for x in range(width // side):
-                block = np.int32(0)
-                for j in range(side):
-                    block += total[x * side + j]
-                line[x] = np.rint(block * weight)
-
-
 @njit(cache=True, nogil=True)
 def monotone_path_sums(
     along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
@@ -245,33 +87,6 @@ def monotone_path_sums(
                 best[s] = max(best[s], best[s - 1] + table[b, t, s - 1] + table[b + 1, t, s - 1])
         out[b] = best[-1]
     return out
-
-
-@njit(cache=True)
-def passing_times(table: np.ndarray) -> np.ndarray:
-    """Find the monotone path that collects most change, and the time at which it passes each position. Shapes: table
-    (n_times, n_places) → (n_places,).
-    """
-    n, places = table.shape
-    best = np.zeros((n, places + 1))
-    predecessor = np.zeros((n, places + 1), np.uint8)
-    for t in range(n):
-        for s in range(places + 1):
-            best[t, s] = best[t - 1, s] if t > 0 else 0.0
-            if s > 0 and best[t, s - 1] + table[t, s - 1] > best[t, s]:
-                best[t, s] = best[t, s - 1] + table[t, s - 1]
-                predecessor[t, s] = 1
-    passed = np.full(places, np.nan)
-    t, s = n - 1, places
-    while s > 0 and t >= 0:
-        if predecessor[t, s] == 1:
-            passed[s - 1] = t
-            s -= 1
-        elif t > 0:
-            t -= 1
-        else:
-            break
-    return passed
 
 
 def mean_changes(pictures: NDArray[Any], step: int) -> NDArray[np.float64]:
@@ -353,31 +168,6 @@ def _change_score(
 
 
 @njit(cache=True)
-def _max_score_path(score: np.ndarray) -> np.ndarray:
-    """Find the monotone path with the greatest sum of scores, each column counted once; shape (n_frames,)."""
-    n, columns = score.shape
-    best = np.zeros((n, columns + 1), np.float32)
-    predecessor = np.zeros((n, columns + 1), np.uint8)
-    for t in range(n):
-        for s in range(columns + 1):
-            # A path may begin anywhere: columns behind its beginning were covered before the first frame.
-            best_here = best[t - 1, s] if t > 0 else 0.0
-            if s > 0 and t > 0:
-                advanced = best[t, s - 1] + score[t, s - 1]
-                if advanced > best_here:
-                    best_here = advanced
-                    predecessor[t, s] = 1
-            best[t, s] = best_here
-    path = np.zeros(n)
-    s = int(np.argmax(best[n - 1]))
-    for t in range(n - 1, -1, -1):
-        path[t] = s
-        while s > 0 and predecessor[t, s] == 1:
-            s -= 1
-    return path
-
-
-@njit(cache=True)
 def dividing_path(evidence: np.ndarray) -> np.ndarray:
     """Find the monotone path that best separates film from background, by dynamic programming. The sum of `evidence`
     behind the edge is minimised; the edge never retreats. Shapes: evidence (n_frames, n_along) → (n_frames,).
@@ -405,6 +195,16 @@ def dividing_path(evidence: np.ndarray) -> np.ndarray:
     return path
 
 
+def collecting_path(score: NDArray[Any]) -> Floats:
+    """Find the monotone path that collects the greatest sum of scores, each column counted once, when the path passes
+    it: the path that divides the score's decreases. A column that is passed at once has scored nothing. Shapes: score
+    (n_frames, n_along) → (n_frames,).
+    """
+    gains = np.zeros((len(score) + 1, score.shape[1]))
+    gains[1:-1] = score[1:]
+    return np.asarray(dividing_path(np.diff(gains, axis=0)))
+
+
 def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
     """Find the front as the monotone path that collects most change; also return the change of each column. Within a
     column the score is proportional to the power of the change, so that the strongest change wins; between columns only
@@ -428,7 +228,7 @@ def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
     score = np.where(
         column_weight[None, :] > 0, score - PEAK_FRACTION * score.max(axis=0, keepdims=True), -UNCHANGED_COLUMN_COST
     ).astype(np.float32)
-    path, columns = _max_score_path(score), np.arange(score.shape[1])
+    path, columns = collecting_path(score), np.arange(score.shape[1])
     passage = np.clip(np.searchsorted(path, columns + 0.5), 0, len(path) - 1)
     return path, np.max([score[np.clip(passage + d, 0, len(path) - 1), columns] for d in (-1, 0, 1)], axis=0)
 

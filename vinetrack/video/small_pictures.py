@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video.frames import (
     DECODER_THREADS,
     Frames,
@@ -27,7 +27,7 @@ from vinetrack.video.frames import (
     read_frames,
     slots_from_times,
 )
-from vinetrack.video.kymograph import BINS_PER_LEVEL, block_means, largest_changes, largest_steps, median, ratio_medians
+from vinetrack.video.kymograph import largest_steps
 
 SMALL_PX = 240  # Longer side of the pictures in which the axis is sought (chosen)
 MAX_FRAMES = 150  # Maximum number of frames in which it is sought, spread evenly over the changes (chosen)
@@ -102,15 +102,9 @@ def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
     n, height, width = luma.shape
     factor = max(1.0, max(height, width) / SMALL_PX)
     size = (max(8, round(width / factor)), max(8, round(height / factor)))
-    side = round(factor)
-    if side == factor and height % side == 0 and width % side == 0 and 8 * side <= min(height, width):
-        small = block_means(luma, side)
-    else:
-        small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
-    reference = small[n // 2, ::2, ::2] + np.float32(1.0)
-    gain = np.concatenate(
-        in_parts(lambda first, last: ratio_medians(small[first:last, ::2, ::2], reference), n, FEWEST_PICTURES)
-    )
+    small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
+    sampled = small[:, ::4, ::4] + np.float32(1.0)
+    gain = np.median(sampled / sampled[n // 2], axis=(1, 2))
     small /= np.clip(gain, 0.2, 5.0)[:, None, None]
     return small * np.float32(255.0 / max(float(small.max()), 1.0)), factor
 
@@ -120,11 +114,8 @@ def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
     n = len(small)
     if n <= MAX_FRAMES:
         return np.arange(n)
-    flat = small.reshape(n, -1)
-    # 200: number of pixels of a small picture whose mean change is its activity (chosen)
-    activity = np.concatenate(
-        in_parts(lambda first, last: largest_changes(flat[first : last + 1], 200), n - 1, FEWEST_PICTURES)
-    )
+    # Squares: a few pixels that change much are activity, many that change a little are noise.
+    activity = np.array([np.sqrt(np.mean((after - before) ** 2)) for before, after in pairwise(small)])
     floor = float(np.quantile(activity, 0.2))
     busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
     total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
@@ -143,7 +134,7 @@ def _changes(frames: NDArray[np.float32], noise_power: float) -> tuple[NDArray[n
 def _noise_power(frames: NDArray[np.float32]) -> float:
     """Variance of the noise of a pixel, at least that of quantisation."""
     changes = np.abs(np.diff(frames[:: max(1, len(frames) // 30), ::2, ::2], axis=0)).ravel()
-    noise = 1.4826 * float(median(changes, np.ones(changes.size, np.int8), BINS_PER_LEVEL)) / np.sqrt(2)
+    noise = 1.4826 * float(np.median(changes)) / np.sqrt(2)
     return max(noise, 0.7) ** 2
 
 

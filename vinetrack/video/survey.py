@@ -32,7 +32,6 @@ from vinetrack.video.curved_axis import (
     axis_through,
     curve_problem,
     find_growth_axis,
-    front_share_function,
 )
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
@@ -147,9 +146,9 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
     luma (n_frames, height, width).
     """
     small = SmallPictures(luma)
-    axis = find_growth_axis(small, luma)
+    axis = find_growth_axis(small)
     try:
-        outlined = tube_strip(luma, axis, front_share_function(small, luma))
+        outlined = tube_strip(luma, axis, small)
     except ValueError:
         return axis
     return axis if outlined is None else outlined[0].axis

@@ -5,28 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, FrontShare, centred_on_motion, find_axis
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, centred_on_motion, find_axis, front_share
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import (
     CENTRED_PX,
     CurvedAxis,
     check_curve,
     curve_note,
-    cut_along,
     find_growth_axis,
-    front_share_function,
-    front_share_on_curve,
     outline_stretches,
     path_error_px,
     recentred_curve,
-    shake_along,
 )
 from vinetrack.video.edge import ARRIVAL_PX, SLOW_PX, Outline, outline
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
@@ -44,7 +39,7 @@ from vinetrack.video.point_quality import (
     ending_of,
 )
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.strip import Strip, recut, snap_to_grid
+from vinetrack.video.strip import Strip, cut_strip, snap_to_grid
 
 if TYPE_CHECKING:
     from vinetrack.video.body import BodyEnd
@@ -55,7 +50,7 @@ if TYPE_CHECKING:
 # Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
 
 
-def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tuple[Strip, Outline] | None:
+def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
     """Cut the strip about the tube that grows along an axis. An outline is found for anything that changes in order.
     Where that is no tube, the outline is arbitrary and no front passes along its middle, which the front share along
     the middle shows. Returns the strip, centred on the tube, and the tube's outline in it; None where no single front
@@ -66,9 +61,9 @@ def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tu
     # Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows
     # or columns (chosen)
     first_slope = 0.08
-    if front_share_of(axis) < LEAST_FRONT_SHARE:
+    if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
-    strip = first = cut_along(luma, snap_to_grid(axis, first_slope * axis.width_px), 0.65 * axis.width_px + 3)
+    strip = first = cut_strip(luma, snap_to_grid(axis, first_slope * axis.width_px), 0.65 * axis.width_px + 3)
     tube = outline(strip, outline_stretches(axis))
     try:
         for _ in range(2 * most_recuts if axis.bends else most_recuts):
@@ -76,7 +71,7 @@ def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tu
             if strip is before:
                 break
             tube = outline(strip, outline_stretches(axis))
-        off_tube = strip is not first and front_share_of(strip.axis) < LEAST_FRONT_SHARE
+        off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
     except (RecordingError, ValueError):
         return None
     return None if off_tube else (strip, tube)
@@ -92,7 +87,7 @@ def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
         curve, distance = recentred_curve(strip.axis, tube)
         if distance < CENTRED_PX and 0 <= room < 0.3 * half + 6:
             return strip
-        return cut_along(luma, curve, half * 1.15 + 5, strip)
+        return cut_strip(luma, curve, half * 1.15 + 5, strip)
     tilt = slope * strip.axis.length_px
     middle = shift + tilt / 2
     # 0.8: tilt of the axis over its length, or shift, that is left uncorrected (chosen)
@@ -101,7 +96,7 @@ def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
     start = strip.axis.points(np.array(0.0), shift)
     stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
     turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
-    return recut(strip, luma, snap_to_grid(turned), half * 1.15 + 5)
+    return cut_strip(luma, snap_to_grid(turned), half * 1.15 + 5, strip)
 
 
 # ------------------------------------------------------------------------------
@@ -131,7 +126,7 @@ class Positions:
 
 
 def follow(
-    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, front_share_of: FrontShare
+    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, small: SmallPictures
 ) -> tuple[Strip, Positions]:
     """Follow a body (travel ratio 1) or the edge of a tube; where there is no tube, the arrival of whatever comes.
     Returns the strip, centred on what moves along the axis, and the positions along it. Shapes: luma (n_frames, height,
@@ -140,7 +135,7 @@ def follow(
     try:
         if trial.travel_ratio == 1:
             return _body(luma, axis, exposure_frames)
-        return _edge(luma, axis, exposure_frames, front_share_of) or _arrival(luma, axis, exposure_frames)
+        return _edge(luma, axis, exposure_frames, small) or _arrival(luma, axis, exposure_frames)
     except RecordingError:
         raise
     except ValueError as error:
@@ -151,7 +146,7 @@ def _body(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip
     """Register a body against itself."""
     from vinetrack.video.body import track_body
 
-    strip = cut_along(luma, axis, 0.75 * axis.width_px + 12)
+    strip = cut_strip(luma, axis, 0.75 * axis.width_px + 12)
     fit = track_body(strip)
     position_px = np.where(fit.unseen, np.nan, fit.position_px)
     return strip, Positions(
@@ -160,12 +155,12 @@ def _body(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip
 
 
 def _edge(
-    luma: NDArray[Any], axis: Axis, exposure_frames: float, front_share_of: FrontShare
+    luma: NDArray[Any], axis: Axis, exposure_frames: float, small: SmallPictures
 ) -> tuple[Strip, Positions] | None:
     """Track the edge of a tube; None where there is no tube along the axis."""
     from vinetrack.video.edge import track_edge
 
-    outlined = tube_strip(luma, axis, front_share_of)
+    outlined = tube_strip(luma, axis, small)
     if outlined is None:
         return None
     strip, tube = outlined
@@ -182,7 +177,7 @@ def _arrival(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[St
     """Follow the arrival of whatever comes along the axis, of any width and direction, to about a pixel."""
     from vinetrack.video.kymograph import track_arrival
 
-    strip = cut_along(luma, axis, min(4 * axis.width_px, 0.3 * max(luma.shape[1:])))
+    strip = cut_strip(luma, axis, min(4 * axis.width_px, 0.3 * max(luma.shape[1:])))
     edge, sigma = track_arrival(strip)
     unsure = np.zeros(len(edge), dtype=bool)
     return strip, Positions(edge, sigma, unsure, 1.0, exposure_frames, 2.0, slow_px=ARRIVAL_PX, is_edge=False)
@@ -321,8 +316,9 @@ def track_pixels(
     luma = frames.luma if len(rows) == len(frames) else frames.luma[rows]
     axis_given = axis is not None
     try:
-        axis, front_share_of = locate_axis(luma, axis, trial, diameter_px)
-        strip, followed = follow(luma, trial, axis, exposure_s * capture_fps, front_share_of)
+        small = SmallPictures(luma)
+        axis = locate_axis(luma, small, axis, trial, diameter_px)
+        strip, followed = follow(luma, trial, axis, exposure_s * capture_fps, small)
     except RecordingError as error:
         raise RecordingError(error.what, error.remedy, name) from error
     random_px, total_px = _edge_errors(strip, followed, trial)
@@ -338,7 +334,7 @@ def track_pixels(
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
     pictures = tuple((int(number[i]), luma[i].copy()) for i in shown)
     shake_px = np.zeros(frames.n_recorded)
-    shake_px[number] = shake_along(strip, followed.edge_px) if strip.stabilised else 0.0
+    shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
         track, strip.axis, _kymograph(strip), pictures, followed.blur_px, followed.exposure_frames, shake_px,
         *followed.width_px, *followed.seen_exposure, strip_frames=number, ending=ending,
@@ -447,35 +443,25 @@ def _notes(
     return [*notes, *selection.notes], ending
 
 
-def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, diameter_px: float) -> tuple[Axis, FrontShare]:
-    """Find the growth axis, or give a known one a width and centre it on the motion. Returns the axis, px, and a
-    function from an axis of its kind, straight or curved, to its `axis.front_share`: below: `axis.LEAST_FRONT_SHARE`
-    where the vine bends or sweeps away. Shapes: luma (n_frames, height, width).
+def locate_axis(luma: NDArray[Any], small: SmallPictures, axis: Axis | None, trial: Trial, diameter_px: float) -> Axis:
+    """Find the growth axis, or give a known one a width and centre it on the motion. Shapes: luma (n_frames, height,
+    width).
     """
     given = axis is not None
-    if isinstance(axis, CurvedAxis):
-        return _given_curve(luma, axis, diameter_px)
-    small = SmallPictures(luma)
-    if axis is None and trial.travel_ratio == 2:
-        axis = find_growth_axis(small, luma)
-    axis = axis if axis is not None else find_axis(small, grows=False)
-    axis = replace(axis, width_px=2 * _half_width(axis, diameter_px))
-    if given and not axis.bends:
-        # A margin for an axis a few degrees off; it is centred on the motion, here or by `tube_strip`.
-        axis = replace(axis, width_px=axis.width_px + GIVEN_AXIS_MARGIN * axis.length_px)
-        if trial.travel_ratio == 1:
-            axis = centred_on_motion(small, axis)
-    return axis, front_share_function(small, luma)
-
-
-def _given_curve(luma: NDArray[Any], axis: CurvedAxis, diameter_px: float) -> tuple[CurvedAxis, FrontShare]:
-    """A given curve with a width, no wider than its curvature allows; see `locate_axis`."""
-    half = _half_width(axis, diameter_px)
-    width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
-    check_curve(axis, half if width_known else math.nan, luma.shape[1:])
-    wide = min(2 * half + GIVEN_AXIS_MARGIN * axis.length_px, 2 * axis.largest_half_px)
-    axis = replace(axis, width_px=max(wide, 2 * half) if width_known else wide)
-    return axis, partial(front_share_on_curve, luma)
+    if axis is None:
+        axis = find_growth_axis(small) if trial.travel_ratio == 2 else find_axis(small, grows=False)
+    width_px = 2 * _half_width(axis, diameter_px)
+    if not given:
+        return replace(axis, width_px=width_px)
+    # A margin for an axis a few degrees off; it is centred on the motion, here or by `tube_strip`.
+    wide_px = width_px + GIVEN_AXIS_MARGIN * axis.length_px
+    if axis.bends:
+        width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
+        check_curve(axis, width_px / 2 if width_known else math.nan, luma.shape[1:])
+        wide_px = min(wide_px, 2 * axis.largest_half_px)
+        return replace(axis, width_px=max(wide_px, width_px) if width_known else wide_px)
+    axis = replace(axis, width_px=wide_px)
+    return centred_on_motion(small, axis) if trial.travel_ratio == 1 else axis
 
 
 def _half_width(axis: Axis, diameter_px: float) -> float:
