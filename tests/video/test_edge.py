@@ -409,7 +409,7 @@ def test_without_a_front_only_the_arrival_is_followed(monkeypatch, on_axis, besi
     luma = tube()
     front_shares(monkeypatch, on_axis, beside)
     assert tube_strip(luma, AXIS, SmallPictures(luma)) is None
-    _, positions = follow(luma, TRIAL, AXIS, 0.1, SmallPictures(luma))
+    _, positions, _ = follow(luma, TRIAL, AXIS, 0.1, SmallPictures(luma))
     assert not positions.is_edge
     moving = slice(14, 60)
     assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[moving].max() < 3

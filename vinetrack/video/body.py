@@ -9,13 +9,12 @@ point is fixed on the body.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.video.strip import Strip
+from vinetrack.video.frames import RecordingError
+from vinetrack.video.strip import SLOW_PX, Positions, Strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
 
@@ -23,37 +22,8 @@ SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate i
 POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
 
 
-@dataclass(frozen=True)
-class BodyEnd:
-    """Last frame of a body's motion along the strip, where the recording goes on. The body `turns_back` there, or is
-    not seen again.
-    """
-
-    last_frame: int
-    turns_back: bool
-
-
-@dataclass(frozen=True)
-class BodyFit:
-    """Position of the body along the strip; arrays of shape (n_frames,). `position_px` is the column of the template's
-    centre at mid-exposure, `across_px` its place across, `sigma_px` the random error along, `match` the correlation
-    with the template.
-    """
-
-    position_px: Floats
-    across_px: Floats
-    sigma_px: Floats
-    match: Floats
-    unsure: NDArray[np.bool_]
-    half_px: float
-    unseen: NDArray[np.bool_]
-    end: BodyEnd | None = None
-
-
-def track_body(strip: Strip) -> BodyFit:
+def track_body(strip: Strip) -> Positions:
     """Register the moving body of a strip against itself."""
-    from vinetrack.video.frames import RecordingError
-
     pictures = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     pictures += strip.offset[:, None, None].astype(np.float32)
     path, half, background = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
@@ -79,13 +49,15 @@ def track_body(strip: Strip) -> BodyFit:
     unseen = (match < 0.4) | off_axis | _is_absent(pictures, background, template, weight, place, half)
     end = _body_end(place[:, 0], error, match, unseen)
     if end is not None:
-        unseen |= np.arange(len(unseen)) > end.last_frame
+        unseen |= np.arange(len(unseen)) > end[0]
     if hops_between_bodies(place[:, 0], ~unseen):
         raise RecordingError(
             "what is followed hops between several bodies that move along the axis: give the axis, with a smaller width"
         )
-    unsure = ~inside | (match < POOR_MATCH)
-    return BodyFit(place[:, 0], place[:, 1], error, match, unsure, float(half), unseen, end)
+    return Positions(
+        edge_px=np.where(unseen, np.nan, place[:, 0]), sigma_px=error, unsure=~inside | (match < POOR_MATCH),
+        blur_px=float(half), reach_px=float(half), slow_px=SLOW_PX, end=end,
+    )  # fmt: skip
 
 
 def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
@@ -136,9 +108,9 @@ def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
     return (1 / (1 + (np.clip(outside, 0, None) / 2.0) ** 2)).astype(np.float32)[:, None]
 
 
-def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> BodyEnd | None:
-    """Where the body's motion along the strip ends, None where the recording ends first. It ends where the body turns
-    back (a bounce), and where it is not recognised again (it tips over, or is gone).
+def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> tuple[int, bool] | None:
+    """Last frame of the body's motion along the strip, and whether it turns back there (a bounce) or is not recognised
+    again (it tips over, or is gone); None where the recording ends first.
     """
     recognised = np.flatnonzero(~unseen & (match >= POOR_MATCH))
     if len(recognised) < 3:
@@ -150,9 +122,9 @@ def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bo
     is_back = behind > np.maximum(3.0, 6.0 * np.nan_to_num(sigma[recognised], nan=0.0))
     turned = np.flatnonzero(is_back[:-1] & is_back[1:])
     if len(turned):
-        return BodyEnd(int(recognised[int(np.argmax(position[: turned[0]]))]), turns_back=True)
+        return int(recognised[int(np.argmax(position[: turned[0]]))]), True
     last = int(recognised[-1])
-    return BodyEnd(last, turns_back=False) if last < len(along) - 2 else None
+    return (last, False) if last < len(along) - 2 else None
 
 
 def _coarse_path(

@@ -22,8 +22,8 @@ from vinetrack.core.records import Correction, Floats, Track, join_flags
 from vinetrack.experiment.settings import Calibration, Charuco, Checkerboard, MmPerPx, TwoPoints
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import CurvedAxis, length_along
-from vinetrack.video.edge import SLOW_PX
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.strip import SLOW_PX
 
 # ------------------------------------------------------------------------------
 # Find the corners of calibration targets in a picture, to a few hundredths of a pixel, or say why there are none.

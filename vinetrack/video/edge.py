@@ -45,7 +45,7 @@ from vinetrack.video.edge_state import (
 )
 from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.point_quality import growth_end
-from vinetrack.video.strip import Strip
+from vinetrack.video.strip import SLOW_PX, Positions, Strip
 
 # ------------------------------------------------------------------------------
 # Repair of edge fits that break the motion, and errors of the edge by its bands.
@@ -62,9 +62,7 @@ from vinetrack.video.strip import Strip
 # differently for some frames, and their mean with them. Near the start a door or a mouth may hide the tip as well,
 # and where a shaken camera was stabilised the slow part of the shake stays.
 
-SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
 GUESS_RANDOM_PART = math.sqrt(0.5)  # The same for an edge that is a guess, since a door or the mouth hides it (chosen)
-ARRIVAL_PX = 1.0  # Slow error of a tip that sweeps and bends, tracked by when the picture changes for good (measured)
 
 
 def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats:
@@ -619,32 +617,10 @@ WIDTH_ERROR_PX = 1.0
 MIN_FRAME_WEIGHT = 0.05  # Weight of a frame identical to the one before it (chosen)
 
 
-@dataclass(frozen=True)
-class EdgeFit:
-    """Leading edge in strip pixels; arrays have shape (n_frames,). `edge_px` is the position at mid-exposure and
-    `sigma_px` its standard error from the likelihood. `extra_sigma_px` is added in quadrature: it comes from the
-    disagreement of bands of rows and, near the start, from START_ERROR_PX.
-    """
-
-    edge_px: Floats
-    sigma_px: Floats
-    extra_sigma_px: Floats
-    misfit: Floats
-    amplitude: Floats
-    contrast: Floats
-    blur_px: float
-    exposure_frames: float
-    passed: tuple[int, int]
-    hidden: Bools
-    bands_sigma_px: Floats
-    slow_px: Floats
-    seen_exposure_frames: float = np.nan
-    fast_px_per_frame: float = np.nan
-
-
-def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, sides: Outline | None = None) -> EdgeFit:
-    """Track the leading edge through a strip, growing towards higher columns."""
-    path, passed = initial_front_path(strip) if sides is None else (sides.path_px, sides.passed)
+def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions:
+    """Track the leading edge of a tube through its strip, growing towards higher columns."""
+    rounds = 4  # Fewest rounds of the alternation (chosen)
+    path, passed = tube.path_px, tube.passed
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = initial_state(strip, path, exposure)
@@ -677,6 +653,20 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
         return finished
     blur_exposure, speed = seen_exposure(strip, state, fit, exposure)
     return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
+
+
+def _unsure(fit: Floats, sigma_px: Floats, extra_px: Floats, hidden: Bools) -> Bools:
+    """Frames in which the fit is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain. Shapes: fit
+    (n_frames, 6), all others (n_frames,).
+    """
+    # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
+    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
+    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
+    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
+    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
+    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
+    uncertain = (extra_px > 1.0) | (sigma_px > np.maximum(1.0, 5.0 * np.nanmedian(sigma_px)))
+    return np.asarray(odd | uncertain | hidden)
 
 
 def _fit_frames(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT_ROUNDS) -> Floats:
@@ -810,7 +800,7 @@ def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) 
     return replace(state, inflation=np.clip(smoothed, 0.3, 50.0))
 
 
-def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
+def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:
     """Add to a converged fit the errors of bands, start, doors and leaps, and refer the edge to mid-exposure."""
     core = core_frames(state, fit)
     # Where a frame departs from the model (a door, a glint), the error exceeds that from the curvature of ln L.
@@ -841,7 +831,8 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     extra = np.maximum(extra, leap_error_px(edge_now, hidden))
     bands, slow_bands = noise_and_slow(bands, visible_error, extra)
     slow = np.hypot(slow_bands, slow_error_px(edge_now, contrast, shared))
-    return EdgeFit(
-        edge, sigma, extra, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, passed, hidden,
-        bands, slow,
+    return Positions(
+        edge_px=edge, sigma_px=sigma, unsure=_unsure(fit, sigma, extra, hidden), blur_px=state.blur,
+        reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
+        bands_sigma_px=bands,
     )  # fmt: skip

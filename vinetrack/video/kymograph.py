@@ -5,9 +5,6 @@ once, when the front passes it: `path_by_change` maximises the change collected 
 separates columns that look as at the end of the recording from columns that look as at its start. The second pass
 (`edge`) knows film and background and compares every pixel with both; distances are clipped, so that a door, a payload
 flying ahead or a reflection cannot capture the path.
-
-`track_arrival` is for vines that bend, sweep or slide along walls. The film of such a vine does not stay in place, so
-its appearance is never stable and a tracker of a straight front would follow the sweep.
 """
 
 from __future__ import annotations
@@ -382,27 +379,3 @@ def column_after_leap(path: Floats) -> int:
         if steps[t] > 3.0 * max(float(np.median(steps[t + 1 : t + 5])), 2.0):
             begin = int(path[t + 1])
     return begin
-
-
-def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
-    """Track the edge of a vine that bends or sweeps, as the column up to which the scene has changed. Returns edge and
-    its standard error, each of shape (n_frames,), px.
-    """
-    min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
-    values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
-    values += strip.offset[:, None, None].astype(np.float32)
-    first = np.median(values[:END_FRAMES], axis=0)
-    # 4.0: change, in units of the noise, that counts (chosen)
-    threshold = 4.0 * max(strip.noise, 3.0)
-    changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
-    smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
-    evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
-    ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
-    if len(ever) < 10:
-        raise ValueError("nothing moves along the axis")
-    evidence[:, : ever[0]] = 0.0
-    path = dividing_path(evidence)
-    edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
-    smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    # 0.8: standard error of an arrival
-    return smoothed, np.full(len(edge), 0.8)

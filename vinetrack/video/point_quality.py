@@ -8,7 +8,7 @@ from __future__ import annotations
 import bisect
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,6 @@ from vinetrack.core.records import Bools, Floats, Indices, join_flags
 from vinetrack.tracks.frame_timing import count_missing
 from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.strip import Strip
-
-if TYPE_CHECKING:
-    from vinetrack.video.body import BodyEnd
-
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
 FLOOR_PX = 0.04  # Standard error that no check shows
@@ -270,10 +266,9 @@ def ending_of(
     return Ending(grown_px, truncated_px, tuple(growth_end_notes(luma, quality, edge_px, name, number)), name, place)
 
 
-def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
-    """Say why a body is not followed to the end of the recording. Shapes: number (n_frames,)."""
-    frame = number[end.last_frame]
-    if end.turns_back:
+def body_end_note(frame: int, turns_back: bool) -> str:
+    """Say why a body is not followed to the end of the recording."""
+    if turns_back:
         return f"the body turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
     return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
 

@@ -7,6 +7,7 @@ outliers and are left out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Bools, Floats
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video.axis import Axis
 
@@ -22,6 +23,7 @@ BAND_GAP_PX = 5  # Rows left out between tube and background, to allow for sway 
 BAND_HEIGHT_PX = (14, 44)  # Rows of background on either side, at least and at most (chosen)
 BACKGROUND_PIXELS = 9000  # Pixels of the background that are used, evenly spaced (derived)
 REFERENCE_FRAMES = 15  # Frames whose median is the reference (derived)
+SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
 SHAKE_FLOOR_PX = 0.04  # Smaller shake is not removed (chosen)
 # Slope of an axis over its whole length up to which it is treated as lying along rows or columns (chosen)
 SNAP_TOLERANCE_PX = 0.4
@@ -48,6 +50,30 @@ class Strip:
         """
         place_px = np.where(np.isfinite(edge_px), edge_px, 0.5 * self.axis.length_px)
         return np.asarray(np.sum(self.shift_px * self.axis.direction_at(place_px), axis=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Positions:
+    """Positions along a strip by frame, px, from any of the trackers; arrays of shape (n_frames,). `edge_px` is where
+    the edge, or the body, is at mid-exposure, NaN where it is not seen, `sigma_px` its standard error from the fit
+    alone; `extra_sigma_px` is what is added to that in all, `bands_sigma_px` the part of it that differs from frame to
+    frame, `slow_px` what neighbouring frames share. `reach_px` is how far from the end of the strip the last place is
+    that can be seen; `end` the last frame of a body's motion, and whether it turns back there.
+    """
+
+    edge_px: Floats
+    sigma_px: Floats
+    unsure: Bools
+    blur_px: float
+    reach_px: float
+    slow_px: Floats | float
+    exposure_frames: float = math.nan
+    extra_sigma_px: Floats | float = 0.0
+    bands_sigma_px: Floats | float = 0.0
+    end: tuple[int, bool] | None = None
+    seen_exposure_frames: float = math.nan
+    fast_px_per_frame: float = math.nan
+    is_edge: bool = True
 
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,10 @@ from vinetrack.video.curved_axis import (
     path_error_px,
     recentred_curve,
 )
-from vinetrack.video.edge import ARRIVAL_PX, SLOW_PX, Outline, outline
+from vinetrack.video.edge import Outline, outline, track_edge
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
 from vinetrack.video.images import capture_exposure, capture_rate
+from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
 from vinetrack.video.point_quality import (
     FLOOR_PX,
     LARGEST_BODY_FACTOR,
@@ -39,12 +40,7 @@ from vinetrack.video.point_quality import (
     ending_of,
 )
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.strip import Strip, cut_strip, snap_to_grid
-
-if TYPE_CHECKING:
-    from vinetrack.video.body import BodyEnd
-    from vinetrack.video.edge import EdgeFit
-
+from vinetrack.video.strip import Positions, Strip, cut_strip, snap_to_grid
 
 # ------------------------------------------------------------------------------
 # Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
@@ -102,100 +98,58 @@ def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
 # ------------------------------------------------------------------------------
 # Follow what moves along an axis, by frame: the edge of a tube, a body, or else the arrival of whatever comes.
 
-# A frame whose misfit is this many times the median one, taken as at least LEAST_MISFIT, is doubtful (chosen)
-MISFIT_RATIO, LEAST_MISFIT = 6.0, 0.3
-
-
-@dataclass(frozen=True)
-class Positions:
-    """Positions along the axis by frame, px, from any of the trackers; arrays of shape (n_frames,)."""
-
-    edge_px: Floats
-    sigma_px: Floats
-    unsure: Bools
-    blur_px: float
-    exposure_frames: float
-    reach_px: float
-    extra_sigma_px: Floats | float = 0.0
-    bands_sigma_px: Floats | float = 0.0
-    slow_px: Floats | float = SLOW_PX
-    end: BodyEnd | None = None
-    width_px: tuple[float, float] = (math.nan, math.nan)
-    seen_exposure: tuple[float, float] = (math.nan, math.nan)
-    is_edge: bool = True
-
 
 def follow(
     luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, small: SmallPictures
-) -> tuple[Strip, Positions]:
+) -> tuple[Strip, Positions, tuple[float, float]]:
     """Follow a body (travel ratio 1) or the edge of a tube; where there is no tube, the arrival of whatever comes.
-    Returns the strip, centred on what moves along the axis, and the positions along it. Shapes: luma (n_frames, height,
-    width).
+    Returns the strip, centred on what moves along the axis, the positions along it, and the tube's width with its
+    standard error, px, NaN where there is none. Shapes: luma (n_frames, height, width).
     """
+    no_width = math.nan, math.nan
     try:
         if trial.travel_ratio == 1:
-            return _body(luma, axis, exposure_frames)
-        return _edge(luma, axis, exposure_frames, small) or _arrival(luma, axis, exposure_frames)
+            from vinetrack.video.body import track_body
+
+            strip = cut_strip(luma, axis, 0.75 * axis.width_px + 12)
+            return strip, replace(track_body(strip), exposure_frames=exposure_frames), no_width
+        if (outlined := tube_strip(luma, axis, small)) is not None:
+            strip, tube = outlined
+            return strip, track_edge(strip, exposure_frames, tube), (tube.width_px, tube.width_sigma_px)
+        # Of any width and direction
+        strip = cut_strip(luma, axis, min(4 * axis.width_px, 0.3 * max(luma.shape[1:])))
+        return strip, replace(track_arrival(strip), exposure_frames=exposure_frames), no_width
     except RecordingError:
         raise
     except ValueError as error:
         raise RecordingError(str(error)) from error
 
 
-def _body(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip, Positions]:
-    """Register a body against itself."""
-    from vinetrack.video.body import track_body
-
-    strip = cut_strip(luma, axis, 0.75 * axis.width_px + 12)
-    fit = track_body(strip)
-    position_px = np.where(fit.unseen, np.nan, fit.position_px)
-    return strip, Positions(
-        position_px, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end
+def track_arrival(strip: Strip) -> Positions:
+    """Track the tip of a vine that bends, sweeps or slides along walls, to about a pixel, as the column up to which the
+    scene has changed. Its film does not stay in place, so that a tracker of a straight front would follow the sweep.
+    """
+    min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
+    values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
+    values += strip.offset[:, None, None].astype(np.float32)
+    first = np.median(values[:END_FRAMES], axis=0)
+    # 4.0: change, in units of the noise, that counts (chosen)
+    threshold = 4.0 * max(strip.noise, 3.0)
+    changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
+    smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
+    evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
+    ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
+    if len(ever) < 10:
+        raise ValueError("nothing moves along the axis")
+    evidence[:, : ever[0]] = 0.0
+    path = dividing_path(evidence)
+    edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
+    smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    # 0.8, 1.0: random and slow error of an arrival (measured)
+    return Positions(
+        edge_px=smoothed, sigma_px=np.full(len(edge), 0.8), unsure=np.zeros(len(edge), dtype=bool), blur_px=1.0,
+        reach_px=2.0, slow_px=1.0, is_edge=False,
     )  # fmt: skip
-
-
-def _edge(
-    luma: NDArray[Any], axis: Axis, exposure_frames: float, small: SmallPictures
-) -> tuple[Strip, Positions] | None:
-    """Track the edge of a tube; None where there is no tube along the axis."""
-    from vinetrack.video.edge import track_edge
-
-    outlined = tube_strip(luma, axis, small)
-    if outlined is None:
-        return None
-    strip, tube = outlined
-    fit = track_edge(strip, exposure_frames, sides=tube)
-    reach = 3 * fit.blur_px + 1
-    return strip, Positions(
-        fit.edge_px, fit.sigma_px, _unsure(fit), fit.blur_px, fit.exposure_frames, reach,
-        fit.extra_sigma_px, fit.bands_sigma_px, fit.slow_px, width_px=(tube.width_px, tube.width_sigma_px),
-        seen_exposure=(fit.seen_exposure_frames, fit.fast_px_per_frame),
-    )  # fmt: skip
-
-
-def _arrival(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip, Positions]:
-    """Follow the arrival of whatever comes along the axis, of any width and direction, to about a pixel."""
-    from vinetrack.video.kymograph import track_arrival
-
-    strip = cut_strip(luma, axis, min(4 * axis.width_px, 0.3 * max(luma.shape[1:])))
-    edge, sigma = track_arrival(strip)
-    unsure = np.zeros(len(edge), dtype=bool)
-    return strip, Positions(edge, sigma, unsure, 1.0, exposure_frames, 2.0, slow_px=ARRIVAL_PX, is_edge=False)
-
-
-def _unsure(fit: EdgeFit) -> Bools:
-    """Frames in which the fit of the edge is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain."""
-    from vinetrack.video.edge import LEAST_AMPLITUDE
-
-    median_misfit = float(np.nanmedian(fit.misfit))
-    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
-    poor = (fit.amplitude < LEAST_AMPLITUDE) | (fit.amplitude > 1.5)
-    poor = poor | (fit.misfit > MISFIT_RATIO * max(median_misfit, LEAST_MISFIT))
-    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
-    poor |= (fit.extra_sigma_px > 1.0) | fit.hidden
-    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
-    uncertain = fit.sigma_px > np.maximum(1.0, 5.0 * np.nanmedian(fit.sigma_px))
-    return np.asarray(poor | uncertain)
 
 
 # ------------------------------------------------------------------------------
@@ -318,7 +272,7 @@ def track_pixels(
     try:
         small = SmallPictures(luma)
         axis = locate_axis(luma, small, axis, trial, diameter_px)
-        strip, followed = follow(luma, trial, axis, exposure_s * capture_fps, small)
+        strip, followed, width_px = follow(luma, trial, axis, exposure_s * capture_fps, small)
     except RecordingError as error:
         raise RecordingError(error.what, error.remedy, name) from error
     random_px, total_px = _edge_errors(strip, followed, trial)
@@ -337,7 +291,7 @@ def track_pixels(
     shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
         track, strip.axis, _kymograph(strip), pictures, followed.blur_px, followed.exposure_frames, shake_px,
-        *followed.width_px, *followed.seen_exposure, strip_frames=number, ending=ending,
+        *width_px, followed.seen_exposure_frames, followed.fast_px_per_frame, strip_frames=number, ending=ending,
     )  # fmt: skip
 
 
@@ -429,7 +383,8 @@ def _notes(
     name, number = frames.recording.path.name, selection.number
     notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
-        notes.append(f"{name}: {body_end_note(followed.end, number)}")
+        last_frame, turns_back = followed.end
+        notes.append(f"{name}: {body_end_note(int(number[last_frame]), turns_back)}")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
