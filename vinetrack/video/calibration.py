@@ -190,10 +190,7 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
         corners, ids = max((corners, ids), _detect_markers(grey, dictionary, enlarge=2), key=lambda pair: len(pair[1]))
     if not len(ids):
         raise CornersError(_no_markers(grey, board.dictionary))
-    layouts = [_charuco_board(board, dictionary, legacy) for legacy in (False, True)]
-    agreement = [_marker_agreement(layout, corners, ids, board) for layout in layouts]
-    layout = layouts[int(np.argmax([share for share, _ in agreement]))]
-    share, marker_mm = max(agreement, key=lambda pair: pair[0])
+    share, marker_mm, layout = _best_layout(corners, ids, board, dictionary)
     if share < 0.8:
         raise CornersError(
             f"the markers do not lie as on a board of {board.squares[0]} × {board.squares[1]} squares "
@@ -230,26 +227,6 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
             square_m = board.square_mm / 1000
             return _refined(grey, found_px, grid.astype(float) * square_m, square_m, 0.5)
     raise CornersError(_no_checkerboard(grey, across, down))
-
-
-def markers_seen(grey: Grey, dictionary: str) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
-    """Detect the markers of a dictionary in a picture. Returns corners of each marker, shape (1, 4, 2), px, and their
-    numbers, shape (n, 1). Shapes: grey (height, width).
-    """
-    return _detect_markers(grey, _dictionary(dictionary))
-
-
-def marker_agreement(
-    corners: list[Any], ids: NDArray[np.int32], board: Charuco, dictionary: str
-) -> tuple[float, float]:
-    """Share of markers that lie where a board has them, and their size (mm) relative to squares of `square_mm`. Boards
-    printed by OpenCV before 4.6 count too. Returns share, marker_mm.
-    """
-    predefined = _dictionary(dictionary)
-    layouts = [_charuco_board(board, predefined, legacy) for legacy in (False, True)]
-    return max(
-        (_marker_agreement(layout, corners, ids, board) for layout in layouts), key=lambda agreement: agreement[0]
-    )
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
@@ -290,13 +267,20 @@ def _dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(code)
 
 
-def _charuco_board(board: Charuco, dictionary: Any, legacy: bool) -> Any:
-    """The layout of a board, as OpenCV printed it from version 4.6, or before (`legacy`)."""
+def _best_layout(
+    corners: list[Any], ids: NDArray[np.int32], board: Charuco, dictionary: Any
+) -> tuple[float, float, Any]:
+    """Share of the markers that lie where a board has them, their size (mm) beside squares of `square_mm`, and its
+    layout: as OpenCV prints it from version 4.6, or as before.
+    """
     import cv2
 
-    layout = cv2.aruco.CharucoBoard(board.squares, board.square_mm / 1000, board.marker_mm / 1000, dictionary)
-    layout.setLegacyPattern(legacy)
-    return layout
+    found = []
+    for legacy in (False, True):
+        layout = cv2.aruco.CharucoBoard(board.squares, board.square_mm / 1000, board.marker_mm / 1000, dictionary)
+        layout.setLegacyPattern(legacy)
+        found.append((*_marker_agreement(layout, corners, ids, board), layout))
+    return max(found, key=lambda agreement: agreement[0])
 
 
 def _detect_markers(
@@ -391,13 +375,11 @@ def _no_markers(grey: Grey, dictionary: str) -> str:
     """Say that there are no markers, and name the dictionary whose markers are there, if any."""
     best, numbers = "", np.empty(0, int)
     for name in OTHER_DICTIONARIES:
-        family = f"{name}_{DICTIONARY_SIZES[-1]}" if name[-2] == "X" else name
-        ids = _detect_markers(grey, _dictionary(family))[1].ravel()
+        ids = _detect_markers(grey, _dictionary(_largest(name)))[1].ravel()
         if name not in dictionary and len(ids) > len(numbers):
             best, numbers = name, ids
     if len(numbers) >= 3:
-        enough = next((size for size in DICTIONARY_SIZES if size > numbers.max()), DICTIONARY_SIZES[-1])
-        likely = f"{best}_{enough}" if best[-2] == "X" else best
+        likely = _smallest(best, int(numbers.max()) + 1)
         return f"no marker of {dictionary} is seen, but {len(numbers)} of {likely}; correct `dictionary`"
     return (
         f"no marker of {dictionary} is seen; check `dictionary`, and that the board is in the picture, in focus, "
@@ -439,7 +421,7 @@ class BoardSeen:
 def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     """Find the printed board in a picture. Shapes: picture (height, width)."""
     grey = eight_bits(picture)
-    seen = [(*markers_seen(grey, _largest(family)), family) for family in OTHER_DICTIONARIES]
+    seen = [(*_detect_markers(grey, _dictionary(_largest(family))), family) for family in OTHER_DICTIONARIES]
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
     # 6: fewest markers that distinguish a board from chance (chosen)
     if len(ids) >= 6:
@@ -456,7 +438,7 @@ def _charuco(corners: Any, ids: NDArray[np.int32], family: str) -> BoardSeen | N
     for squares in _layouts(int(ids.max()) + 1):
         # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
         board = Charuco(kind="charuco", image="", squares=squares, square_mm=1.0, marker_mm=0.7, dictionary=family)
-        share, marker = marker_agreement(corners, ids, board, _largest(family))
+        share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
             dictionary = _smallest(family, squares[0] * squares[1] // 2)
             best_share, best_board = share, BoardSeen("charuco", squares, dictionary, marker, len(ids))

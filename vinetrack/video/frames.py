@@ -146,13 +146,12 @@ def _enlarged(
 @dataclass(frozen=True)
 class PacketIndex:
     """All frames of a film in display order, shapes (n_frames,). `pts` is the presentation time in units of `base_s`,
-    `key` marks key frames, `size_bytes` is the size of the packet.
+    `key` marks key frames.
     """
 
     pts: NDArray[np.int64]
     key: Bools
     base_s: float
-    size_bytes: NDArray[np.int64]
 
     @property
     def times_s(self) -> Floats:
@@ -164,7 +163,7 @@ def packet_index(path: Path) -> PacketIndex | None:
     """List the frames of a film without decoding them."""
     import av
 
-    pts, key, size = [], [], []
+    pts, key = [], []
     with quiet_log(), contextlib.suppress(av.error.FFmpegError), av.open(str(path)) as container:
         stream = container.streams.video[0]
         base = float(stream.time_base) if stream.time_base else 1.0
@@ -175,12 +174,11 @@ def packet_index(path: Path) -> PacketIndex | None:
                 return None
             pts.append(packet.pts)
             key.append(packet.is_keyframe)
-            size.append(packet.size)
     order = np.argsort(pts)
     times = np.array(pts, dtype=np.int64)[order]
     if len(times) < 2 or np.any(np.diff(times) <= 0):
         return None
-    return PacketIndex(times, np.array(key, dtype=bool)[order], base, np.array(size, dtype=np.int64)[order])
+    return PacketIndex(times, np.array(key, dtype=bool)[order], base)
 
 
 def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> Iterator[av.VideoFrame]:

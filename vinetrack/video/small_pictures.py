@@ -225,8 +225,7 @@ def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
 # A recording stopped by hand may hold thousands of frames of which tens or hundreds show the growth. A recording too
 # large for memory is sampled first: the key frames of a film, which can be decoded on their own, or every n-th frame
 # of other files. The event lasts from the first sample that differs from the initial pictures to the last that
-# differs from the final ones. In a film with few key frames the packet sizes are used instead, if frames at rest take
-# hardly any bytes.
+# differs from the final ones.
 
 MAX_BYTES_WHOLE = 400_000_000  # Size of the pictures up to which a recording is read whole (chosen)
 MAX_SAMPLES = 400  # Maximum number of samples (chosen)
@@ -235,8 +234,6 @@ SAMPLE_SIZE_PX = 320  # Longer side of the samples, px (chosen)
 CHANGE_THRESHOLD = 6.0  # Change of a pixel that counts, in units of its noise (measured)
 MIN_CHANGE = 3.0  # Smallest change that counts, grey levels of 255 (chosen)
 MIN_CHANGED_PIXELS = 8  # Number of pixels that must have changed (chosen)
-# Something moves where packets are, on average over the second number of frames (chosen)
-ACTIVE_RATIO, ACTIVE_FRAMES = 2.0, 9
 MARGIN_FRAMES, MARGIN_PART = 40, 0.15  # Frames, and fraction of the event, added at either end (chosen)
 
 
@@ -286,7 +283,8 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], co
         return None
     start = int(numbers[max(differs_from_first[0] - 1, 0)])
     stop = int(numbers[min(max(differs_from_last[-1], differs_from_first[0]) + 1, len(numbers) - 1)])
-    return _with_margin(start, stop, count)
+    margin = max(MARGIN_FRAMES, round(MARGIN_PART * (stop - start)))
+    return max(start - margin, 0), min(stop + margin, count - 1)
 
 
 def _film_event(recording: Recording, frame_range: tuple[int, int] | None) -> Frames:
@@ -296,87 +294,28 @@ def _film_event(recording: Recording, frame_range: tuple[int, int] | None) -> Fr
         return read_frames(recording)
     count = len(index.pts)
     if frame_range is None:
-        frame_range = _range_by_packets(recording, index)
-    if frame_range is None:
         pictures, numbers = _sample_film(recording, index)
         frame_range = event_range(pictures, numbers, count)
         pictures.clear()
-    if frame_range is None or frame_range[0] >= count:
-        return read_frames(recording)
-    if frame_range == (0, count - 1):
+    if frame_range is None or frame_range[0] >= count or frame_range == (0, count - 1):
         return read_frames(recording)
     return read_frames(recording, part=(frame_range[0], min(frame_range[1], count - 1), index))
 
 
-def _range_by_packets(recording: Recording, index: PacketIndex) -> tuple[int, int] | None:
-    """Return the first and last frame of the event, margin included, from packet sizes of a film with few key frames. A
-    frame that repeats the one before it takes a packet of a few bytes; one in which something moves takes more. The key
-    frames before and after the event, which can be decoded on their own, must show that nothing changes there.
-    """
-    count, keys = len(index.pts), np.flatnonzero(index.key)
-    if _keys_suffice(index) or len(keys) < 2:
-        return None
-    size = np.where(index.key, 0, index.size_bytes).astype(float)
-    smallest = float(size[~index.key].min(initial=np.inf))
-    mean = np.convolve(size, np.ones(ACTIVE_FRAMES), "same") / np.convolve(~index.key, np.ones(ACTIVE_FRAMES), "same")
-    active = np.flatnonzero(mean > ACTIVE_RATIO * smallest)
-    # 100: maximum packet size of a frame that repeats the one before it (measured)
-    if smallest > 100 or not len(active):
-        return None
-    first, last = _with_margin(int(active[0]), int(active[-1]), count)
-    before, after = keys[keys <= active[0]], keys[keys >= active[-1]]
-    if not len(before) or not len(after):
-        return None
-    sampled = [keys[:: max(1, -(-len(keys) // MAX_SAMPLES))] for keys in (before, after)]
-    pictures = _samples_of(recording, index, np.concatenate(sampled), keys_only=True)
-    sides = [[pictures[number] for number in numbers if number in pictures] for numbers in sampled]
-    if not all(sides) or any(_differ(side[0], picture) for side in sides for picture in side[1:]):
-        return None
-    return first, last
-
-
-def _differ(still: NDArray[np.uint8], picture: NDArray[np.uint8]) -> bool:
-    """Whether two samples differ by more than noise, apart from a change of brightness."""
-    import cv2
-
-    first, second = (cv2.blur(sample.astype(np.float32), (3, 3)) for sample in (still, picture))
-    change = np.abs(second * (np.median(first + 1) / np.median(second + 1)) - first)
-    limit = max(CHANGE_THRESHOLD * 1.4826 * float(np.median(change)), MIN_CHANGE)
-    return bool(np.count_nonzero(change > limit) >= MIN_CHANGED_PIXELS)
-
-
-def _with_margin(start: int, stop: int, count: int) -> tuple[int, int]:
-    """Extend the range of an event by the margin."""
-    margin = max(MARGIN_FRAMES, round(MARGIN_PART * (stop - start)))
-    return max(start - margin, 0), min(stop + margin, count - 1)
-
-
-def _keys_suffice(index: PacketIndex) -> bool:
-    """Whether key frames are so close to each other that no event fits between two of them."""
-    keys = np.flatnonzero(index.key)
-    return len(keys) > 1 and max(int(np.diff(keys).max()), len(index.pts) - int(keys[-1])) <= MAX_SAMPLE_INTERVAL
-
-
 def _sample_film(recording: Recording, index: PacketIndex) -> tuple[list[NDArray[np.uint8]], NDArray[np.int_]]:
     """Sample the key frames of a film or, if these are too rare, every n-th frame of the whole film."""
-    keys_only = _keys_suffice(index)
-    candidates = np.flatnonzero(index.key) if keys_only else np.arange(len(index.pts))
-    pictures = _samples_of(recording, index, candidates[:: max(1, -(-len(candidates) // MAX_SAMPLES))], keys_only)
-    numbers = sorted(pictures)
-    return [pictures[number] for number in numbers], np.array(numbers, dtype=int)
-
-
-def _samples_of(
-    recording: Recording, index: PacketIndex, numbers: NDArray[np.int_], keys_only: bool
-) -> dict[int, NDArray[np.uint8]]:
-    """Decode and shrink some frames, by their index; with `keys_only` no other frame is decoded."""
-    chosen = {int(index.pts[i]): int(i) for i in numbers}
+    keys = np.flatnonzero(index.key)
+    # Key frames so close to each other that no event fits between two of them
+    keys_only = len(keys) > 1 and max(int(np.diff(keys).max()), len(index.pts) - int(keys[-1])) <= MAX_SAMPLE_INTERVAL
+    candidates = keys if keys_only else np.arange(len(index.pts))
+    chosen = {int(index.pts[i]): int(i) for i in candidates[:: max(1, -(-len(candidates) // MAX_SAMPLES))]}
     pictures = {}
     for frame in decode_packets(recording.path, set(chosen) if keys_only else None, DECODER_THREADS):
         number = None if frame.pts is None else chosen.get(frame.pts)
         if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
             pictures[number] = _shrunk(luma_plane(frame, recording.whole), recording.bit_depth)
-    return pictures
+    numbers = sorted(pictures)
+    return [pictures[number] for number in numbers], np.array(numbers, dtype=int)
 
 
 def _raw_event(recording: Recording, frame_range: tuple[int, int] | None) -> Frames:
