@@ -95,7 +95,7 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     arguments = (*steady, fit, np.zeros(16), LAG, blur, pictures, margin, frames, 0.5 * RIM)
     rows, places, distances, misfit = (sums.sum(axis=0) for sums in kernels.residual_sums(*arguments))
     half = kernels.coverage_reach(0.0, blur) + margin
-    by_distance, by_row, by_place, squares = np.zeros_like(distances), np.zeros((9, 2)), np.zeros((65, 2)), []
+    by_distance, by_row, by_place, logs = np.zeros_like(distances), np.zeros((9, 2)), np.zeros((65, 2)), []
     for t in np.flatnonzero(use):
         columns: dict[int, np.ndarray] = {}
         for u in range(9):
@@ -115,12 +115,12 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
                 i = int(len(by_distance) // 2 - x)
                 columns[i] = columns.get(i, np.zeros(2)) + w * (after - before) * np.array([r, after - before])
                 by_row[u] += w * g * np.array([r, g])
-                squares.append(r * r / ((va + vb) / 2 + r * r / 9))
+                logs.append(math.log(1 + r * r / (4.5 * (va + vb))))
         for i, (top, square) in columns.items():
             by_distance[i] += top**2 / square, 1
     assert np.allclose(distances, by_distance, rtol=0.01, atol=0.02)
     assert np.allclose(rows, by_row, rtol=0.01, atol=0.02 * np.abs(by_row).max())
-    assert misfit == pytest.approx([np.sum(squares), len(squares)], rel=1e-3)
+    assert misfit == pytest.approx([np.sum(logs), len(logs)], rel=1e-3)
     assert np.allclose(places.T, by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
 
 

@@ -505,28 +505,13 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
 
 AVERAGED_FRAMES = 12  # Frames after and before the front over which film and background are averaged (derived)
 
-_FrontPath = tuple[Floats, tuple[int, int]]  # Column of the front by frame, shape (n_frames,), px
-
 
 def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
-    """Find the initial path of the front, and the columns that it leaves permanently changed. Returns column of the
-    front by frame, shape (n_frames,), px, first column passed, and the one behind the last.
+    """Find the initial path of the front, by change or by appearance, whichever leaves the smaller residual sum, and
+    the columns that it leaves permanently changed; a payload may fly on beyond the end of the film. Returns column of
+    the front by frame, shape (n_frames,), px, first column passed, and the one behind the last.
     """
-    return _cut_at_growth_end(strip, _better_path(strip))
-
-
-def _cut_at_growth_end(strip: Strip, front_path: _FrontPath) -> _FrontPath:
-    """End the passed columns where the film ends: a payload may fly on beyond it."""
-    path, (begin, end) = front_path
-    end = growth_end(strip, path, (begin, end))
-    if end <= begin:
-        raise ValueError("what changes along the axis does not stay changed: nothing grows")
-    return path, (begin, end)
-
-
-def _better_path(strip: Strip) -> _FrontPath:
-    """Return the path by change or by appearance, whichever leaves the smaller residual sum, and its columns."""
-    candidates: list[_FrontPath] = []
+    candidates: list[tuple[Floats, tuple[int, int]]] = []
     errors: list[ValueError] = []
     for path, change in (ky.path_by_change(strip), ky.path_by_appearance(strip)):
         try:
@@ -535,25 +520,28 @@ def _better_path(strip: Strip) -> _FrontPath:
             errors.append(error)
     if not candidates:
         raise errors[0]
-    if len(candidates) == 1:
-        return candidates[0]
-    columns = min(passed[0] for _, passed in candidates), max(passed[1] for _, passed in candidates)
-    by_change, by_looks = (_residual_of_path(strip, front_path, columns) for front_path in candidates)
-    return candidates[1] if by_looks < by_change else candidates[0]
+    path, passed = candidates[0]
+    if len(candidates) == 2:
+        columns = min(first for _, (first, _) in candidates), max(last for _, (_, last) in candidates)
+        by_change, by_looks = (_residual_of_path(strip, path, columns) for path, _ in candidates)
+        path, passed = candidates[int(by_looks < by_change)]
+    end = growth_end(strip, path, passed)
+    if end <= passed[0]:
+        raise ValueError("what changes along the axis does not stay changed: nothing grows")
+    return path, (passed[0], end)
 
 
-def _residual_of_path(strip: Strip, front_path: _FrontPath, columns: tuple[int, int]) -> float:
+def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> float:
     """Residual sum of a path over some columns, with the film and background that follow from it."""
-    path, _ = front_path
     pictures = appearance_about_path(strip, path, columns)
 
-    def residuals(first: int, last: int) -> Floats:
+    def residuals_of(first: int, last: int) -> Floats:
         part = slice(first, last)
         return ky.clipped_residual_sums(
             strip.values[part], strip.scale[part], strip.offset[part], strip.noise, path[part], pictures, *columns
         )
 
-    return float(np.concatenate(in_parts(residuals, len(strip.values), FEWEST_PICTURES)).sum())
+    return float(np.concatenate(in_parts(residuals_of, len(strip.values), FEWEST_PICTURES)).sum())
 
 
 def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:
@@ -563,7 +551,7 @@ def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) 
     return ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns, AVERAGED_FRAMES)
 
 
-def _trim_to_changed_runs(path: Floats, change: Floats) -> _FrontPath:
+def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
     """Clip a path to the range of columns that changed in runs; prepend a run-up. A late beginning is better than an
     early one: neighbours then stand in for the background, whereas a column that never changed carries no information
     about the edge.

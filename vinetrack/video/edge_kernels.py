@@ -561,7 +561,7 @@ def residual_sums(
     By row: Σ w g r and Σ w g², g the derivative of the model with respect to the row's lag, shape (n_used, n_across,
     2). By distance from the row's own edge, in the bins of `shading`: Σ w r and Σ w, shape (n_used, 2, n_distances). By
     distance from the edge, 1 px a bin, edge at the middle bin: z² / var z of columns, z = Σ C r / v over their rows (C
-    the contrast, v the variance), and the number of terms, shape (n_used, n_bins, 2). In all: r² / (v + r²/9), v the
+    the contrast, v the variance), and the number of terms, shape (n_used, n_bins, 2). In all: log(1 + r²/9v), v the
     mean of the variances of film and background, and the number of pixels, shape (n_used, 2): a robust misfit for
     comparing blurs, since v does not depend on the blur; otherwise a wider one would lower its own misfit.
     """
@@ -600,15 +600,18 @@ def residual_sums(
                 p = low[i] + f * (high[i] - low[i])
                 v = p * p * film_variance[i] + (1 - p) * (1 - p) * background_variance[i]
                 weight[i] = 1 / (v + residual[i] * residual[i] / 9)
-            gradient, curvature, total = 0.0, 0.0, 0.0
+            gradient, curvature = 0.0, 0.0
             for i in range(m):
                 g = (background[i] - film[i]) * (low_slope[i] + f * (high_slope[i] - low_slope[i]))
                 gradient += weight[i] * g * residual[i]
                 curvature += weight[i] * g * g
-                square = residual[i] * residual[i]
-                total += square / (0.5 * (film_variance[i] + background_variance[i]) + square / 9)
             by_row[used, u, 0], by_row[used, u, 1] = gradient, curvature
-            misfit[used, 0] += total
+            for start in range(0, m, 32):  # the logarithm of a product: 32 factors, at most 1e9 each, do not overflow
+                product = 1.0
+                for i in range(start, min(start + 32, m)):
+                    square = residual[i] * residual[i]
+                    product *= min(1 + square / (4.5 * (film_variance[i] + background_variance[i])), 1e9)
+                misfit[used, 0] += math.log(product)
             misfit[used, 1] += m
             # The row's edge lies between two whole columns: each pixel counts in two bins.
             for further in range(2):

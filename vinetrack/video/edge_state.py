@@ -275,20 +275,10 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
 
-    def misfit_of(blur: float) -> float:
-        return _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - coverage_reach(0.0, blur))
-
-    if everywhere:
-        misfits = [misfit_of(float(blur)) for blur in candidates]
-    else:
-        # The outer two are tried only where the least lies at the border of the inner three.
-        misfits = [np.inf, *(misfit_of(float(blur)) for blur in candidates[1:-1]), np.inf]
-        least = int(np.argmin(misfits))
-        if least in (1, len(candidates) - 2):
-            outer = 0 if least == 1 else len(candidates) - 1
-            misfits[outer] = misfit_of(float(candidates[outer]))
-        tried = np.isfinite(misfits)
-        candidates, misfits = candidates[tried], [value for value in misfits if np.isfinite(value)]
+    misfits = [
+        _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - coverage_reach(0.0, blur))
+        for blur in candidates.tolist()
+    ]
     return replace(state, blur=float(np.clip(_least_misfit(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
 
 
