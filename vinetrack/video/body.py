@@ -50,7 +50,10 @@ def track_body(strip: Strip) -> Positions:
     end = _body_end(place[:, 0], error, match, unseen)
     if end is not None:
         unseen |= np.arange(len(unseen)) > end[0]
-    if hops_between_bodies(place[:, 0], ~unseen):
+    found = np.flatnonzero(~unseen)
+    # 0.5: part of the frames, from the first to the last in which it is seen, that must show a body (chosen)
+    hardly_seen = len(found) > 0 and len(found) < 0.5 * (1 + np.ptp(found))
+    if hardly_seen or hops_between_bodies(place[:, 0], ~unseen):
         raise RecordingError(
             "what is followed hops between several bodies that move along the axis: give the axis, with a smaller width"
         )

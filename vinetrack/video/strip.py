@@ -194,8 +194,7 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     shift, shaken = np.zeros((n, 2)), False
     places = _beside(axis, half, luma.shape[1:])
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
-    # 200: fewest pixels of background from which flicker and shift are measured (chosen)
-    basis = _reference(luma[picks], places, None) if len(places) >= 200 else np.zeros((4, 0))
+    basis = _reference(luma[picks], places, None) if len(places) else np.zeros((4, 0))
     if not basis[0].any():  # no background, or black all over
         return np.full(n, unit), np.zeros(n), shift, shaken
     fit, sigma = register(luma, places, basis, None)
@@ -211,15 +210,18 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
 
 
 def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> NDArray[np.int_]:
-    """Whole pixels (x, y) of the background on both sides of a tube, from its start to its end, shape (n, 2)."""
+    """Whole pixels (x, y) of the background on both sides of a tube, from its start to its end, shape (n, 2); none
+    where there is hardly any.
+    """
     rows = half + BAND_GAP_PX + np.arange(int(np.clip(half, *BAND_HEIGHT_PX)))
     along, across = np.meshgrid(np.arange(1.0, axis.length_px), np.concatenate([-rows, rows]), indexing="ij")
-    every = max(1, along.size // BACKGROUND_PIXELS)
-    places = np.rint(axis.points(along.ravel()[::every], across.ravel()[::every])).astype(int)
-    inside = ((places >= 2) & (places < np.array(shape[::-1]) - 2)).all(axis=1)
-    if axis.bends:
-        inside &= np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1
-    return places[inside]
+    places = np.rint(axis.points(along.ravel(), across.ravel())).astype(int)
+    places = places[((places >= 2) & (places < np.array(shape[::-1]) - 2)).all(axis=1)]
+    # 6: fewest rows, of the whole length together, that tell of flicker and shift (chosen)
+    if len(places) < 6 * axis.length_px:
+        return places[:0]
+    places = places[:: max(1, len(places) // BACKGROUND_PIXELS) | 1]  # odd: rows come in pairs, and none is left out
+    return places[np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1]
 
 
 def _followed(luma: NDArray[Any], places: NDArray[np.int_], picks: NDArray[np.int_]) -> tuple[Floats, Floats, Floats]:
