@@ -95,16 +95,18 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     ridge_weight = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)
     neighbour_decay = 0.93  # Factor by which the weight of neighbours falls per column (derived)
     early, late = _passage_frames(state, strip.values.shape[2])
+    # 2.06: distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
+    reach = 0.5 * state.lengths + 2.06 * state.blur
     sums = kernels.gather(
-        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
-        MEMORY_FRAMES, state.appearance, clip, state.shading,
+        strip.values, strip.scale, strip.offset, state.edge, reach, state.lag, early, late, MEMORY_FRAMES,
+        state.appearance, clip, state.shading,
     )  # fmt: skip
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
     appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     film_all_along = _film_at_start(state, appearance)
     if film_all_along.any():
-        sums[5:8, :, film_all_along] = 0.0
+        sums[1, :, :, film_all_along] = 0.0
         appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     return replace(state, appearance=appearance)
 
