@@ -148,28 +148,15 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: 
 
 def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_rows: int, n_along: int) -> NDArray[Any]:
     """Slice whole pixels of an axis along rows or columns of the picture; beyond the picture its border is repeated."""
-    x = np.rint(
-        start[0] + np.arange(n_along) * along[0] if abs(along[0]) > 0.5 else start[0] + np.arange(n_rows) * across[0]
+    level = abs(along[0]) > 0.5
+    steps = (along[0], across[1]) if level else (across[0], along[1])
+    counts = (n_along, n_rows) if level else (n_rows, n_along)
+    x, y = (
+        np.clip(np.rint(start[k] + np.arange(counts[k]) * steps[k]), 0, luma.shape[2 - k] - 1).astype(int)
+        for k in (0, 1)
     )
-    y = np.rint(
-        start[1] + np.arange(n_rows) * across[1] if abs(along[0]) > 0.5 else start[1] + np.arange(n_along) * along[1]
-    )
-    columns = np.clip(x, 0, luma.shape[2] - 1).astype(int)
-    rows = np.clip(y, 0, luma.shape[1] - 1).astype(int)
-    part = _take(_take(luma, rows, 1), columns, 2)
-    part = part if abs(along[0]) > 0.5 else part.transpose(0, 2, 1)
-    out = np.empty(part.shape, part.dtype)
-    in_parts(lambda first, last: np.copyto(out[first:last], part[first:last]), len(part), FEWEST_PICTURES)
-    return out
-
-
-def _take(luma: NDArray[Any], index: NDArray[np.int_], dim: int) -> NDArray[Any]:
-    """Index one dimension: consecutive indices as a view, others as a copy."""
-    steps = np.diff(index)
-    if len(steps) and np.all(steps == 1):
-        chosen = slice(int(index[0]), int(index[-1]) + 1)
-        return luma[:, chosen] if dim == 1 else luma[:, :, chosen]
-    return np.take(luma, index, axis=dim)
+    part = luma[:, y][:, :, x]
+    return np.ascontiguousarray(part if level else part.transpose(0, 2, 1))
 
 
 # ------------------------------------------------------------------------------
