@@ -98,7 +98,7 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
             if found_px is None:
                 continue
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
-            return _enough(found_px, grid * (board.square_mm / 1000), "all are seen")
+            return _enough(found_px, grid.astype(float) * (board.square_mm / 1000), "all are seen")
     raise CornersError(_no_checkerboard(grey, across, down))
 
 
