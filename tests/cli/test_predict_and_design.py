@@ -17,7 +17,7 @@ from vinetrack.cli.main import app
 from vinetrack.core.tables import write_json
 from vinetrack.inference.fit_summary import summary_of
 from vinetrack.pipeline.design_stage import read_list, read_range
-from vinetrack.pipeline.predict_stage import PredictionRequest, inputs_of, read_basis
+from vinetrack.pipeline.predict_stage import PredictionRequest, read_basis
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 # `vinetrack predict`: what it says, what it writes, and how it refuses.
@@ -109,7 +109,7 @@ def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_pa
     write_json(results / "fit.json", content)
     write_json(results / "provenance.json", {"experiment": experiment.as_posix()})
     values = dict(zip((name[2:].replace("-", "_") for name in FAST[::2]), map(str, FAST[1::2]), strict=True))
-    (inputs,) = inputs_of(read_basis(PredictionRequest(cells=values, results=results)))
+    (inputs,) = read_basis(PredictionRequest(cells=values, results=results)).inputs
     assert inputs.model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
     done = run("predict", *FAST, "--fit", results)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -39,7 +38,7 @@ from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, Power, Rate
 from vinetrack.experiment.settings import Limits
 from vinetrack.pipeline.power_stage import sheet_rows
-from vinetrack.planning.simulated_campaigns import FilmingPlan
+from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
 CAMERA = FilmingPlan(500.0, 1e-4)
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
@@ -59,14 +58,13 @@ def planned(
         trial = vt.planned_trial({**texts, "yield_pressure_kPa": "3", **cells}).trials[0]
         trials += [replace(trial, name=f"P{pressure}_{k}", position_systematic_m=0.0) for k in range(replicates)]
     model = vt.predictive_inputs(trials[0]).model
-    return with_trials(CampaignDesign(model, (), (), spreads, (), (), candidates), trials)
+    return with_trials(CampaignDesign(model, (), (), spreads, candidates), trials)
 
 
 def with_trials(design: CampaignDesign, added: Sequence[Trial]) -> CampaignDesign:
     """A design with these trials as well."""
-    count = len(design.trials) + len(added)
-    nothing = {"slow_error_m": (math.nan,) * count, "has_trace": (False,) * count}
-    return replace(design, trials=(*design.trials, *added), cameras=(CAMERA,) * count, **nothing)
+    trials = (*design.trials, *added)
+    return replace(design, trials=trials, cameras=(CAMERA,) * len(trials))
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +83,17 @@ def place_of(questions: MisfitTests, name: str) -> int:
 
 def test_a_noise_free_campaign_raises_no_alarm(six: MisfitTests) -> None:
     assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold
+
+
+def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed() -> None:
+    noise_m = 1e-3
+    design = replace(planned(2), cameras=(FilmingPlan(500.0, noise_m),) * 6)
+    promised = planned_tests(design)[0].fit
+    pairs = make(design.model, design.trials, design.cameras, design.spreads, np.random.default_rng(1))
+    filmed = vt.fit(design.to_fit, pairs, spreads=design.spreads, noise=(noise_m, 0.0), profile=False)
+    assert [n.sigma for n in promised.numbers] == pytest.approx([n.sigma for n in filmed.numbers], rel=0.04)
+    precisions = [fit.solution.problem.release_origin_precision for fit in (promised, filmed)]
+    assert precisions[0] == pytest.approx(precisions[1], rel=0.5)
 
 
 def test_detectable_sizes_follow_the_normal_distribution(six: MisfitTests, power: Power) -> None:
@@ -155,26 +164,22 @@ def test_the_exact_interval_of_a_rate() -> None:
     assert Rate(0, 0).interval == (0.0, 1.0)
 
 
-def answer(seed: int, verdict: str, answer_set: tuple[str, ...] = (), **more: object) -> SimulatedDiagnosis:
-    return SimulatedDiagnosis("leak", 0.5, seed, verdict, answer_set, **more)  # type: ignore[arg-type]
-
-
 def test_simulated_diagnoses_are_counted() -> None:
     answers = [
-        answer(0, "missing", ("leak",)),
-        answer(1, "ambiguous", ("supply_refill", "leak")),
-        answer(2, "missing", ("supply_refill",)),
-        answer(3, "adequate"),
-        answer(4, "", failed="FitError: none"),
+        SimulatedDiagnosis("leak", "missing", ("leak",)),
+        SimulatedDiagnosis("leak", "ambiguous", ("supply_refill", "leak")),
+        SimulatedDiagnosis("leak", "missing", ("supply_refill",)),
+        SimulatedDiagnosis("leak", "adequate"),
+        SimulatedDiagnosis("leak", failed="FitError: none"),
     ]
-    rates = rates_of(answers, 0.9)
+    rates = rates_of(answers, 0.5, 0.9)
     assert (rates.detections, rates.alarms, rates.failed) == (Rate(2, 4), Rate(3, 4), 1)
     assert rates.to_json()["rate"] == 0.5
 
 
 @pytest.mark.slow
 def test_a_simulated_campaign_is_diagnosed_with_its_effect() -> None:
-    found = simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", 0.02, 3)
+    found = simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", (0.02,), 3)
     assert found.failed == ""
     assert found.is_found
 

@@ -82,10 +82,15 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
 def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked_for: list[tuple[str, int]] = []
 
-    def answered(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedDiagnosis:  # noqa: ARG001
+    def answered(
+        design: CampaignDesign,  # noqa: ARG001
+        effect: str,
+        values: tuple[float, ...],  # noqa: ARG001
+        seed: int,
+    ) -> SimulatedDiagnosis:
         asked_for.append((effect, seed))
         verdict, names = ("missing", ("leak",)) if effect and seed % 2 else ("adequate", ())
-        return SimulatedDiagnosis(effect, value, seed, verdict, names, (), 1.0)
+        return SimulatedDiagnosis(effect, verdict, names)
 
     monkeypatch.setattr(power_stage, "simulated_diagnosis", answered)
     nothing, leak = power_of_target(PowerRequest(folder, ("leak=0.01",), simulate=3)).simulated

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -306,12 +305,10 @@ def _predict(
     options: dict[str, Any],
 ) -> None:
     """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
-    from vinetrack.pipeline.predict_stage import fit_heading, predict_conditions
+    from vinetrack.pipeline.predict_stage import predict_conditions
 
     request = _request(options, sheet=sheet)
-    heading = fit_heading(request)
-    lines = predict_conditions(request, **options)
-    print_result([*heading, *lines] if lines else [], None, None)
+    print_result(predict_conditions(request, **options), None, None)
 
 
 @with_options(
@@ -323,13 +320,9 @@ def _predict(
 def _vine(options: dict[str, Any]) -> None:
     """Find the fastest vine within limits of burst stress, diameter and length, for a choice of films."""
     from vinetrack.pipeline.design_stage import design_vine
-    from vinetrack.pipeline.predict_stage import fit_heading
 
-    json_file = options.pop("json")
-    request = _request(options)
-    heading = fit_heading(request)
-    lines, films = design_vine(request, **options)
-    print_result([*heading, *lines], {"warnings": heading, "films": films}, json_file)
+    json_file, request = options.pop("json"), _request(options)
+    print_result(*design_vine(request, **options), json_file)
 
 
 @with_options(
@@ -342,14 +335,9 @@ def _vine(options: dict[str, Any]) -> None:
 def _reservoir(options: dict[str, Any]) -> None:
     """Find the chamber that limits the loss of gauge pressure, by the gas law in absolute pressure."""
     from vinetrack.pipeline.design_stage import design_reservoir
-    from vinetrack.pipeline.predict_stage import fit_heading
 
-    json_file = options.pop("json")
-    request = _request(options)
-    heading = fit_heading(request)
-    supply_s = None if math.isnan(options["supply_s"]) else options["supply_s"]
-    lines, chambers = design_reservoir(request, **{**options, "supply_s": supply_s})
-    print_result([*heading, *lines], {"warnings": heading, "chambers": chambers}, json_file)
+    json_file, request = options.pop("json"), _request(options)
+    print_result(*design_reservoir(request, **options), json_file)
 
 
 @with_options("power")

@@ -478,17 +478,14 @@ def tests_with_conditions(
             scaled = [damping_prior(sized.diameter_m, sized.thickness_m) for sized in (trial, like)]
             B[vine] = B[like.vine] * scaled[0] / scaled[1]
         values = {DAMPING: B}
-    like_trials = [condition.like for condition in added]
     extended = replace(
         design,
         model=design.model.with_values(values),
         trials=(*design.trials, *(condition.trial for condition in added)),
         cameras=(
             *design.cameras,
-            *(replace(design.cameras[k], stops_s=math.inf, longest_s=longest_s) for k in like_trials),
+            *(replace(design.cameras[c.like], stops_s=math.inf, longest_s=longest_s) for c in added),
         ),
-        slow_error_m=(*design.slow_error_m, *(design.slow_error_m[k] for k in like_trials)),
-        has_trace=(*design.has_trace, *(design.has_trace[k] for k in like_trials)),
         candidates=candidates,
     )
     return planned_tests(extended)[0]

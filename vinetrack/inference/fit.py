@@ -604,6 +604,8 @@ def fit(
     """Fit a model to all trials of an experiment."""
     pairs, left_out = pairs_of(experiment, tracks)
     data, unusable = prepare(pairs, weighted=noise is None)
+    if noise is not None:
+        data = [replace(trial_data, noise_m=noise[0], correlation=noise[1]) for trial_data in data]
     left_out = {**left_out, **unusable}
     if not data:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())

@@ -8,26 +8,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.experiment.schema import option
+from vinetrack.core.records import Trial
+from vinetrack.core.terminal import table, waiting
+from vinetrack.dynamics.model import host_for
+from vinetrack.experiment.schema import COLUMNS, CellError, option, read_cell
+from vinetrack.figures.prediction_figures import draw_choice, draw_reservoir
 from vinetrack.pipeline.predict_stage import (
     PredictionRequest,
     check_figure,
     describe_trial,
     display_value,
     format_volume,
-    inputs_of,
-    name_missing_option,
+    planning_errors,
     read_basis,
+    speed_band,
     write_figure,
 )
-from vinetrack.results.folder_layout import ResultsError
+from vinetrack.planning.prediction import (
+    GAMMAS,
+    Choice,
+    Room,
+    chambers,
+    design_checks,
+    fastest,
+    final_m_s,
+    final_with,
+    gauge_loss,
+    supplied_chamber,
+    swept_m3,
+)
+from vinetrack.planning.predictive_inputs import PredictiveInputs, hoop_stress_Pa
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from vinetrack.core.records import Trial
-    from vinetrack.planning.prediction import Chamber, Choice, Room
-    from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 
 FILMS = "--films-um"
@@ -52,8 +65,6 @@ def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
 
 def _cell(column: str, text: str, name: str = "") -> float:
     """Read one number of a column; return it in SI."""
-    from vinetrack.experiment.schema import COLUMNS, CellError, read_cell
-
     try:
         value = read_cell(COLUMNS[column], text.strip())
     except CellError as error:
@@ -79,14 +90,8 @@ def design_vine(
     seed: int,
     at_fraction: float,
     figure: Path | None = None,
-) -> tuple[list[str], list[dict[str, Any]]]:
-    """Find the fastest vine of every film; draw the choice if requested. Returns lines, and numbers of each film."""
-    from vinetrack.core.terminal import waiting
-    from vinetrack.dynamics.simulate import SimulationError
-    from vinetrack.effects import EffectError
-    from vinetrack.inference.fit_data import FitError
-    from vinetrack.planning.prediction import Room, fastest
-
+) -> tuple[list[str], dict[str, Any]]:
+    """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
     check_figure(figure)
     basis = read_basis(request, needed=("pressure_kPa",))
     room = Room(
@@ -99,21 +104,14 @@ def design_vine(
         burst_stress_Pa=1e6 * burst_stress_MPa,
     )
     _check_films(room, films, diameter)
-    try:
-        with waiting("looking for the fastest vine"):
-            choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
-    except EffectError as error:
-        raise name_missing_option(error) from None
-    except (SimulationError, FitError) as error:
-        raise ResultsError(str(error)) from None
+    with planning_errors(), waiting("looking for the fastest vine"):
+        choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     _refuse_standstill(room, choices)
-    lines = list(_vine_lines(room, choices))
+    lines = [*basis.heading, *_vine_lines(room, choices)]
     if figure is not None:
-        from vinetrack.figures.prediction_figures import draw_choice
-
         write_figure(draw_choice(choices), figure)
         lines.append(f"Figure: {figure}")
-    return lines, [_choice_entry(choice) for choice in choices]
+    return lines, {"warnings": basis.heading, "films": [_choice_entry(choice) for choice in choices]}
 
 
 def _choice_entry(choice: Choice) -> dict[str, Any]:
@@ -161,10 +159,6 @@ def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
 
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
-    from vinetrack.core.terminal import table
-    from vinetrack.planning.prediction import design_checks
-    from vinetrack.planning.predictive_inputs import hoop_stress_Pa
-
     best = choices[0].prediction
     yield (
         f"fastest by {best.final.name}"
@@ -198,11 +192,7 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
             f"{choices[0].odds:.0%} of the draws; measuring B and P_y of the first two films would decide it"
         )
     yield f"uncertainty budget of the fastest, {describe_trial(best.inputs.trial)}: final speed by each input alone"
-    rows_of = [
-        (f"  {share.name}", f"{display_value(share.low, 'm/s')} to {display_value(share.high, 'm/s')} m/s", share.words)
-        for share in best.shares
-    ]
-    yield from table(rows_of)
+    yield from table([(f"  {share.name}", speed_band(share), share.words) for share in best.shares])
     yield "  not included: the burst stress, a guess from one vine, and effects not in the model (`vinetrack predict`)"
     yield from (f"! {warning}" for warning in design_checks(best))
 
@@ -211,31 +201,24 @@ def design_reservoir(
     request: PredictionRequest,
     *,
     within_percent: float,
-    supply_s: float | None,
+    supply_s: float,
     at_fraction: float,
     figure: Path | None = None,
-) -> tuple[list[str], list[dict[str, Any]]]:
+) -> tuple[list[str], dict[str, Any]]:
     """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested. Speeds are
-    predicted if the wall thickness is given. Returns lines, and numbers of each chamber.
+    predicted if the wall thickness is given. Returns lines, and JSON content.
     """
-    from vinetrack.core.terminal import waiting
-    from vinetrack.effects import EffectError
-    from vinetrack.planning.prediction import chambers
-
     required_for_reservoir = ("diameter_mm", "length_mm", "pressure_kPa")
     check_figure(figure)
     basis = read_basis(request, needed=required_for_reservoir)
     trial = basis.planned.trials[0]
-    inputs = inputs_of(basis)[0] if math.isfinite(trial.thickness_m) else None
     loss = within_percent / 100
-    try:
-        with waiting("simulating"):
-            lines = [*_reservoir_lines(trial, inputs, loss, at_fraction)]
-            if supply_s is not None and inputs is not None:
-                lines += _supplied_lines(inputs, loss, supply_s)
-    except EffectError as error:
-        raise name_missing_option(error) from None
-    if supply_s is not None and inputs is None:
+    with planning_errors(), waiting("simulating"):
+        inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
+        lines = [*basis.heading, *_reservoir_lines(trial, inputs, loss, at_fraction)]
+        if math.isfinite(supply_s) and inputs is not None:
+            lines += _supplied_lines(inputs, loss, supply_s)
+    if math.isfinite(supply_s) and inputs is None:
         lines.append("! --supply-s needs --thickness-um: how fast the vine takes up gas depends on its wall")
     if figure is not None:
         write_figure(_reservoir_picture(trial, loss), figure)
@@ -244,13 +227,10 @@ def design_reservoir(
         {"chamber": chamber.name, "volume_l": 1e3 * chamber.volume_m3, "loss_of_gauge_pressure": chamber.losses}
         for chamber in chambers(trial, loss)
     ]
-    return lines, entries
+    return lines, {"warnings": basis.heading, "chambers": entries}
 
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
-    from vinetrack.core.terminal import table
-    from vinetrack.planning.prediction import GAMMAS, chambers, swept_m3
-
     description = (
         describe_trial(trial)
         if inputs is not None
@@ -259,43 +239,25 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     yield f"{description}: it sweeps {format_volume(swept_m3(trial))}"
     yield f"closed chamber that keeps the gauge pressure within {100 * loss:g} %, by the gas law in absolute pressure"
     yield ""
-    listed = chambers(trial, loss)
-    rows = [_row(chamber, inputs, at_fraction) for chamber in listed]
     laws = [law.split(",")[0] for law in GAMMAS]
-    speeds = [f"speed, {law}" for law in laws] if inputs is not None else []
+    rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
+    for chamber in chambers(trial, loss):
+        cells = [chamber.name, format_volume(chamber.volume_m3)]
+        cells += [f"{100 * share:.1f}" for share in chamber.losses.values()]
+        if inputs is not None:
+            finals = [final_with(inputs, chamber.volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
+            cells += [display_value(final, "m/s") for final in finals]
+        rows.append(cells)
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
     yield from table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
     if inputs is not None:
-        steady = _final(inputs, math.inf, 1.0, at_fraction)
+        steady = final_m_s(inputs, inputs.model, host_for(inputs.model), at_fraction)
         place = "" if trial.payload_kg > 0 else f" at y/L = {at_fraction:g}"
         yield f"speed: final speed at the medians{place}; {display_value(steady, 'm/s')} m/s at constant pressure"
     yield "slow: γ = 1, isothermal; fast: γ = 1.4, adiabatic, as within milliseconds"
 
 
-def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
-    from vinetrack.planning.prediction import GAMMAS
-
-    losses = [f"{100 * share:.1f}" for share in chamber.losses.values()]
-    speeds = (
-        []
-        if inputs is None
-        else [display_value(_final(inputs, chamber.volume_m3, gamma, at_fraction), "m/s") for gamma in GAMMAS.values()]
-    )
-    return chamber.name, format_volume(chamber.volume_m3), *losses, *speeds
-
-
-def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
-    from vinetrack.dynamics.model import host_for
-    from vinetrack.planning.prediction import final_m_s, final_with
-
-    if math.isinf(volume_m3):
-        return final_m_s(inputs, inputs.model, host_for(inputs.model), at_fraction)
-    return final_with(inputs, volume_m3, gamma, at_fraction)
-
-
 def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
-    from vinetrack.planning.prediction import GAMMAS, supplied_chamber
-
     volumes = {law.split(",")[0]: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
     needed = ", ".join(f"{format_volume(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
     return [f"with a supply that refills the chamber in {1e3 * supply_s:g} ms, at the medians: {needed}"]
@@ -303,9 +265,6 @@ def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> l
 
 def _reservoir_picture(trial: Trial, loss: float) -> Figure:
     import numpy as np
-
-    from vinetrack.figures.prediction_figures import draw_reservoir
-    from vinetrack.planning.prediction import GAMMAS, chambers, gauge_loss, swept_m3
 
     swept, pressure_Pa, ambient_Pa = swept_m3(trial), trial.pressure_Pa, trial.ambient_pressure_Pa
     volumes = swept * np.geomspace(3.0, 300.0, 200)

@@ -20,7 +20,6 @@ def describe_effects(name: str | None, experiment: Path | None, figure: Path | N
     from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
     from vinetrack.effects import catalogue, explanation, find_effect, listing
     from vinetrack.figures.prediction_figures import draw_effect
-    from vinetrack.pipeline.predict_stage import check_figure, write_figure
 
     user_effects = {} if experiment is None else effects_of(experiment)
     if name is None:
@@ -34,6 +33,8 @@ def describe_effects(name: str | None, experiment: Path | None, figure: Path | N
     effect = find_effect(name, user_effects)
     lines = explanation(effect)
     if figure is not None:
+        from vinetrack.pipeline.predict_stage import check_figure, write_figure
+
         check_figure(figure)
         shown = effect.name, size_words(effect), reference_words(effect), effect_motion(effect)
         write_figure(draw_effect(*shown), figure)

@@ -4,26 +4,49 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
+from vinetrack.core.records import Trial
 from vinetrack.core.tables import STANDARD_OUTPUT, write_bytes, write_csv, write_json
+from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.experiment.schema import option
-from vinetrack.experiment.sheet import PlannedTrials, planned_sheet, planned_trial
+from vinetrack.experiment.settings import ExperimentSettings
+from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
+from vinetrack.figures.prediction_figures import PredictionPicture, draw_predictions
+from vinetrack.figures.style import render
+from vinetrack.inference.fit_data import FitError
+from vinetrack.pipeline.effects_stage import effects_of
+from vinetrack.planning.prediction import (
+    TIME,
+    Contribution,
+    Neglected,
+    Quantity,
+    VinePrediction,
+    design_checks,
+    neglected,
+    predict_vine,
+)
+from vinetrack.planning.predictive_inputs import (
+    FitNumbers,
+    Input,
+    PredictiveInputs,
+    StatedValues,
+    fit_numbers,
+    predictive_inputs,
+    read_sizes,
+)
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from vinetrack.core.records import Trial
-    from vinetrack.effects import Effect
-    from vinetrack.figures.prediction_figures import PredictionPicture
-    from vinetrack.planning.prediction import Neglected, Quantity, VinePrediction
-    from vinetrack.planning.predictive_inputs import FitNumbers, Input, PredictiveInputs, StatedValues
 
 
 # ------------------------------------------------------------------------------
@@ -72,9 +95,6 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
 # Inputs of the commands about new vines: options or a sheet, a fit, effects; and formatting of their output.
 
 
-NEVER = "never"
-
-
 @dataclass(frozen=True)
 class PredictionRequest:
     """Options of a command about new vines; NaN and None for those not given. `cells` are texts by column of the sheet,
@@ -95,33 +115,36 @@ class PredictionRequest:
 
 @dataclass(frozen=True)
 class PredictionBasis:
-    """What predictive inputs are made from: planned trials, stated values, and a fit if there is one."""
+    """What predictive inputs are made from: planned trials, stated values, and a fit if there is one; `heading` stands
+    over everything predicted from it.
+    """
 
     planned: PlannedTrials
     stated: StatedValues
     fit: FitNumbers | None
+    heading: tuple[str, ...]
+
+    @property
+    def inputs(self) -> list[PredictiveInputs]:
+        """The predictive inputs of every trial."""
+        return [predictive_inputs(trial, self.stated, self.fit) for trial in self.planned.trials]
 
 
-def read_basis(request: PredictionRequest, needed: Sequence[str] | None = None) -> PredictionBasis:
+def read_basis(request: PredictionRequest, needed: Sequence[str] = REQUIRED_FOR_PREDICTION) -> PredictionBasis:
     """Read the sheet or the options, the fit, and the requested effects."""
-    from vinetrack.experiment.settings import ExperimentSettings
-    from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION
-    from vinetrack.planning.predictive_inputs import StatedValues, read_sizes
-
-    if request.sheet is not None:
+    chosen = None if request.results is None else choose_fit(request.results, request.anyway)
+    if request.sheet is None:
+        planned = planned_trial(request.cells, ExperimentSettings(), needed)
+    else:
         planned = planned_sheet(request.sheet)
         _refuse_options_with_sheet(request)
-    else:
-        planned = planned_trial(
-            request.cells, ExperimentSettings(), REQUIRED_FOR_PREDICTION if needed is None else needed
-        )
     if request.tail_slack is not None:
-        planned = replace(
-            planned, trials=tuple(replace(trial, tail_slack=request.tail_slack) for trial in planned.trials)
-        )
-    fit, user_effects = (
-        (None, _effects_of_sheet(planned)) if request.results is None else _read_fit(request.results, request.anyway)
-    )
+        trials = tuple(replace(trial, tail_slack=request.tail_slack) for trial in planned.trials)
+        planned = replace(planned, trials=trials)
+    if request.results is None or chosen is None:
+        fit, user_effects = None, effects_of_plan(planned)
+    else:
+        fit, user_effects = _read_fit(request.results, chosen)
     sizes = [read_sizes(text, user_effects) for text in request.effects]
     stated = StatedValues(
         B=request.B,
@@ -133,48 +156,31 @@ def read_basis(request: PredictionRequest, needed: Sequence[str] | None = None) 
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
         user_effects=user_effects,
     )
-    return PredictionBasis(planned, stated, fit)
+    return PredictionBasis(planned, stated, fit, () if chosen is None else chosen.heading)
 
 
 def _refuse_options_with_sheet(request: PredictionRequest) -> None:
+    message, remedy = "is given in addition to a sheet", "write it in the sheet"
     problems = [
-        Problem(
-            message="is given in addition to a sheet", column=option(name), value=text, remedy="write it in the sheet"
-        )
-        for name, text in request.cells.items()
+        Problem(message=message, column=option(name), value=text, remedy=remedy) for name, text in request.cells.items()
     ]
     if problems:
         raise ExperimentError(problems)
 
 
-def _effects_of_sheet(planned: PlannedTrials) -> Mapping[str, Effect]:
-    """Return the user's own effects of the experiment to which the sheet belongs."""
-    from vinetrack.pipeline.effects_stage import effects_of
-
+def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
+    """Return the user's own effects of the experiment to which a sheet belongs."""
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def fit_heading(request: PredictionRequest) -> list[str]:
-    """Return the heading for everything predicted from a fit: the verdict on its model."""
-    return [] if request.results is None else list(choose_fit(request.results, request.anyway).heading)
-
-
-def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Effect]]:
-    """Read the fit of a results folder, and the user's own effects if its model contains any."""
-    from vinetrack.effects import catalogue
-    from vinetrack.inference.fit_data import FitError
-    from vinetrack.pipeline.effects_stage import effects_of
-    from vinetrack.planning.predictive_inputs import fit_numbers
-
-    paths = Results(results)
-    try:
-        fit = fit_numbers(choose_fit(results, anyway).content, results.as_posix())
-    except FitError as error:
-        raise ResultsError(str(error)) from None
+def _read_fit(results: Path, chosen: ChosenFit) -> tuple[FitNumbers, Mapping[str, Effect]]:
+    """Read a fit of a results folder, and the user's own effects if its model contains any."""
+    with planning_errors():
+        fit = fit_numbers(chosen.content, results.as_posix())
     own_names = [name for name in fit.model if name not in catalogue()]
     if not own_names:
         return fit, {}
-    experiment = Path(str(read_json(paths.provenance).get("experiment", "")))
+    experiment = Path(str(read_json(Results(results).provenance).get("experiment", "")))
     user_effects = effects_of(experiment) if experiment.is_dir() else {}
     if not set(own_names) <= set(user_effects):
         raise ResultsError(
@@ -184,30 +190,21 @@ def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Eff
     return fit, user_effects
 
 
-def inputs_of(basis: PredictionBasis) -> list[PredictiveInputs]:
-    """Return the predictive inputs of every trial."""
-    from vinetrack.inference.fit_data import FitError
-    from vinetrack.planning.predictive_inputs import predictive_inputs
-
+@contextmanager
+def planning_errors() -> Iterator[None]:
+    """Turn errors of a prediction into those a user reads: a missing input of an effect is named as an option."""
     try:
-        return [predictive_inputs(trial, basis.stated, basis.fit) for trial in basis.planned.trials]
+        yield
+    except EffectError as error:
+        if not error.column:
+            raise
+        message, remedy = f"is blank, and the effect {error.effect} needs it", f"give it as {option(error.column)}"
+        problem = Problem(message=message, column=error.column, remedy=f"{remedy} or in the sheet")
+        raise ExperimentError([problem]) from None
+    except SimulationError as error:
+        raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
     except FitError as error:
         raise ResultsError(str(error)) from None
-
-
-def name_missing_option(error: Exception) -> Exception:
-    """Convert an error about a missing input of an effect to one that names the option; return others unchanged."""
-    from vinetrack.effects import EffectError
-
-    if not isinstance(error, EffectError) or not error.column:
-        return error
-    message, remedy = f"is blank, and the effect {error.effect} needs it", f"give it as {option(error.column)}"
-    return ExperimentError([Problem(message=message, column=error.column, remedy=f"{remedy} or in the sheet")])
-
-
-def warnings_of(basis: PredictionBasis) -> list[str]:
-    """Return warnings about values of the sheet or the options that are allowed but implausible."""
-    return format_problems(basis.planned.problems)
 
 
 def format_volume(volume_m3: float) -> str:
@@ -230,33 +227,23 @@ def describe_trial(trial: Trial) -> str:
 def display_value(value: float, unit: str, digits: int = 3) -> str:
     """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
     if math.isinf(value):
-        return NEVER
+        return "never"
     return number(value * display_unit(unit, PREDICTION_UNITS)[1], digits)
-
-
-def display_unit_name(unit: str) -> str:
-    """Return the unit that `display_value` uses."""
-    return display_unit(unit, PREDICTION_UNITS)[0]
 
 
 def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
     """Return rows of a table of inputs: symbol, median, 90 % band, unit, origin; constants of nature are left out."""
     rows = []
     for entry in inputs:
-        if entry.origin == "constant":
-            continue
-        exact = entry.low == entry.high
-        band = "–" if exact else f"{display_value(entry.low, entry.unit)} to {display_value(entry.high, entry.unit)}"
-        rows.append(
-            (entry.symbol, display_value(entry.median, entry.unit), band, display_unit_name(entry.unit), entry.origin)
-        )
+        if entry.origin != "constant":
+            low, median, high = (display_value(value, entry.unit) for value in (entry.low, entry.median, entry.high))
+            band = "–" if entry.low == entry.high else f"{low} to {high}"
+            rows.append((entry.symbol, median, band, display_unit(entry.unit, PREDICTION_UNITS)[0], entry.origin))
     return rows
 
 
 def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
     """Write a figure in the format that the suffix names."""
-    from vinetrack.figures.style import render
-
     check_figure(path)
     form = path.suffix.lower().removeprefix(".")
     write_bytes(path, render(fig, [form], dpi)[form])
@@ -294,12 +281,14 @@ def predict_conditions(
 
     check_figure(figure)
     basis = read_basis(request)
-    entries = _predict_all(basis, samples, seed, at_fraction)
-    lines = [*_condition_lines(entries[0])] if len(entries) == 1 else [*_table_lines(entries)]
-    lines += [f"! {warning}" for warning in warnings_of(basis)]
+    entries = []
+    with planning_errors():
+        for inputs in progress(basis.inputs, "predicting", unit="condition"):
+            prediction = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
+            entries.append(ConditionPrediction(prediction, design_checks(prediction), neglected(inputs, at_fraction)))
+    lines = [*basis.heading, *(_condition_lines(entries[0]) if len(entries) == 1 else _table_lines(entries))]
+    lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
-        from vinetrack.figures.prediction_figures import draw_predictions
-
         write_figure(draw_predictions([_picture(entry.prediction) for entry in entries], at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
@@ -311,29 +300,8 @@ def predict_conditions(
     return [] if json == STANDARD_OUTPUT else lines
 
 
-def _predict_all(basis: PredictionBasis, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
-    """Predict every condition."""
-    from vinetrack.core.terminal import progress
-    from vinetrack.dynamics.simulate import SimulationError
-    from vinetrack.effects import EffectError
-    from vinetrack.planning.prediction import design_checks, neglected, predict_vine
-
-    entries = []
-    try:
-        for inputs in progress(inputs_of(basis), "predicting", unit="condition"):
-            prediction = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
-            entries.append(ConditionPrediction(prediction, design_checks(prediction), neglected(inputs, at_fraction)))
-    except SimulationError as error:
-        raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
-    except EffectError as error:
-        raise name_missing_option(error) from None
-    return entries
-
-
 def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
     """Yield all lines about a single condition."""
-    from vinetrack.core.terminal import table
-
     prediction = entry.prediction
     inputs = prediction.inputs
     yield f"{describe_trial(inputs.trial)}; {' + '.join(inputs.model.names)}"
@@ -344,7 +312,7 @@ def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
     yield from table(rows, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
-    yield from table([_share_row(share.name, share.low, share.high, share.words) for share in prediction.shares], head)
+    yield from table([(share.name, speed_band(share), share.words) for share in prediction.shares], head)
     yield from _left_out(entry)
     yield ""
     yield from (f"! {warning}" for warning in entry.hazards)
@@ -360,19 +328,18 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
     elif unit == "N" and max(abs(value) for value in values) < 0.01:
         texts, unit = [number(1e3 * value) for value in values], "mN"
     else:
-        texts, unit = [display_value(value, unit) for value in values], display_unit_name(unit)
+        texts, unit = [display_value(value, unit) for value in values], display_unit(unit, PREDICTION_UNITS)[0]
     no_band = quantity.low == quantity.high or math.isnan(quantity.median)
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
 
-def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str, str]:
-    return name, f"{display_value(low, 'm/s')} to {display_value(high, 'm/s')} m/s", words
+def speed_band(share: Contribution) -> str:
+    """Return the 90 % band of the final speed with one uncertain input, in words."""
+    return f"{display_value(share.low, 'm/s')} to {display_value(share.high, 'm/s')} m/s"
 
 
 def _left_out(entry: ConditionPrediction) -> Iterator[str]:
     """Yield a table of neglected effects that every vine has, with their influence on the final speed."""
-    from vinetrack.core.terminal import table
-
     # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
     rows = [
         (
@@ -391,9 +358,6 @@ def _left_out(entry: ConditionPrediction) -> Iterator[str]:
 
 def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
     """Yield a table with one row per condition."""
-    from vinetrack.core.terminal import table
-    from vinetrack.planning.prediction import TIME
-
     first = entries[0].prediction
     yield f"{' + '.join(first.inputs.model.names)}; medians and 90 % bands of {first.samples} draws"
     rows = [
@@ -421,8 +385,6 @@ def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
 
 
 def _picture(prediction: VinePrediction) -> PredictionPicture:
-    from vinetrack.figures.prediction_figures import PredictionPicture
-
     return PredictionPicture(
         title=describe_trial(prediction.inputs.trial),
         curve=prediction.curve,

@@ -22,7 +22,6 @@ from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, so
 from vinetrack.inference.sensitivity import Predictor, align, initial_trial_effects
 from vinetrack.inference.solving import log_likelihood
 from vinetrack.planning.discriminating_design import Condition, Hypothesis, TrackSampling, film_trials
-from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.tracks.position_noise import ar1_noise
 
 FEWEST_GROWTH_FRAMES = 12  # Frames of growth below which a trial is not worth filming (chosen)
@@ -30,8 +29,10 @@ FEWEST_GROWTH_FRAMES = 12  # Frames of growth below which a trial is not worth f
 
 @dataclass(frozen=True)
 class FilmingPlan:
-    """How a campaign is filmed: frames per second, noise of a position, m, and its lag-one correlation. A recording
-    ends with the growth, at twice `longest_s` where the growth does not end, and at the latest `stops_s` after release.
+    """How a trial is filmed: frames per second, noise of a position, m, and its lag-one correlation. A recording ends
+    with the growth, at twice `longest_s` where the growth does not end, and at the latest `stops_s` after release.
+    `slow_error_m` is the slow error that its tracker states, NaN for positions measured elsewhere; `has_trace` says
+    whether its pressure is measured.
     """
 
     capture_fps: float
@@ -39,12 +40,8 @@ class FilmingPlan:
     noise_correlation: float = 0.0
     longest_s: float = 4.0
     stops_s: float = math.inf
-
-
-def joint_model(vine_inputs: Sequence[PredictiveInputs]) -> Model:
-    """Return one model with the median B of each vine and everything else shared."""
-    B = {inputs.trial.vine: inputs.medians[DAMPING] for inputs in vine_inputs}
-    return vine_inputs[0].model.with_values({DAMPING: B})
+    slow_error_m: float = math.nan
+    has_trace: bool = False
 
 
 def make(
@@ -59,12 +56,7 @@ def make(
     positions have no systematic error unless the sheet states one.
     """
     rest_frames = 20  # Frames at rest before release (chosen)
-    trials = [
-        trial if math.isfinite(trial.position_systematic_m) else replace(trial, position_systematic_m=0.0)
-        for trial in trials
-    ]
     count = len(trials)
-    frames_s = np.array([1 / camera.capture_fps for camera in cameras])
     pressure_factors = 1 + spreads[0] * draw.standard_normal(count)
     misread = {vine: draw.standard_normal() for vine in dict.fromkeys(trial.vine for trial in trials)}
     true_trials = [
@@ -77,25 +69,29 @@ def make(
     ]
     theta = np.array([model.parameters_of(trial) for trial in trials])
     theta[:, model.parameter_names.index(DAMPING)] *= np.exp(spreads[1] * draw.standard_normal(count))
-    longest_s = [2 * camera.longest_s for camera in cameras]
-    ends = simulate_many(model, true_trials, [np.array([0.0, s]) for s in longest_s], parameters=theta, host=host)
-    stop_s = [
-        min(end.end_time_s if end.status == "ended" else longest, camera.stops_s)
-        for end, longest, camera in zip(ends, longest_s, cameras, strict=True)
-    ]
-    release = (rest_frames - draw.uniform(size=count)) * frames_s
-    counts = [rest_frames + int(end * camera.capture_fps) for end, camera in zip(stop_s, cameras, strict=True)]
-    times: list[Floats] = [
-        np.arange(frames, dtype=float) * frame_s for frames, frame_s in zip(counts, frames_s, strict=True)
-    ]
-    since_release = [time_s - begin for time_s, begin in zip(times, release.tolist(), strict=True)]
+    until_longest = [np.array([0.0, 2 * camera.longest_s]) for camera in cameras]
+    ends = simulate_many(model, true_trials, until_longest, parameters=theta, host=host)
+    release_frames = rest_frames - draw.uniform(size=count)
+    times, since_release = [], []
+    for end, camera, release in zip(ends, cameras, release_frames.tolist(), strict=True):
+        stop_s = min(end.end_time_s if end.status == "ended" else 2 * camera.longest_s, camera.stops_s)
+        times.append(np.arange(rest_frames + int(stop_s * camera.capture_fps)) / camera.capture_fps)
+        since_release.append(times[-1] - release / camera.capture_fps)
     moved = simulate_many(model, true_trials, since_release, parameters=theta, host=host)
-    tracks = []
-    for time_s, trajectory, camera in zip(times, moved, cameras, strict=True):
+    pairs = []
+    for trial, time_s, trajectory, camera in zip(trials, times, moved, cameras, strict=True):
         noise_m = ar1_noise(time_s.size, camera.noise_m, camera.noise_correlation, draw)
-        origin_m = draw.uniform(-0.05, 0.05)
-        tracks.append(plain_track(time_s, trajectory.observed_position_m + noise_m + origin_m))
-    return list(zip(trials, tracks, strict=True))
+        position_m = trajectory.observed_position_m + noise_m + draw.uniform(-0.05, 0.05)
+        pressure_Pa = np.full(time_s.size, trial.pressure_Pa) if camera.has_trace else None
+        track = plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
+        systematic_m = trial.position_systematic_m if math.isfinite(trial.position_systematic_m) else 0.0
+        pairs.append(
+            (
+                replace(trial, position_systematic_m=systematic_m),
+                replace(track, lead_position_systematic_m=np.full(time_s.size, camera.slow_error_m)),
+            )
+        )
+    return pairs
 
 
 # ------------------------------------------------------------------------------
