@@ -28,7 +28,7 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import GroundTruth, campaign, damping_values, grow, isometric_vine
-from vinetrack.planning.prediction import run
+from vinetrack.planning.prediction import drawn_final_speeds
 from vinetrack.planning.predictive_inputs import numbers_of, predictive_inputs
 
 DAMPING_SCATTER, PRESSURE_SCATTER = 0.03, 0.01
@@ -78,8 +78,7 @@ def measure(seed: int) -> list[dict[str, object]]:
         inputs = predictive_inputs(
             replace(trial, yield_pressure_Pa=np.nan, yield_pressure_sigma_Pa=np.nan), None, numbers
         )
-        runs = run(inputs, np.array([0.95 * trial.length_m]), SAMPLES, seed, with_tension=False)
-        speeds = 2 * runs.end_lead_velocity_m_s if trial.payload_kg > 0 else runs.lead_velocity_m_s[:, 0]
+        speeds = drawn_final_speeds(inputs, 0.95, SAMPLES, seed)
         low, median, high = np.quantile(speeds, (0.05, 0.5, 0.95))
         truth = made(trial, nature, grown[0].true.yield_pressure_Pa, np.random.default_rng([seed, 5, k]))
         rows.append(

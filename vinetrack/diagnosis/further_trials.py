@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from scipy.special import ndtr
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
-from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shape_index
+from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials, Power
 from vinetrack.diagnosis.remarks import Remark, remark
@@ -33,7 +33,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, Fit
-from vinetrack.inference.sensitivity import Predictor
+from vinetrack.inference.trial_effects import subset_predictor, subset_problem, subset_state
 from vinetrack.planning.discriminating_design import (
     NEW_VINE,
     OTHER_RIG,
@@ -42,6 +42,7 @@ from vinetrack.planning.discriminating_design import (
     RefitTerms,
     best_design,
     best_new_vines,
+    conditions_by_effort,
     extend,
     feasible_conditions,
     growth_courses,
@@ -63,12 +64,8 @@ from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES, DesignP
 # parameters and all noise drawn anew. Where no trials help, or only measurements are in question, the advice is what to
 # measure instead.
 
-__all__ = ["Limits", "NextExperiment", "next_experiment"]
-
-
 # Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended (chosen)
 SUFFICIENT_SEPARATION = 8.0
-
 
 NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
 
@@ -145,7 +142,10 @@ class _Option:
 def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: int = 0) -> NextExperiment:
     """Recommend trials that separate hypotheses which fit the same trials equally well."""
     limits = limits or Limits()
-    _check_fits(tied)
+    if len(tied) < 2:
+        raise FitError("A next experiment needs at least two hypotheses to separate: give at least two fits.")
+    if len({tuple(trial_data.trial.name for trial_data in fit.predictor.data) for fit in tied}) > 1:
+        raise FitError("The fits to separate are not of the same trials: fit all hypotheses to the same trials.")
     # 5: most hypotheses that a design separates (chosen)
     tied = list(tied)[:5]
     names = _hypothesis_names(tied)
@@ -158,16 +158,6 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     if not options:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
     return _recommendation(bench, options, seed)
-
-
-def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]]:
-    """Return the effects that only the first model has, and those that only the second has. Returns only_first,
-    only_second : list of Effect.
-    """
-    return (
-        [effect for effect in first.model if effect.name not in second.model],
-        [effect for effect in second.model if effect.name not in first.model],
-    )
 
 
 def _only_measurement(tied: Sequence[Fit]) -> bool:
@@ -184,7 +174,11 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
     trace_decides = False
     effects: dict[str, Effect] = {}
     for pair in pairs:
-        only_first, only_second = effects_between(*pair)
+        models = [fit.model for fit in pair]
+        only_first, only_second = (
+            [effect for effect in model if effect.name not in other.names]
+            for model, other in zip(models, reversed(models), strict=True)
+        )
         trace_decides |= any(e.in_trace for e in only_first) != any(e.in_trace for e in only_second)
         effects.update({effect.name: effect for effect in [*only_first, *only_second]})
     measured = [effect for effect in effects.values() if effect.kind == "measurement"]
@@ -192,14 +186,6 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
         return Remark()
     facts = {"trace_decides": trace_decides, "effects": measured or list(effects.values())}
     return Remark("deciding_measurements", {**facts, "faults_only": bool(measured)})
-
-
-def _check_fits(tied: Sequence[Fit]) -> None:
-    if len(tied) < 2:
-        raise FitError("A next experiment needs at least two hypotheses to separate: give at least two fits.")
-    names = [[trial_data.trial.name for trial_data in fit.predictor.data] for fit in tied]
-    if any(others != names[0] for others in names[1:]):
-        raise FitError("The fits to separate are not of the same trials: fit all hypotheses to the same trials.")
 
 
 def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
@@ -242,7 +228,12 @@ def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed
     """
     options: list[_Option] = []
     before = -math.inf
-    for allowed in _conditions_by_effort(bench, terms, limits.trials):
+
+    def best_vines(places: NDArray[np.intp]) -> list[str]:
+        # 2: new vines that are tried, at most (chosen)
+        return best_new_vines(terms, bench.conditions, places, limits.trials, 2 if len(terms) == 2 else 1)
+
+    for _, allowed in conditions_by_effort(bench.conditions, best_vines):
         if any(option.weakest >= SUFFICIENT_SEPARATION for option in options[:-1]):
             break
         design, predicted = best_design(terms, allowed, limits.trials)
@@ -254,21 +245,6 @@ def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed
     return options
 
 
-def _conditions_by_effort(bench: DesignProblem, terms: list[RefitTerms], trials: int) -> Iterator[NDArray[np.int_]]:
-    """Conditions to choose from: with the rig so far, with another rig as well, and with one new vine as well."""
-    efforts = np.array([condition.effort for condition in bench.conditions])
-    for effort in (SAME_RIG, OTHER_RIG):
-        if (efforts == effort).any():
-            yield np.flatnonzero(efforts <= effort)
-    new = np.flatnonzero(efforts == NEW_VINE)
-    if new.size:
-        vines = np.array([condition.trial.vine for condition in bench.conditions])
-        # 2: new vines that are tried, at most (chosen)
-        most = 2 if len(terms) == 2 else 1
-        for vine in best_new_vines(terms, bench.conditions, new, trials, most):
-            yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
-
-
 def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
     """The smaller separation of the two directions, by pair."""
     return {
@@ -277,17 +253,11 @@ def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
     }
 
 
-def _recommended(options: Sequence[_Option]) -> _Option:
-    """The option of least effort that is sufficient, else the best."""
-    for option in options:
-        if option.weakest >= SUFFICIENT_SEPARATION:
-            return option
-    return max(options, key=lambda option: option.worth)
-
-
 def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    best = _recommended(options)
+    # The option of least effort that is sufficient, else the best.
+    sufficient = (option for option in options if option.weakest >= SUFFICIENT_SEPARATION)
+    best = next(sufficient, None) or max(options, key=lambda option: option.worth)
     best = _Option(best.design, np.concatenate([best.rises, simulated_rises(bench, best.design, [1], seed)]))
     names = [hypothesis.name for hypothesis in bench.hypotheses]
     expected_sigma = _by_pair(best.separations)
@@ -365,22 +335,20 @@ def _pair_name(names: Sequence[str], pair: tuple[int, int]) -> str:
 
 def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
     """Return the trials of a design as entries of `next_experiment`, one for each condition."""
-    return tuple(
-        _entry(every[index], int(count))
-        for index, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
-    )
-
-
-def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
-    trial = condition.trial
-    settings = {name: COLUMNS[name].of_trial(trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
-    return {
-        **{name: float(f"{value:.6g}") for name, value in settings.items()},
-        "replicates": replicates,
-        "vine": trial.vine,
-        "new_vine": condition.effort == NEW_VINE,
-        "changed": list(condition.changed),
-    }
+    entries = []
+    for index, replicates in zip(*np.unique(np.array(design), return_counts=True), strict=True):
+        condition = every[index]
+        cells = {name: COLUMNS[name].of_trial(condition.trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
+        entries.append(
+            {
+                **{name: float(f"{value:.6g}") for name, value in cells.items()},
+                "replicates": int(replicates),
+                "vine": condition.trial.vine,
+                "new_vine": condition.effort == NEW_VINE,
+                "changed": list(condition.changed),
+            }
+        )
+    return tuple(entries)
 
 
 # ------------------------------------------------------------------------------
@@ -399,20 +367,17 @@ REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
 UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
 
-
 Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products, shape
 
 
 class DesignInformation:
     """Information of designs about the sizes of some effects with everything else free. `conditions` are those that can
-    be filmed; `efforts` and `vines`, shape (n_conditions,), are theirs; `each`, shape (n_conditions, n, n), is what a
-    group of `REPLICATES` trials of each adds, the effects last.
+    be filmed; `each`, shape (n_conditions, n, n), is what `REPLICATES` trials of each add, the effects last.
     """
 
     def __init__(self, design: CampaignDesign, every: Sequence[Condition], effects: Sequence[str]) -> None:
         tests = tests_with_conditions(design, every, tuple(effects))
-        shapes = {name: typical_shape_index(tests, name) for name in effects if name in tests.sensitivities.effects}
-        indices = {name: index for name, index in shapes.items() if index is not None}
+        indices = {name: shapes[-1] for name in effects if (shapes := typical_shapes(tests, name))}
         self.effects = list(indices)
         names = [trial.name for trial in tests.fit.trials]
         moving = [trial_data.time_s.size - trial_data.n_rest for trial_data in tests.fit.predictor.data]
@@ -423,8 +388,6 @@ class DesignInformation:
         self.each = REPLICATES * blocks[[filmed[condition.trial.name] for condition in self.conditions]]
         done = [k for k, name in enumerate(names) if name in before]
         self.so_far = _prior_precision(tests, len(self.effects)) + blocks[done].sum(axis=0)
-        self.efforts = np.array([condition.effort for condition in self.conditions])
-        self.vines = np.array([condition.trial.vine for condition in self.conditions])
 
     def total(self, chosen: Sequence[int]) -> Floats:
         """Cross products of the trials so far and of a design. Shape (n, n)."""
@@ -460,7 +423,7 @@ class DesignInformation:
 
 
 def tests_with_conditions(
-    design: CampaignDesign, added: Sequence[Condition], candidates: tuple[str, ...] | None
+    design: CampaignDesign, added: Sequence[Condition], candidates: Sequence[str] | None
 ) -> MisfitTests:
     """Misfit tests of a noise-free design with one trial of each condition added."""
     longest_s = max(camera.longest_s for camera in design.cameras)
@@ -520,37 +483,20 @@ def _prior_precision(tests: MisfitTests, n_effects: int) -> Floats:
 
 def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:
     """The same tests for some of the trials, which may be repeated."""
-    where = list(indices)
-    fit, problem, state = tests.fit, tests.fit.solution.problem, tests.fit.state
-    layout = tests.fit.predictor.layout
-    predictor = Predictor(
-        replace(layout, index=layout.index[where], base=layout.base[where]),
-        [fit.predictor.data[k] for k in where],
-        fit.predictor.host,
-    )
-    predictor.steps = fit.predictor.steps.copy()
-    predictor.pressure_step = fit.predictor.pressure_step[where]
-    problem = replace(
-        problem,
-        index=problem.index[where],
-        has_deviation=problem.has_deviation[where],
-        gauge_error=problem.gauge_error[where],
-        release_origin_mean=problem.release_origin_mean[where],
-        release_origin_precision=problem.release_origin_precision[where],
-        points=problem.points[where],
-        stretches=problem.stretches[where],
-    )
-    state = replace(state, trial_effects=state.trial_effects[where], variance=state.variance[where])
+    rows, fit, solution = np.array(indices), tests.fit, tests.fit.solution
+    places = np.arange(solution.problem.prior_mean.size)
+    predictor = subset_predictor(fit.predictor, rows, places)
     solution = replace(
-        fit.solution,
-        state=state,
-        problem=problem,
-        cross_products=fit.solution.cross_products[where],
-        columns=tuple(fit.solution.columns[k] for k in where),
+        solution,
+        state=subset_state(solution.state, rows, places),
+        problem=subset_problem(solution.problem, predictor.layout, rows, places),
+        cross_products=solution.cross_products[rows],
+        columns=tuple(solution.columns[row] for row in rows),
     )
-    part = replace(fit, predictor=predictor, solution=solution, trials=tuple(fit.trials[k] for k in where), smooth=None)
-    products = tests.products.of(where)
-    sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[k] for k in where])
+    trials = tuple(fit.trials[row] for row in rows)
+    part = replace(fit, predictor=predictor, solution=solution, trials=trials, smooth=None)
+    products = tests.products.of(indices)
+    sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[row] for row in rows])
     return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))
 
 
@@ -595,19 +541,12 @@ class _Search(DesignInformation):
         """Information about the size from these trials and those so far."""
         return float(self.first_information(self.total(chosen)[None])[0])
 
-    def unlimited_information(self) -> float:
-        """Information with unlimited trials of all conditions."""
-        return float(self.first_information((self.so_far + UNLIMITED_TRIALS * self.each.sum(axis=0))[None])[0])
-
     def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
         """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
         options: dict[str, list[int]] = {}
-        for effort, words in EFFORT_WORDS.items():
-            best: list[list[int]] = []
-            for allowed in self._feasible(effort):
-                best.append(self._design(allowed, wanted, most))
-            if best:
-                options[words] = min(best, key=lambda chosen: self._cost(chosen, wanted))
+        for effort, allowed in conditions_by_effort(self.conditions, self._best_new_vines):
+            words, chosen = EFFORT_WORDS[effort], self._design(allowed, wanted, most)
+            options[words] = min(options.get(words, chosen), chosen, key=lambda design: self._cost(design, wanted))
         if not options:
             return [], {}
         words = min(options, key=lambda name: self._cost(options[name], wanted))
@@ -620,18 +559,13 @@ class _Search(DesignInformation):
         information = self.information(chosen)
         return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
 
-    def _feasible(self, effort: int) -> Iterator[NDArray[np.intp]]:
-        """Indices of the conditions available at this effort: one new vine at a time, the most informative first."""
-        if not (self.efforts == effort).any():
-            return
-        if effort < NEW_VINE:
-            yield np.flatnonzero(self.efforts <= effort)
-            return
-        new = list(dict.fromkeys(self.vines[self.efforts == NEW_VINE]))
-        unlimited = [self.so_far + UNLIMITED_TRIALS * self.each[self.vines == vine].sum(axis=0) for vine in new]
+    def _best_new_vines(self, places: NDArray[np.intp]) -> list[str]:
+        """The new vines with the largest information in unlimited trials of all their conditions."""
+        vines = np.array([condition.trial.vine for condition in self.conditions])
+        new = list(dict.fromkeys(vines[places].tolist()))
+        unlimited = [self.so_far + UNLIMITED_TRIALS * self.each[vines == vine].sum(axis=0) for vine in new]
         # 2: new vines that are tried, one at a time (chosen)
-        for k in np.argsort(-self.first_information(np.stack(unlimited)))[:2]:
-            yield np.flatnonzero((self.efforts < NEW_VINE) | (self.vines == new[k]))
+        return [new[k] for k in np.argsort(-self.first_information(np.stack(unlimited)))[:2]]
 
     def _design(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
         """Pairs added one by one up to the wanted information, exchanged, and removed where not needed."""
@@ -651,16 +585,12 @@ class _Search(DesignInformation):
             information = self.information(chosen)
         chosen = self.exchanged(chosen, allowed, self.first_information)
         while len(chosen) > 1:
-            least = self._least_informative(chosen)
+            least = int(np.argmax(self.first_information(self.total(chosen) - self.each[chosen])))
             fewer = self.exchanged(chosen[:least] + chosen[least + 1 :], allowed, self.first_information)
             if self.information(fewer) < wanted:
                 break
             chosen = fewer
         return self._most_informative_first(chosen)
-
-    def _least_informative(self, chosen: Sequence[int]) -> int:
-        total = self.total(chosen)
-        return int(np.argmax(self.first_information(total - self.each[list(chosen)])))
 
     def _most_informative_first(self, chosen: Sequence[int]) -> list[int]:
         """The same trials, in order of the information they add."""
@@ -692,9 +622,8 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
         if probability >= plan.target:
             break
     assert power is not None
-    ratio = math.sqrt(
-        search.unlimited_information() / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300)
-    )
+    endless = search.first_information((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
+    ratio = math.sqrt(endless / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
     unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))
     return replace(plan, trials=tuple(trials), power=power, unlimited=max(unlimited, probability))
 

@@ -288,12 +288,13 @@ def power_of(
     *,
     nonlinear: bool = False,
     first_round: MisfitTests | None = None,
+    only: str = "",
 ) -> Power:
-    """Compute which effects, at which sizes, the trials of a fit can detect."""
+    """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
     null_scores, inflation, least = _null_scores(tests), error_inflation(tests), sizes_at_systematic_error(tests)
     effects = [
         power
-        for response in _responses(tests, nonlinear=nonlinear)
+        for response in _responses(tests, nonlinear=nonlinear, only=only)
         if (power := _effect_power(tests, response, null_scores, inflation, least)) is not None
     ]
     silent = dict.fromkeys(tests.sensitivities.silent, remark("no_response"))
@@ -314,24 +315,8 @@ def power_of(
 
 
 def effect_power(tests: MisfitTests, name: str) -> EffectPower | None:
-    """Compute at which sizes the trials of a fit can detect one candidate among all others."""
-    responses = _responses(tests, nonlinear=True, only=name)
-    if not responses:
-        return None
-    return _effect_power(
-        tests,
-        responses[0],
-        _null_scores(tests),
-        error_inflation(tests),
-        sizes_at_systematic_error(tests),
-    )
-
-
-def typical_shape_index(tests: MisfitTests, name: str) -> int | None:
-    """Index of the shape by which an effect is represented; None where no trial has information about it."""
-    effect = next(effect for effect in tests.effects if effect.name == name)
-    indices = _typical_shapes(tests, effect)
-    return indices[-1] if indices else None
+    """Compute at which sizes the trials of a fit can detect one candidate among all others; None where none can."""
+    return next(iter(power_of(tests, nonlinear=True, only=name).effects), None)
 
 
 def inputs_of_fit(fit: Fit) -> tuple[PowerInput, ...]:
@@ -345,7 +330,7 @@ def inputs_of_fit(fit: Fit) -> tuple[PowerInput, ...]:
     return tuple(rows)
 
 
-def _responses(tests: MisfitTests, *, nonlinear: bool, only: str = "") -> list[_Response]:
+def _responses(tests: MisfitTests, *, nonlinear: bool, only: str) -> list[_Response]:
     """Expected scores of all shapes by the size of an effect: one response for each effect, or only one."""
     information = tests.scores.information
     root = np.sqrt(np.maximum(np.diag(information), 1e-300))
@@ -354,7 +339,7 @@ def _responses(tests: MisfitTests, *, nonlinear: bool, only: str = "") -> list[_
     for effect in tests.effects:
         if only not in ("", effect.name):
             continue
-        indices = _typical_shapes(tests, effect)
+        indices = typical_shapes(tests, effect.name)
         if not indices:
             continue
         shapes = [tests.sensitivities.shapes[index] for index in indices]
@@ -375,10 +360,12 @@ def _responses(tests: MisfitTests, *, nonlinear: bool, only: str = "") -> list[_
     return responses
 
 
-def _typical_shapes(tests: MisfitTests, effect: Effect) -> list[int]:
-    """Indices of the shapes that represent an effect: the middle small step, else all finite sizes."""
+def typical_shapes(tests: MisfitTests, name: str) -> list[int]:
+    """Indices of the shapes that represent an effect: the middle small step, else all finite sizes, the largest last;
+    none where no trial has information about it.
+    """
     has_information = np.diag(tests.scores.information) > 0
-    indices = [k for k, name in enumerate(tests.sensitivities.effects) if name == effect.name and has_information[k]]
+    indices = [k for k, of in enumerate(tests.sensitivities.effects) if of == name and has_information[k]]
     small = [k for k in indices if not tests.sensitivities.shapes[k].whole]
     return [small[len(small) // 2]] if small else sorted(indices, key=lambda k: abs(tests.sensitivities.shapes[k].step))
 
@@ -574,18 +561,13 @@ def _false_alarms(tests: MisfitTests) -> dict[str, float]:
 
 
 def _interval_widths(fit: Fit) -> tuple[NumberWidth, ...]:
-    """Half widths of the 95 % intervals of n and of every B."""
+    """Half widths of the 95 % intervals of n and of every B, relative for B."""
     widths = []
     for number in fit.numbers:
-        if number.key in (DAMPING, EXPONENT) and math.isfinite(number.high - number.low):
-            half = (number.high - number.low) / 2
-            relative = number.key == DAMPING
-            widths.append(
-                NumberWidth(
-                    "B" if relative else "n",
-                    number.vine,
-                    number.value,
-                    half / number.value if relative and number.value > 0 else half,
-                )
-            )
+        half = (number.high - number.low) / 2
+        if number.key == DAMPING and math.isfinite(half):
+            half = half / number.value if number.value > 0 else half
+            widths.append(NumberWidth("B", number.vine, number.value, half))
+        elif number.key == EXPONENT and math.isfinite(half):
+            widths.append(NumberWidth("n", number.vine, number.value, half))
     return tuple(widths)

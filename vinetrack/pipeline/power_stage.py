@@ -32,7 +32,7 @@ from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerIn
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS
-from vinetrack.experiment.folder import read_experiment
+from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.settings import Limits
 from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, PlannedTrials, expected_systematic_m, planned_sheet
 from vinetrack.inference.fit import fit
@@ -110,6 +110,7 @@ class PowerCampaign:
 def campaign_of_target(request: PowerRequest) -> PowerCampaign:
     """Return the campaign of the measured trials of a results folder or an experiment; without any, of the planned."""
     target = request.target
+    experiment: Experiment | None
     if (target / PROVENANCE).exists():
         results, experiment = Results(target), read_source_experiment(target, request.experiment)
         diagnosis = read_diagnosis(results)

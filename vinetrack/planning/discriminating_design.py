@@ -15,7 +15,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,6 +97,22 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
         )
         for condition, name in zip(feasible, named, strict=True)
     ]
+
+
+def conditions_by_effort(
+    conditions: Sequence[Condition], best_new_vines: Callable[[NDArray[np.intp]], Sequence[str]]
+) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Yield the indices of the conditions to choose from with more and more effort: on the rig so far, with another
+    rig as well, and with one new vine at a time as well, of those that `best_new_vines` chooses among their indices.
+    """
+    efforts = np.array([condition.effort for condition in conditions])
+    for effort in (SAME_RIG, OTHER_RIG):
+        if (efforts == effort).any():
+            yield effort, np.flatnonzero(efforts <= effort)
+    new = np.flatnonzero(efforts == NEW_VINE)
+    for vine in best_new_vines(new) if new.size else ():
+        vines = np.array([condition.trial.vine for condition in conditions])
+        yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
 # Columns of the sheet that describe a rig, with their fields of a trial

@@ -60,12 +60,9 @@ def run(
     places_m: Floats,
     samples: int,
     seed: int,
-    *,
-    only: Iterable[str] | None = None,
-    with_tension: bool = True,
 ) -> Runs:
     """Draw predictive inputs and simulate every draw. Shapes: places_m (n_places,)."""
-    trials, rows = inputs.laid_out(inputs.draw(samples, seed, only))
+    trials, rows = inputs.laid_out(inputs.draw(samples, seed))
     moved, until_s = grown(inputs.model, trials, rows)
     time_s, velocity_m_s = np.full((samples, places_m.size), math.inf), np.zeros((samples, places_m.size))
     for i, trajectory in enumerate(moved):
@@ -75,8 +72,7 @@ def run(
             places_m[reached], trajectory.lead_position_m, trajectory.lead_velocity_m_s
         )
     # 300: draws whose forces are evaluated, a third of a millisecond each (chosen)
-    with_forces = min(samples, 300) if with_tension else 0
-    tension_N, pressure_Pa, least_N, slack = _forces(inputs, trials[:with_forces], rows, moved, places_m)
+    tension_N, pressure_Pa, least_N, slack = _forces(inputs, trials[:300], rows, moved, places_m)
     return Runs(
         places_m=places_m,
         time_s=time_s,
@@ -130,10 +126,8 @@ def drawn_final_speeds(
     inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int, only: Iterable[str] | None = None
 ) -> Floats:
     """Return the final speed in every draw, m/s, see `final_speeds`. Shape (n_draws,)."""
-    place_m = np.array([at_fraction * inputs.trial.length_m])
-    runs = run(inputs, place_m, samples, seed, only=only, with_tension=False)
-    loaded = told_by_payload(inputs.trial)
-    return inputs.trial.travel_ratio * runs.end_lead_velocity_m_s if loaded else runs.lead_velocity_m_s[:, 0]
+    trials, rows = inputs.laid_out(inputs.draw(samples, seed, only))
+    return final_speeds(inputs.model, trials, at_fraction, rows)
 
 
 def _forces(
@@ -449,20 +443,12 @@ def _slack(prediction: VinePrediction) -> Iterator[str]:
             "payload falls freely, at a speed that is not predicted"
         )
         return
+    tension = prediction[LEAST_TENSION]
+    also = "" if tension.median < 0 else f", below {tension.low:.2g} N in one draw of twenty"
     payload = f", and the {EJECTION} is at least the one stated" if trial.payload_kg > 0 else ""
     yield (
-        f"the model predicts compression in the tail {frequency} (least tension {_least_tension(prediction)}), which "
+        f"the model predicts compression in the tail {frequency} (least tension {tension.median:.2g} N{also}), which "
         f"thin film cannot carry: the payload runs ahead of the film{payload}; `--tail-slack free` allows that"
-    )
-
-
-def _least_tension(prediction: VinePrediction) -> str:
-    """The median where it is negative; else also the 5 % quantile."""
-    tension = prediction[LEAST_TENSION]
-    return (
-        f"{tension.median:.2g} N"
-        if tension.median < 0
-        else f"{tension.median:.2g} N, below {tension.low:.2g} N in one draw of twenty"
     )
 
 
@@ -537,10 +523,6 @@ class Room:
     burst_share: float = 0.9
     burst_stress_Pa: float = BURST_STRESS_PA
 
-    def pressure_of(self, diameter_m: float, thickness_m: float) -> float:
-        """Return the highest pressure that supply and wall allow, Pa."""
-        return min(self.pressure_Pa, self.bearable_Pa(diameter_m, thickness_m))
-
     def bearable_Pa(self, diameter_m: float, thickness_m: float) -> float:
         """Return the highest pressure that the wall allows, f · 2tσ/D, Pa."""
         burst_Pa = burst_pressure_Pa(diameter_m, thickness_m) * self.burst_stress_Pa / BURST_STRESS_PA
@@ -548,7 +530,7 @@ class Room:
 
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
         """Return the trial with a vine of this size at the highest pressure allowed."""
-        pressure_Pa = self.pressure_of(diameter_m, thickness_m)
+        pressure_Pa = min(self.pressure_Pa, self.bearable_Pa(diameter_m, thickness_m))
         sized = replace(
             self.rig,
             diameter_m=diameter_m,
@@ -583,17 +565,19 @@ def fastest(
     at_fraction: float = 0.95,
 ) -> tuple[Choice, ...]:
     """Find the fastest vine of every film, fastest first."""
-    best: list[tuple[PredictiveInputs, Floats]] = [_best(room, film, stated, fit, at_fraction) for film in room.films_m]
-    odds = _odds([inputs for inputs, _ in best], samples, seed, at_fraction)
+    best = [_best(room, film, stated, fit, at_fraction) for film in room.films_m]
+    # Inputs that vines share have the same draws in all.
+    drawn = np.array([drawn_final_speeds(inputs, at_fraction, samples, seed) for inputs, _ in best])
+    fastest_of_draw = np.argmax(drawn, axis=0)
     choices = [
         Choice(
             thickness_m=inputs.trial.thickness_m,
             prediction=predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction),
             limits=_limits(room, inputs.trial),
-            odds=share,
+            odds=float(np.mean(fastest_of_draw == k)),
             others=others,
         )
-        for (inputs, others), share in zip(best, odds, strict=True)
+        for k, (inputs, others) in enumerate(best)
     ]
     return tuple(sorted(choices, key=lambda choice: -choice.prediction.final.median))
 
@@ -641,13 +625,6 @@ def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
         elif high > low and value < low * (1 + bound_tolerance):
             limits.append(f"smallest {name}")
     return tuple(limits)
-
-
-def _odds(vine_inputs: Sequence[PredictiveInputs], samples: int, seed: int, at_fraction: float) -> list[float]:
-    """Fraction of draws in which each is the fastest; inputs that vines share have the same draws in all."""
-    speeds = [drawn_final_speeds(inputs, at_fraction, samples, seed) for inputs in vine_inputs]
-    winners = np.argmax(np.array(speeds), axis=0)
-    return [float(np.mean(winners == k)) for k in range(len(vine_inputs))]
 
 
 # ------------------------------------------------------------------------------
