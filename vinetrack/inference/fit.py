@@ -604,17 +604,19 @@ def fit(
     """Fit a model to all trials of an experiment."""
     pairs, left_out = pairs_of(experiment, tracks)
     data, unusable = prepare(pairs, weighted=noise is None)
-    if noise is not None:
-        data = [replace(trial_data, noise_m=noise[0], correlation=noise[1]) for trial_data in data]
     left_out = {**left_out, **unusable}
     if not data:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
         raise FitError(f"No trial can be fitted: {reasons or 'there is none'}.")
     fixed, free = tuple(fixed), tuple(free)
     options = {"fixed": fixed, "free": free, "shared": dict(shared or {})}
+    fixed_terms = FixedTerms(spreads)
+    if noise is not None:
+        noise_m, rho = noise
+        data = [replace(trial_data, noise_m=noise_m, correlation=rho) for trial_data in data]
+        fixed_terms = FixedTerms(spreads, (rho, np.full(len(data), noise_m**2 * (1 - rho**2))))
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
-    fixed_terms = _fixed_terms(spreads, noise, data)
     solution = solve_from_scratch(predictor, fixed_terms, watch, thorough=thorough)
     _refuse_a_standstill(predictor, solution)
     predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, watch=watch)
@@ -641,15 +643,6 @@ def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
 
 def _range_in_words(values: Sequence[float]) -> str:
     return f"{values[0]:g}" if values[0] == values[-1] else f"{values[0]:g} to {values[-1]:g}"
-
-
-def _fixed_terms(
-    spreads: tuple[float, float] | None, noise: tuple[float, float] | None, data: list[FitTrial]
-) -> FixedTerms:
-    if noise is None:
-        return FixedTerms(spreads)
-    sigma_m, rho = noise
-    return FixedTerms(spreads, (rho, np.full(len(data), sigma_m**2 * (1 - rho**2))))
 
 
 def refit(
