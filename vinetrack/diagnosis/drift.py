@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,6 +271,16 @@ def normal_deviate(p: float) -> float:
     return float(norm.isf(max(p, 1e-300) / 2))
 
 
+DRIFT_COLUMNS = (
+    *("parameter", "vine", "symbol", "unit", "against", "from_level", "to_level", "change", "change_sigma"),
+    *("relative", "z", "z_constancy", "dof", "n_trials", "significant", "sentence"),
+)
+GROUP_COLUMNS = (
+    *("parameter", "vine", "symbol", "unit", "against", "level", "value", "sigma", "ratio", "ratio_sigma"),
+    "n_trials",
+)
+
+
 @dataclass(frozen=True)
 class ConstancyTest:
     """A row of the table of drifts with its p-value, and the rows of its groups."""
@@ -278,6 +288,43 @@ class ConstancyTest:
     row: dict[str, object]
     p: float
     groups: list[dict[str, object]]
+
+
+def _tested(
+    parameter: PerTrialEstimates | Number,
+    vine: str,
+    against: str,
+    levels: tuple[float, float],
+    change: tuple[float, float],
+    *,
+    p: float,
+    z: float,
+    dof: float,
+    n_trials: int,
+    sentence: str,
+    relative: bool = False,
+    z_constancy: float = math.nan,
+    groups: Sequence[dict[str, object]] = (),
+) -> ConstancyTest:
+    """A test as a row of the table: levels from and to, the change between them and its standard error."""
+    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
+    numbers = (*levels, *change, relative, z, z if math.isnan(z_constancy) else z_constancy, dof, n_trials)
+    columns = [name for name in DRIFT_COLUMNS if name != "significant"]
+    return ConstancyTest(dict(zip(columns, (*of_parameter, *numbers, sentence), strict=True)), p, list(groups))
+
+
+def _group(
+    parameter: PerTrialEstimates | Number,
+    vine: str,
+    against: str,
+    level: float,
+    value: tuple[float, float],
+    ratio: tuple[float, float],
+    n_trials: int,
+) -> dict[str, object]:
+    """A row of the table of groups: value and ratio to the common value, each with its standard error."""
+    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
+    return dict(zip(GROUP_COLUMNS, (*of_parameter, level, *value, *ratio, n_trials), strict=True))
 
 
 # ------------------------------------------------------------------------------
@@ -313,7 +360,7 @@ def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates)
     names = list(dict.fromkeys(vines[usable]))
     for vine in [*names, *([""] if len(names) > 1 else [])]:
         chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
-        test = _difference_test(fit, halves, str(vine), chosen)
+        test = _difference_test(fit, estimates, halves, str(vine), chosen)
         if test is not None:
             yield test
 
@@ -353,45 +400,50 @@ def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
     return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
 
 
-def _difference_test(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> ConstancyTest | None:
-    """Student's t test of the mean difference of the halves; None without enough degrees of freedom."""
+def _difference_test(
+    fit: Fit, estimates: PerTrialEstimates, halves: _Halves, vine: str, chosen: np.ndarray
+) -> ConstancyTest | None:
+    """Student's t test of the mean difference of the halves; None without enough degrees of freedom. The groups of a
+    vine are its halves, among which the variance of their difference is divided equally.
+    """
     from scipy.stats import t as student
 
     rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
     scatter, dof = _scatter(rise, [halves.trials[i].condition for i in chosen])
-    scatter = max(scatter, DRIFT_ALONG_LEAST_SCATTER)
     if dof < FEWEST_DEGREES:
         return None
-    mean, sigma = float(rise.mean()), scatter / math.sqrt(rise.size)
+    sigma = max(scatter, DRIFT_ALONG_LEAST_SCATTER) / math.sqrt(rise.size)
+    mean = float(rise.mean())
     p = float(2 * student.sf(abs(mean) / sigma, dof))
-    change = math.expm1(abs(mean))
-    error = math.exp(abs(mean)) * sigma
-    start, stop = HALVES if mean >= 0 else HALVES[::-1]
+    change, error = math.expm1(abs(mean)), math.exp(abs(mean)) * sigma
+    groups = []
+    if vine:
+        base = float(fit.model.parameters_for(vine)[fit.model.parameter_names.index(DAMPING)])
+        for half, level in enumerate(HALVES):
+            ratio = math.exp(float(halves.deviation[chosen, half].mean()))
+            with_error = ratio, ratio * sigma / math.sqrt(2)
+            value = base * with_error[0], base * with_error[1]
+            groups.append(_group(estimates, vine, "growth", level, value, with_error, int(chosen.size)))
     where = ("first", "second") if mean >= 0 else ("second", "first")
-    who = f"B of {vine}" if vine else "B"
     digits = max(decimals(100 * error) - 1, 0)
-    row = {
-        "parameter": DAMPING,
-        "vine": vine,
-        "symbol": "B",
-        "unit": "N·(s/m)ⁿ",
-        "against": "growth",
-        "from_level": start,
-        "to_level": stop,
-        "change": change,
-        "change_sigma": error,
-        "relative": True,
-        "z": normal_deviate(p),
-        "z_constancy": normal_deviate(p),
-        "dof": dof,
-        "n_trials": int(chosen.size),
-        "sentence": (
-            f"{who} would have to be {100 * change:.{digits}f} ± {100 * error:.{digits}f} % larger in the {where[1]}"
-            f" half of the growth than in the {where[0]} ({normal_deviate(p):.1f} σ), though it should not change along"
-            " the growth."
+    return _tested(
+        estimates,
+        vine,
+        "growth",
+        HALVES if mean >= 0 else HALVES[::-1],
+        (change, error),
+        relative=True,
+        p=p,
+        z=normal_deviate(p),
+        dof=dof,
+        n_trials=int(chosen.size),
+        sentence=(
+            f"{f'B of {vine}' if vine else 'B'} would have to be {100 * change:.{digits}f} ± {100 * error:.{digits}f} %"
+            f" larger in the {where[1]} half of the growth than in the {where[0]} ({normal_deviate(p):.1f} σ), though"
+            " it should not change along the growth."
         ),
-    }
-    return ConstancyTest(row, p, _drift_along_groups(fit, halves, vine, chosen) if vine else [])
+        groups=groups,
+    )
 
 
 def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
@@ -406,97 +458,30 @@ def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
     return math.sqrt(float(np.sum(deviations**2)) / max(dof, 1)), dof
 
 
-def _drift_along_groups(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[dict[str, object]]:
-    """Mean value of each half; the variance of their difference is divided equally between them."""
-    rows: list[dict[str, object]] = []
-    conditions = [halves.trials[i].condition for i in chosen]
-    rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
-    sigma = max(_scatter(rise, conditions)[0], DRIFT_ALONG_LEAST_SCATTER) / math.sqrt(2 * chosen.size)
-    base = float(fit.model.parameters_for(vine)[fit.model.parameter_names.index(DAMPING)])
-    for half, level in enumerate(HALVES):
-        ratio = math.exp(float(halves.deviation[chosen, half].mean()))
-        rows.append(
-            {
-                "parameter": DAMPING,
-                "vine": vine,
-                "symbol": "B",
-                "unit": "N·(s/m)ⁿ",
-                "against": "growth",
-                "level": level,
-                "value": base * ratio,
-                "sigma": base * ratio * sigma,
-                "ratio": ratio,
-                "ratio_sigma": ratio * sigma,
-                "n_trials": int(chosen.size),
-            }
-        )
-    return rows
-
-
 def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
     """Compare fitted yield pressures with the sheet, in units of the standard error stated there."""
     for number, free in zip(fit.numbers, fit.predictor.layout.free, strict=True):
         if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
             continue
-        change = number.value - free.start
-        z = abs(change) / free.prior_sd
-        p = math.erfc(z / math.sqrt(2))
-        row = {
-            "parameter": number.key,
-            "vine": number.vine,
-            "symbol": number.symbol,
-            "unit": number.unit,
-            "against": "sheet",
-            "from_level": free.start,
-            "to_level": number.value,
-            "change": change,
-            "change_sigma": free.prior_sd,
-            "relative": False,
-            "z": z,
-            "z_constancy": z,
-            "dof": math.inf,
-            "n_trials": sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
-            "sentence": (
+        z = abs(number.value - free.start) / free.prior_sd
+        yield _tested(
+            number,
+            number.vine,
+            "sheet",
+            (free.start, number.value),
+            (number.value - free.start, free.prior_sd),
+            p=math.erfc(z / math.sqrt(2)),
+            z=z,
+            dof=math.inf,
+            n_trials=sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
+            sentence=(
                 f"{number.symbol} of {number.vine} is pulled from the {free.start / 1e3:.2f} ±"
                 f" {free.prior_sd / 1e3:.2f} kPa of the sheet to {number.value / 1e3:.2f} kPa ({z:.1f} σ)."
             ),
-        }
-        yield ConstancyTest(row, p, [])
+        )
 
 
 log = logging.getLogger(__name__)
-
-DRIFT_COLUMNS = (
-    "parameter",
-    "vine",
-    "symbol",
-    "unit",
-    "against",
-    "from_level",
-    "to_level",
-    "change",
-    "change_sigma",
-    "relative",
-    "z",
-    "z_constancy",
-    "dof",
-    "n_trials",
-    "significant",
-    "sentence",
-)
-GROUP_COLUMNS = (
-    "parameter",
-    "vine",
-    "symbol",
-    "unit",
-    "against",
-    "level",
-    "value",
-    "sigma",
-    "ratio",
-    "ratio_sigma",
-    "n_trials",
-)
 
 MOST_ITERATIONS = 15  # Maximum number of iterations of a refit (chosen)
 
@@ -617,52 +602,40 @@ def _slope(
         change, error = math.expm1(change), math.exp(change) * error
     p = float(2 * student.sf(abs(slope) / sigma, sums.dof))
     p_groups, z_constancy = constancy_p_value(sums)
-    row: dict[str, object] = {
-        "parameter": estimates.key,
-        "vine": vine,
-        "symbol": estimates.symbol,
-        "unit": estimates.unit,
-        "against": against.column,
-        "from_level": start,
-        "to_level": stop,
-        "change": change,
-        "change_sigma": error,
-        "relative": estimates.logarithmic,
-        "z": normal_deviate(p),
-        "z_constancy": z_constancy,
-        "dof": sums.dof,
-        "n_trials": int(sums.x.size),
-    }
-    row["sentence"] = _sentence(estimates, against, row, steadily=p <= p_groups)
-    return ConstancyTest(row, min(1.0, 2 * min(p, p_groups)), groups)
-
-
-def _sentence(estimates: PerTrialEstimates, against: Covariate, row: Mapping[str, Any], *, steadily: bool) -> str:
-    """A row in words; `steadily` where the slope is more significant than the differences between groups."""
-    who = f"{estimates.symbol} of {row['vine']}" if row["vine"] else estimates.symbol
-    start, stop = against.formatted(row["from_level"]), against.formatted(row["to_level"])
-    if steadily:
-        return (
-            f"{who} rises by {_amount(estimates, row['change'], row['change_sigma'])} from {start} to {stop}"
-            f" of {against.label} ({row['z']:.1f} σ), though it should not depend on the {against.label}."
+    who = f"{estimates.symbol} of {vine}" if vine else estimates.symbol
+    if p <= p_groups:
+        unit, factor = ("%", 100.0) if estimates.logarithmic else display_unit(estimates.unit)
+        digits = max(decimals(error * factor) - 1, 0)
+        amount = f"{change * factor:.{digits}f} ± {error * factor:.{digits}f} {unit}".rstrip()
+        sentence = (
+            f"{who} rises by {amount} from {against.formatted(start)} to {against.formatted(stop)} of {against.label}"
+            f" ({normal_deviate(p):.1f} σ), though it should not depend on the {against.label}."
         )
-    low, high = sorted((row["from_level"], row["to_level"]))
-    return (
-        f"{who} is not the same at every {against.label} ({row['z_constancy']:.1f} σ), without rising or falling"
-        f" steadily from {against.formatted(low)} to {against.formatted(high)}."
+    else:
+        sentence = (
+            f"{who} is not the same at every {against.label} ({z_constancy:.1f} σ), without rising or falling steadily"
+            f" from {against.formatted(low)} to {against.formatted(high)}."
+        )
+    return _tested(
+        estimates,
+        vine,
+        against.column,
+        (start, stop),
+        (change, error),
+        relative=estimates.logarithmic,
+        p=min(1.0, 2 * min(p, p_groups)),
+        z=normal_deviate(p),
+        z_constancy=z_constancy,
+        dof=sums.dof,
+        n_trials=int(sums.x.size),
+        sentence=sentence,
+        groups=groups,
     )
-
-
-def _amount(estimates: PerTrialEstimates, change: float, error: float) -> str:
-    """A change with its standard error, in per cent or in its display unit."""
-    unit, factor = ("%", 100.0) if estimates.logarithmic else display_unit(estimates.unit)
-    digits = max(decimals(error * factor) - 1, 0)
-    return f"{change * factor:.{digits}f} ± {error * factor:.{digits}f} {unit}".rstrip()
 
 
 def _groups(
     estimates: PerTrialEstimates,
-    against: Covariate | None,
+    against: Covariate,
     levels: Floats,
     chosen: NDArray[np.bool_],
     sums: BlockedDeviations,
@@ -672,75 +645,18 @@ def _groups(
     rows = []
     for level in np.unique(levels[chosen]):
         k = np.flatnonzero(chosen & (levels == level))
-        w = 1 / estimates.variance[k]
+        w, bases = 1 / estimates.variance[k], estimates.base[k]
         mean = float(np.average(estimates.deviation[k], weights=w))
         sigma = math.sqrt(sums.variance / float(np.sum(w)))
-        rows.append(_group_row(estimates, against, float(level), vine, mean, sigma, k))
+        base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
+        if estimates.logarithmic:
+            ratio = math.exp(mean), math.exp(mean) * sigma
+            value = base * ratio[0], base * ratio[1]
+        else:
+            value = base + mean, sigma
+            ratio = (value[0] / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
+        rows.append(_group(estimates, vine, against.column, float(level), value, ratio, int(k.size)))
     return rows
-
-
-def _group_row(
-    estimates: PerTrialEstimates,
-    against: Covariate | None,
-    level: float,
-    vine: str,
-    mean: float,
-    sigma: float,
-    k: NDArray[np.int_],
-) -> dict[str, object]:
-    base = (
-        float(np.mean(estimates.base[k])) if np.ptp(estimates.base[k]) <= 1e-9 * abs(estimates.base[k][0]) else math.nan
-    )
-    if estimates.logarithmic:
-        ratio, ratio_sigma = math.exp(mean), math.exp(mean) * sigma
-        value, value_sigma = base * ratio, base * ratio_sigma
-    else:
-        value, value_sigma = base + mean, sigma
-        ratio, ratio_sigma = (value / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
-    return {
-        "parameter": estimates.key,
-        "vine": vine,
-        "symbol": estimates.symbol,
-        "unit": estimates.unit,
-        "against": against.column if against else "vine",
-        "level": level if against else math.nan,
-        "value": value,
-        "sigma": value_sigma,
-        "ratio": ratio,
-        "ratio_sigma": ratio_sigma,
-        "n_trials": int(k.size),
-    }
-
-
-def _vine_row(
-    key: str, symbol: str, unit: str, groups: Sequence[dict[str, object]], z: float, dof: float, n_trials: int
-) -> dict[str, object]:
-    """Row for a parameter that differs between vines; the change is from the lowest to the highest value."""
-    ordered = sorted(groups, key=lambda group: float(str(group["value"])))
-    low, high = ordered[0], ordered[-1]
-    shown, factor = display_unit(unit)
-    ends = " and ".join(
-        f"{float(str(end['value'])) * factor:.3g} ± {float(str(end['sigma'])) * factor:.1g} {shown}".rstrip()
-        + f" ({end['vine']})"
-        for end in (low, high)
-    )
-    return {
-        "parameter": key,
-        "vine": "",
-        "symbol": symbol,
-        "unit": unit,
-        "against": "vine",
-        "from_level": math.nan,
-        "to_level": math.nan,
-        "change": float(str(high["value"])) - float(str(low["value"])),
-        "change_sigma": math.hypot(float(str(high["sigma"])), float(str(low["sigma"]))),
-        "relative": False,
-        "z": z,
-        "z_constancy": z,
-        "dof": dof,
-        "n_trials": n_trials,
-        "sentence": f"{symbol} differs between the vines ({z:.1f} σ), though one value should describe all: {ends}.",
-    }
 
 
 def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
@@ -774,29 +690,44 @@ def _fit_vines(fit: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
 
 
 def _compare_vines(common: Number, estimates: Sequence[tuple[str, Number, int]]) -> ConstancyTest:
-    """χ² test of the values of single vines against their mean."""
+    """χ² test of the values of single vines against their mean; the change is from the lowest to the highest value."""
     from scipy.stats import chi2 as chi_square
 
     value, sigma = (np.array([getattr(number, name) for _, number, _ in estimates]) for name in ("value", "sigma"))
     mean = float(np.average(value, weights=1 / sigma**2))
     p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(estimates) - 1))
-    groups = [_vine_group(*estimate, common.value) for estimate in estimates]
-    count = sum(estimate[2] for estimate in estimates)
-    row = _vine_row(common.key, common.symbol, common.unit, groups, normal_deviate(p), math.inf, count)
-    return ConstancyTest(row, p, groups)
-
-
-def _vine_group(vine: str, number: Number, count: int, common: float) -> dict[str, object]:
-    return {
-        "parameter": number.key,
-        "vine": vine,
-        "symbol": number.symbol,
-        "unit": number.unit,
-        "against": "vine",
-        "level": math.nan,
-        "value": number.value,
-        "sigma": number.sigma,
-        "ratio": number.value / common if common else math.nan,
-        "ratio_sigma": number.sigma / common if common else math.nan,
-        "n_trials": count,
-    }
+    z = normal_deviate(p)
+    scale = common.value or math.nan
+    ordered = sorted(estimates, key=lambda estimate: estimate[1].value)
+    (_, low, _), (_, high, _) = ordered[0], ordered[-1]
+    unit, factor = display_unit(common.unit)
+    ends = " and ".join(
+        f"{number.value * factor:.3g} ± {number.sigma * factor:.1g} {unit}".rstrip() + f" ({vine})"
+        for vine, number, _ in (ordered[0], ordered[-1])
+    )
+    return _tested(
+        common,
+        "",
+        "vine",
+        (math.nan, math.nan),
+        (high.value - low.value, math.hypot(high.sigma, low.sigma)),
+        p=p,
+        z=z,
+        dof=math.inf,
+        n_trials=sum(count for _, _, count in estimates),
+        sentence=(
+            f"{common.symbol} differs between the vines ({z:.1f} σ), though one value should describe all: {ends}."
+        ),
+        groups=[
+            _group(
+                number,
+                vine,
+                "vine",
+                math.nan,
+                (number.value, number.sigma),
+                (number.value / scale, number.sigma / scale),
+                count,
+            )
+            for vine, number, count in estimates
+        ],
+    )
