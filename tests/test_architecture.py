@@ -46,7 +46,7 @@ FLOORS = (
 BUDGETS = {
     "cli": (834, 4, 7),
     "core": (1497, 9, 77),
-    "diagnosis": (11932, 23, 186),
+    "diagnosis": (11863, 23, 186),
     "dynamics": (2667, 8, 29),
     "effects": (2711, 44, 180),
     "experiment": (2018, 7, 26),
