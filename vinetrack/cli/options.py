@@ -1,8 +1,9 @@
-"""Options of the commands that have many: `options.csv` beside this file declares them, a line each.
+"""What every command has in common: arguments and options from a table, errors as sentences, output as lines or JSON.
 
-A line holds the name of the value that the command gets, the option, its commands, kind, default, bounds and help. A
-number that is not given is NaN; `per` is what it is divided by (100 for per cent). An option named after a column of
-the trial sheet comes from the columns' own table and is checked like a cell of a sheet.
+A line of `options.csv` beside this file holds the name of the value that the command gets, the option (blank for an
+argument), its commands, kind, default, bounds and help. A number that is not given is NaN; `per` is what it is divided
+by (100 for per cent). An option named after a column of the trial sheet comes from the columns' own table and is
+checked like a cell of a sheet.
 """
 
 from __future__ import annotations
@@ -15,28 +16,19 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from vinetrack.experiment.schema import COLUMNS, CellError, Column, option, read_cell
 
-if TYPE_CHECKING:
-    from vinetrack.experiment.settings import RunSettings
-
-
 # ------------------------------------------------------------------------------
 # Output of commands: lines for the user, or with `--json` the same content for a program.
 
 START, MORE = "Start here", "More"  # Panels of the help; the first lists the commands that a new user needs
-
-JsonFile = Annotated[
-    Path | None,
-    typer.Option("--json", metavar="FILE", help="Write it as JSON to this file, - for the terminal.",
-                 show_default=False),
-]  # fmt: skip
 
 
 def json_to_terminal(json_file: Path | None) -> bool:
@@ -49,40 +41,35 @@ def json_to_terminal(json_file: Path | None) -> bool:
 def print_result(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
     """Print lines, and write `content` as JSON to a file; or print it instead of the lines."""
     from vinetrack.core.tables import write_json
-    from vinetrack.core.terminal import severity_first
 
     for line in () if json_to_terminal(json_file) else lines:
-        typer.echo(severity_first(line))
-    if json_file is not None:
+        _say(line)
+    if json_file is not None and content is not None:
         write_json(json_file, content)
 
 
-ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
-ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
-SettingsText = Annotated[str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")]
-LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.", show_default=False)]
+def _say(line: str, err: bool = False) -> None:
+    from vinetrack.core.terminal import severity_first
+
+    typer.echo(severity_first(line, sys.stderr if err else sys.stdout), err=err)
 
 
-def activity_sign(what: str, log: Path | None) -> AbstractContextManager[object]:
-    """Show a spinner while a stage runs by hand; not in the workflow, where it has a log."""
-    from vinetrack.core.terminal import waiting
+@contextmanager
+def progress_line() -> Iterator[Callable[[str], None]]:
+    """Show the current step on one line of a terminal, which is erased at the end; print nothing elsewhere."""
+    shown: list[str] = []
 
-    return waiting(what) if log is None else nullcontext()
-
-
-def settings_from_json(text: str) -> RunSettings:
-    """Settings of a run from the option `--settings`."""
-    import json
-
-    from vinetrack.experiment.settings import run_settings
+    def show(text: str) -> None:
+        if sys.stderr.isatty():
+            shown.append(text)
+            sys.stderr.write(f"\r\x1b[K{text}")
+            sys.stderr.flush()
 
     try:
-        values = json.loads(text)
-    except ValueError as error:
-        raise typer.BadParameter(f"is not JSON ({error})", param_hint="--settings") from None
-    if not isinstance(values, dict):
-        raise typer.BadParameter('is not a JSON object such as {"damping": {"seed": 7}}', param_hint="--settings")
-    return run_settings(values)
+        yield lambda step: show(f"{step} …")
+    finally:
+        if shown:
+            show("")
 
 
 @contextmanager
@@ -117,9 +104,8 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
 
 
 def _exit_with(message: str) -> None:
-    from vinetrack.core.terminal import severity_first
-
-    typer.echo("\n".join(severity_first(line, sys.stderr) for line in message.splitlines()), err=True)
+    for line in message.splitlines():
+        _say(line, err=True)
     raise typer.Exit(1)
 
 
@@ -140,52 +126,84 @@ _VINE_COLUMNS = frozenset(
 )
 
 # Type of an option by its kind; text for all other kinds
-_TYPES: dict[str, Any] = {"number": float | None, "count": int, "path": Path | None, "flag": bool, "texts": list[str]}
+_TYPES: dict[str, Any] = {"number": float, "count": int, "path": Path, "flag": bool, "texts": list[str]}
 
-_Command = Callable[..., None]
+# Type of a value that is given as JSON, and an example, by kind
+_JSON_KINDS: dict[str, tuple[type, str]] = {
+    "list": (list, '["t1", "t2"]'),
+    "object": (dict, '{"damping": {"seed": 7}}'),
+}
+
+# What a command returns: lines, the same content for a program, and whether it found a fault, by default not
+Answer = tuple[Iterable[str], Any] | tuple[Iterable[str], Any, bool]
+_Command = Callable[..., Answer | None]
 
 
-def with_options(command_name: str, columns: tuple[str, ...] = (), **meanings: str) -> Callable[[_Command], _Command]:
-    """Give a command the options of the table in place of its argument `options`, a mapping of values by field. With
-    `columns`, options for these columns of the trial sheet come first, and `options["cells"]` holds the given texts;
-    `meanings` replaces the help of some of them. Errors are reported in sentences; `--log` holds tracebacks.
+def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) -> Callable[[_Command], _Command]:
+    """Give a function the arguments and options that the table states for its name (or `lines_of`), report its errors
+    in sentences, and print the lines that it returns, or the content beside them as JSON.
+
+    The function gets by name what it has parameters for, and the rest as a mapping `options` if it has that; `report`
+    shows a step on a terminal, and `say` prints a line while it works. With `columns`, options for these columns of the
+    trial sheet come first, and `options["cells"]` holds the given texts; `meanings` replaces the help of some of them.
     """
-    with Path(__file__).with_name("options.csv").open(encoding="utf-8", newline="") as file:
-        lines = [line for line in csv.DictReader(file) if command_name in line["commands"].split()]
-    parameters = [_column_parameter(COLUMNS[name], meanings.get(name, "")) for name in columns]
-    parameters += [_parameter(line) for line in lines]
 
-    def decorate(command: _Command) -> _Command:
+    def decorate(function: _Command) -> _Command:
+        wanted = inspect.signature(function).parameters
+        table = _table(lines_of or function.__name__.strip("_"))
+
         def called(**given: Any) -> None:
             cells = {name: text for name in columns if (text := given.pop(name)) is not None}
-            options = {line["field"]: _value(line, given.pop(line["field"])) for line in lines}
-            with errors_as_sentences(options.pop("log")):
-                command(**given, options={**options, "cells": cells} if columns else options)
+            values = {line["field"]: _value(line, given[line["field"]]) for line in table}
+            log, json_file = values.pop("log", None), values.get("json")
+            with errors_as_sentences(log):
+                with progress_line() as report:
+                    tools = {"say": partial(_say, err=json_to_terminal(json_file)), "report": report}
+                    named = {name: value for name, value in {**values, **tools}.items() if name in wanted}
+                    if "options" in wanted:
+                        options = {name: value for name, value in values.items() if name not in {*wanted, "json"}}
+                        named["options"] = {**options, "cells": cells} if columns else options
+                    answer = function(**named)
+                if answer is not None:
+                    lines, content, *failed = answer
+                    print_result(lines, content, json_file)
+                    if any(failed):
+                        raise typer.Exit(1)
 
-        own = [one for one in inspect.signature(command, eval_str=True).parameters.values() if one.name != "options"]
-        keywords = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in (*own, *parameters)]
-        called.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
-        called.__annotations__ = {one.name: one.annotation for one in keywords}
-        called.__name__, called.__doc__ = command.__name__, command.__doc__
+        parameters = [_column_parameter(COLUMNS[name], meanings.get(name, "")) for name in columns]
+        parameters += [_parameter(line) for line in table]
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {one.name: one.annotation for one in parameters}
+        called.__name__, called.__doc__ = function.__name__, function.__doc__
         return called
 
     return decorate
 
 
+@cache
+def _table(command_name: str) -> list[dict[str, str]]:
+    """The lines of `options.csv` for a command."""
+    with Path(__file__).with_name("options.csv").open(encoding="utf-8", newline="") as file:
+        return [line for line in csv.DictReader(file) if command_name in line["commands"].split()]
+
+
 def _parameter(line: Mapping[str, str]) -> inspect.Parameter:
-    """Return the parameter from which Typer makes the option of a line."""
+    """Return the parameter from which Typer makes the argument or option of a line."""
     kind, default = line["kind"], line["default"]
     bounds = {end: json.loads(line[name]) for end, name in (("min", "low"), ("max", "high")) if line[name]}
-    value = json.loads(default) if default and kind in ("number", "count") else default or None
-    info = typer.Option(
-        line["option"],
-        help=line["help"],
-        metavar=line["metavar"] or None,
-        rich_help_panel=line["panel"] or None,
-        show_default=bool(default),
-        **bounds,
+    value = json.loads(default) if kind in ("number", "count", "flag") and default else default or None
+    value = False if kind == "flag" and not default else None if value == "null" else value
+    said: dict[str, Any] = {"help": line["help"], "metavar": line["metavar"] or None}
+    said["show_default"] = value is not None and value is not False
+    required = not line["option"] and not default
+    if line["option"]:
+        info = typer.Option(line["option"], rich_help_panel=line["panel"] or None, **said, **bounds)
+    else:
+        info = typer.Argument(**said)
+    type_ = _TYPES.get(kind, str)
+    return _keyword(
+        line["field"], type_ if required else type_ | None, info, inspect.Parameter.empty if required else value
     )
-    return _keyword(line["field"], _TYPES.get(kind, str) | None, info, False if kind == "flag" else value)
 
 
 def _column_parameter(column: Column, meaning: str) -> inspect.Parameter:
@@ -207,17 +225,29 @@ def _keyword(name: str, kind: Any, info: Any, default: Any) -> inspect.Parameter
 
 def _value(line: Mapping[str, str], given: Any) -> Any:
     """Return the value of an option for the command."""
-    if line["kind"] == "number":
+    kind = line["kind"]
+    if kind == "number":
         return math.nan if given is None else given / float(line["per"] or 1)
-    if line["kind"] == "texts":
+    if kind == "texts":
         return tuple(given or ())
-    if line["kind"] == "choice" and given not in (None, *line["metavar"].split("|")):
-        words = line["metavar"].replace("|", " nor ")
-        raise typer.BadParameter(f"{given!r} is neither {words}", param_hint=line["option"])
-    if line["kind"] == "column" and given is not None:
+    if kind == "choice" and given not in (None, *line["metavar"].split("|")):
+        raise _refused(line, f"{given!r} is neither {line['metavar'].replace('|', ' nor ')}")
+    if kind == "column" and given is not None:
         try:
             return read_cell(COLUMNS[line["field"]], given)
         except CellError as error:
-            message = f"{given!r} {error.message}: {error.allowed or error.remedy}"
-            raise typer.BadParameter(message, param_hint=line["option"]) from None
+            raise _refused(line, f"{given!r} {error.message}: {error.allowed or error.remedy}") from None
+    if kind in _JSON_KINDS and given is not None:
+        type_, example = _JSON_KINDS[kind]
+        try:
+            content = json.loads(given)
+        except ValueError as error:
+            raise _refused(line, f"is not JSON ({error})") from None
+        if not isinstance(content, type_):
+            raise _refused(line, f"is not a JSON {kind} such as {example}")
+        return content
     return given
+
+
+def _refused(line: Mapping[str, str], message: str) -> typer.BadParameter:
+    return typer.BadParameter(message, param_hint=line["option"])

@@ -56,7 +56,7 @@ def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySetting
     return sorted(line for line in messages if line)
 
 
-def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float | None = None) -> Path:
+def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
     """Write the clip of one trial of a results folder with the settings of its run; return its path."""
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import OverlaySettings
@@ -69,7 +69,7 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
         existing = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there are none"
         raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: {existing}")
     settings = OverlaySettings(**(provenance.get("settings") or {}).get("overlays") or {})
-    if seconds is not None:
+    if math.isfinite(seconds):
         settings = settings.model_copy(update={"seconds": seconds})
     return _write_overlay(read.trial(trial), results, settings)
 
