@@ -57,32 +57,32 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> tu
     results = Results(folder)
     damping = read_json(results.damping)
     pairs, kinematics = measured_trials(experiment, results)
-    tables = {results.comparison: COMPARISON_COLUMNS, results.model_check: CHECK_COLUMNS, results.audit: AUDIT_COLUMNS}
-    written: dict[Path, pd.DataFrame] = {}
-    content: dict[str, Any] = {}
-    trajectories: dict[str, pd.DataFrame] = {}
     initial: Fit | None = None
     try:
         initial, fit = _fits(experiment, pairs)
         comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
-        damping_check, check_message = _damping_check(fit, damping)
+        check, messages = _damping_check(fit, damping)
         audited = _audit(fit, comparison, pairs, kinematics)
+        content = summary_of(fit, audited.warnings, messages).to_json()
+        trajectories, tables = comparison.trajectories, (comparison.table, check, audited.table)
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
-    else:
-        content = summary_of(fit, audited.warnings, (check_message,) if check_message else ()).to_json()
-        written = {
-            results.comparison: comparison.table,
-            results.model_check: damping_check,
-            results.audit: audited.table,
-        }
-        trajectories = dict(comparison.trajectories)
-    for path, columns in tables.items():
-        write_csv(path, written.get(path, empty_table(columns)))
-    _write_trajectories(results, trajectories)
+        trajectories, tables = {}, tuple(map(empty_table, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS)))
+    for path, table in zip((results.comparison, results.model_check, results.audit), tables, strict=True):
+        write_csv(path, table)
+    _emptied(folder / "comparison")
+    for condition, table in trajectories.items():
+        write_csv(results.trajectories(condition), table)
     write_json(results.fit, content)
     log.info("%s", content["refused"] or f"fitted {len(content['trials'])} trials")
     return content, initial
+
+
+def _emptied(folder: Path) -> Path:
+    """A folder without the files of an earlier run, whose trials and conditions may no longer exist."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
 
 
 def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit | None, Fit]:
@@ -90,14 +90,11 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     falls by gravity alone, whose fitted g tests the whole chain, is fitted otherwise than for a diagnosis.
     """
     from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
-    from vinetrack.effects import own_effects
     from vinetrack.inference.solving import assemble
     from vinetrack.pipeline.trials import model_of
 
-    model, settings = model_of(experiment), experiment.settings
-    candidates = candidates_of(
-        model, settings.candidates, own_effects([experiment.folder / path for path in settings.effects])
-    )
+    model = model_of(experiment)
+    candidates = candidates_of(model, experiment.settings.candidates, model.user_effects)
     if model.names == ("gravity",):
         return None, initial_fit(model, pairs, candidates, free=("gravity.g",))
     initial = initial_fit(model, pairs, candidates, profile=False)
@@ -106,16 +103,16 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     return initial, replace(fit, pairs=initial.pairs)
 
 
-def _damping_check(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
+def _damping_check(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, tuple[str, ...]]:
     """Return the table `model_check.csv`, and the reason if it is empty."""
     from vinetrack.inference.fit_data import FitError
     from vinetrack.inference.fit_result import CHECK_COLUMNS, check_damping
 
     method = "log_log" if damping["both_axes"].get("refused") else "both_axes"
     try:
-        return check_damping(fit, damping[method]), ""
+        return check_damping(fit, damping[method]), ()
     except FitError as error:
-        return empty_table(CHECK_COLUMNS), str(error)
+        return empty_table(CHECK_COLUMNS), (str(error),)
 
 
 def _audit(
@@ -132,30 +129,16 @@ def _audit(
     return audit(fit.model, motions)
 
 
-def model_errors() -> tuple[type[Exception], ...]:
-    """Return the exceptions of a model that cannot be fitted, whose messages are meant for the user."""
+def _reason(error: Exception) -> str:
+    """Return why there is no fit or verdict; the traceback of an unexpected exception goes to the log."""
     from vinetrack.dynamics.simulate import SimulationError
     from vinetrack.effects import EffectError
     from vinetrack.inference.fit_data import FitError
 
-    return FitError, EffectError, SimulationError
-
-
-def _reason(error: Exception) -> str:
-    """Return why there is no fit or verdict; the traceback of an unexpected exception goes to the log."""
-    if isinstance(error, model_errors()):
+    if isinstance(error, FitError | EffectError | SimulationError):
         return str(error)
     log.exception("no fit or no diagnosis could be made")
     return INTERNAL_ERROR
-
-
-def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame]) -> None:
-    """Write one file per condition, after removing those of an earlier run, whose conditions may no longer exist."""
-    folder = results.folder / "comparison"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for condition, table in trajectories.items():
-        write_csv(results.trajectories(condition), table)
 
 
 def comparison_lines(folder: Path) -> list[str]:
@@ -166,25 +149,25 @@ def comparison_lines(folder: Path) -> list[str]:
     fit, table = read_fit(results), read_result(results.comparison)
     if fit.refused:
         return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"]
+    columns = {  # column: heading, unit, factor, decimals
+        "rms_position_m": ("rms position", "mm", 1e3, 3),
+        "replicate_floor_m": ("replicates", "mm", 1e3, 3),
+        "ratio": ("ratio", "", 1, 1),
+        "rms_final_velocity_m_s": ("rms final speed", "m/s", 1, 3),
+        "worst_at_s": ("worst at", "ms", 1e3, 1),
+        "worst_at_m": ("", "mm", 1e3, 1),
+    }
     body = [
-        (
-            str(row["condition"]),
-            _shown(1e3 * row["rms_position_m"], 3),
-            _shown(1e3 * row["replicate_floor_m"], 3),
-            _shown(row["ratio"], 1),
-            _shown(row["rms_final_velocity_m_s"], 3),
-            _shown(1e3 * row["worst_at_s"], 1),
-            _shown(1e3 * row["worst_at_m"], 1),
-        )
+        [str(row["condition"])]
+        + [
+            f"{factor * row[name]:.{decimals}f}" if np.isfinite(row[name]) else "–"
+            for name, (_, _, factor, decimals) in columns.items()
+        ]
         for row in table.to_dict("records")
     ]
-    head = ("condition", "rms position", "replicates", "ratio", "rms final speed", "worst at", "")
-    lines = aligned(body, head, ("", "mm", "mm", "", "m/s", "ms", "mm"), align="<>>>>>>")
+    headings, units, *_ = zip(*columns.values(), strict=True)
+    lines = aligned(body, ("condition", *headings), ("", *units), align="<>>>>>>")
     return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)]
-
-
-def _shown(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if np.isfinite(value) else "–"
 
 
 # ------------------------------------------------------------------------------
@@ -194,35 +177,34 @@ def _shown(value: float, decimals: int) -> str:
 
 Report = Callable[[str], None]
 Pairs = Sequence[tuple[Trial, Track]]
-PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
-
-
-def _quiet(_: str) -> None:
-    pass
 
 
 def diagnose_results(
-    experiment: Experiment,
-    folder: Path,
-    report: Report = _quiet,
-    settings: RunSettings | None = None,
-    fitted: Fit | None = None,
-) -> dict[str, Any]:
-    """Diagnose the trials of a results folder; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`. Returns
-    `diagnosis.json` as written; `refused` is None, or the reason why there is no verdict.
-    """
+    experiment: Experiment, folder: Path, report: Report, settings: RunSettings, fitted: Fit | None = None
+) -> None:
+    """Diagnose the trials of a results folder; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS
+    from vinetrack.diagnosis.result import Diagnosis
+
     results = Results(folder)
     try:
         diagnosis, pairs = diagnosed(experiment, results, report, fitted)
     except Exception as error:
-        return _write_refusal(results, experiment, _reason(error))
+        reason = _reason(error)
+        explanation = f"No diagnosis could be made: {reason}"
+        refusal = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
+        _emptied(folder / "diagnosis")
+        write_csv(results.ladder, empty_table(LADDER_COLUMNS))
+        write_json(results.diagnosis, {**refusal.to_json(), "model": list(experiment.settings.model)})
+        log.info("%s", explanation)
+        return
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
     report("fitting the damping law under every model")
-    return write_diagnosis(results, diagnosis, pairs, settings)
+    write_diagnosis(results, diagnosis, pairs, settings)
 
 
 def diagnosed(
-    experiment: Experiment, results: Results, report: Report = _quiet, fitted: Fit | None = None
+    experiment: Experiment, results: Results, report: Report, fitted: Fit | None = None
 ) -> tuple[Diagnosis, Pairs]:
     """The diagnosis with the model, candidates, user effects and limits that the experiment states, and with what
     recordings and speeds contradict in its sheet; and its trials.
@@ -268,55 +250,29 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     return sentences | {problem.column: problem.reason for problem in pressure_problems(speeds)}
 
 
-def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dict[str, Any]:
-    from vinetrack.diagnosis.ladder import LADDER_COLUMNS
-    from vinetrack.diagnosis.result import Diagnosis
-
-    explanation = f"No diagnosis could be made: {reason}"
-    refusal = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
-    content = {**refusal.to_json(), "model": list(experiment.settings.model)}
-    _emptied_folder(results)
-    write_csv(results.ladder, empty_table(LADDER_COLUMNS))
-    write_json(results.diagnosis, content)
-    log.info("%s", content["explanation"])
-    return content
-
-
-def _emptied_folder(results: Results) -> Path:
-    folder = results.folder / "diagnosis"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    return folder
-
-
-def write_diagnosis(
-    results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings | None
-) -> dict[str, Any]:
-    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`. Returns `diagnosis.json` as written."""
+def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
+    from vinetrack.inference.fit_summary import summary_of
 
-    folder = _emptied_folder(results)
-    for name, table in _tables_of(diagnosis).items():
-        write_csv(folder / name, table)
+    folder = _emptied(results.folder / "diagnosis")
     has_added = len(diagnosis.fits) > 1
     parameter_changes = moved(diagnosis.fits, ("", *diagnosis.effects)) if has_added else empty_table(MOVED_COLUMNS)
-    write_csv(folder / "moved.csv", parameter_changes)
+    tables = diagnosis_tables(diagnosis) | {
+        "moved.csv": parameter_changes,
+        "damping_laws.csv": _laws(diagnosis, pairs, settings),
+    }
+    for name, table in tables.items():
+        write_csv(folder / name, table)
     if has_added:
-        from vinetrack.inference.fit_summary import summary_of
-
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]).items():
-        path = results.predictions(name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_csv(path, table)
-    write_csv(folder / "damping_laws.csv", _laws(diagnosis, pairs, settings))
+        write_csv(results.predictions(name), table)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
-    content = diagnosis.to_json()
-    write_json(results.diagnosis, content)
-    return content
+    write_json(results.diagnosis, diagnosis.to_json())
 
 
-def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings | None) -> pd.DataFrame:
+def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:
     """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
     from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 
@@ -331,11 +287,11 @@ def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings | None) -> p
     return law_table(laws) if laws else empty_table(LAW_COLUMNS)
 
 
-def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
+def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     """Return the tables of the initial model's misfit and of the missing force, by file name."""
     from vinetrack.diagnosis.drift import drift_groups
 
-    tables: dict[str, pd.DataFrame] = {}
+    tables = {"missing_force.csv": diagnosis.force_table, "learned_force.csv": diagnosis.learned_table}
     if (failure := diagnosis.failure) is not None:
         tables |= {
             "conditions.csv": failure.by_condition,
@@ -344,33 +300,32 @@ def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
             "along_speed.csv": failure.along_speed,
             "drift_groups.csv": drift_groups(failure.drift, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
         }
-    if diagnosis.force_table is not None:
-        tables["missing_force.csv"] = diagnosis.force_table
-    if diagnosis.learned_table is not None:
-        tables["learned_force.csv"] = diagnosis.learned_table
-    return tables
+    return {name: table for name, table in tables.items() if table is not None}
 
 
 def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
     """Predict every trial with the initial and the final model. As in `comparison.csv` and the ladder, only release and
-    origin are fitted per trial. `model_after_m` is NaN if no effect was added. Returns by name of trial, columns
-    `PREDICTION_COLUMNS`: s and m.
+    origin are fitted per trial. `model_after_m` is NaN if no effect was added. Returns by name of trial: s and m.
     """
     import pandas as pd
 
     from vinetrack.diagnosis.ladder import in_sample
 
-    first = in_sample(before).trials
-    last = in_sample(after).trials if after is not before else first
-    tables = {}
-    for under_first, under_last in zip(first, last, strict=True):
-        later = under_last.predicted_position_m if after is not before else np.full(under_first.time_s.size, np.nan)
-        columns = (under_first.time_s, under_first.lead_position_m, under_first.predicted_position_m, later)
-        tables[under_first.name] = pd.DataFrame(dict(zip(PREDICTION_COLUMNS, columns, strict=True)))
-    return tables
+    final = {} if after is before else {one.name: one.predicted_position_m for one in in_sample(after).trials}
+    return {
+        one.name: pd.DataFrame(
+            {
+                "time_s": one.time_s,
+                "lead_position_m": one.lead_position_m,
+                "model_before_m": one.predicted_position_m,
+                "model_after_m": final.get(one.name, np.nan),
+            }
+        )
+        for one in in_sample(before).trials
+    }
 
 
-def add_effect(experiment: Experiment, folder: Path, name: str, report: Report = _quiet) -> list[str]:
+def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> list[str]:
     """Add an effect to the model and refit; the errors are appended to `ladder.csv`."""
     import pandas as pd
 

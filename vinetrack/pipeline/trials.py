@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR
-from vinetrack.core.records import Kinematics, Track, Trial, Window
+from vinetrack.core.records import Track, Trial, Window
 from vinetrack.core.tables import is_disk_full, write_bytes, write_csv, write_json
 from vinetrack.figures.registry import describe_trial
 from vinetrack.results.folder_layout import (
@@ -49,10 +49,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from vinetrack.core.problems import Problem
     from vinetrack.dynamics.model import Model
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import DampingSettings, FigureSettings, RunSettings
+    from vinetrack.kinematics.summary import TrialResult
     from vinetrack.video.survey import Measurement
     from vinetrack.video.track import Tracking
 
@@ -61,9 +61,8 @@ if TYPE_CHECKING:
 # What a run need not make twice: tracks in pixels and figures of trials, kept in the results by their inputs.
 #
 # Snakemake deletes the outputs of a job before it runs it again; what is kept lies beside them, in a folder that it
-# does
-# not know. A file that is replaced, or another version of the program, has another key; what no run asks for in a month
-# is dropped.
+# does not know. A file that is replaced, or another version of the program, has another key; what no run asks for in a
+# month is dropped.
 
 PACKAGE = Path(__file__).parents[1]
 TRACKER_LIBRARIES = ("numpy", "scipy", "numba", "av", "opencv-python-headless", "scikit-image")
@@ -101,8 +100,8 @@ class Kept:
         film, *others = inputs
         assert isinstance(film, Path)
         libraries = [version(name) for name in TRACKER_LIBRARIES]
-        # ("core", "tracks", "video"): rooms whose code a track in pixels depends on
-        self.tracked = _key(code_hash(*("core", "tracks", "video")), libraries, film.resolve(), identity(film), others)
+        code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
+        self.tracked = _key(code, libraries, film.resolve(), identity(film), others)
         path = self.folder / f"{self.tracked}.npz"
         if not (data := _read(path)):
             data = packed(make())
@@ -112,29 +111,26 @@ class Kept:
     def figure(
         self,
         inputs: tuple[object, ...],
-        path: Callable[[str], Path],
+        path: Callable[..., Path],
         settings: FigureSettings,
         draw: Callable[[], Figure],
     ) -> None:
         """Write a figure in every format, kept for these inputs or drawn; `path` gives the path for a suffix."""
         key = _key(code_hash(), settings.dpi, inputs)
-        places: dict[str, Path] = {form: self.folder / f"{key}.{form}" for form in settings.formats}
-        found = {form: _read(place) for form, place in places.items()}
+        found = {form: _read(self.folder / f"{key}.{form}") for form in settings.formats}
         if missing := [form for form, data in found.items() if not data]:
             from vinetrack.figures.style import render
 
-            made = render(draw(), missing, settings.dpi)
-            for form in missing:
-                write_bytes(places[form], made[form])
-            found.update(made)
+            for form, data in render(draw(), missing, settings.dpi).items():
+                write_bytes(self.folder / f"{key}.{form}", data)
+                found[form] = data
         for form, data in found.items():
-            write_bytes(path(f".{form}"), data)
+            write_bytes(path(suffix=f".{form}"), data)
 
     def forget(self) -> None:
         """Drop what no run has asked for in a long time."""
         for path in self.folder.glob("*"):
-            # 30 * 86400.0: time after which what nobody asks for is dropped (chosen)
-            if path.stat().st_mtime < time.time() - (30 * 86400.0):
+            if path.stat().st_mtime < time.time() - 30 * 86400:  # a month (chosen)
                 path.unlink(missing_ok=True)
 
 
@@ -153,8 +149,6 @@ def _read(path: Path) -> bytes:
 
 def packed(tracking: Tracking) -> bytes:
     """A tracking in pixels as a file of arrays without pickled objects."""
-    import numpy as np
-
     from vinetrack.video.curved_axis import axis_entry
 
     track, ending = tracking.track, tracking.ending
@@ -177,9 +171,6 @@ def packed(tracking: Tracking) -> bytes:
 
 def unpacked(data: bytes) -> Tracking:
     """Read what `packed` wrote."""
-    import numpy as np
-
-    from vinetrack.core.records import Track
     from vinetrack.video.curved_axis import axis_from_entry
     from vinetrack.video.point_quality import Ending
     from vinetrack.video.track import Tracking
@@ -291,89 +282,66 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
     of an unexpected exception (blank if there was none).
     """
     from vinetrack.kinematics.summary import TrialError, summarise_trial
-    from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
+    from vinetrack.tracks.importers import TrackError, load_track
     from vinetrack.video.frames import RecordingError
 
     reason, fault, kept = experiment.failed.get(name, ""), "", Kept(results.folder)
-    if reason:
-        _write(results, name, _bare_row(name, "failed", reason))
-        _draw_trial(name, None, results, settings.figures, kept)
-        return name, reason, fault
-    trial, measurement, summary = experiment.trial(name), None, None
+    trial = None if reason else experiment.trial(name)
+    measurement, summary = None, None
     columns: dict[str, float] = {}
     view: dict[str, Any] = {}
     try:
-        if trial.video is None:
-            track = load_track(trial)
-        else:
+        if trial is not None and trial.video is None:
+            summary = summarise_trial(trial, load_track(trial), settings, model_of(experiment))
+        elif trial is not None:
             from vinetrack.video.survey import measure_recording
 
             measurement = measure_recording(trial, experiment.settings, experiment.folder, kept.track)
-            contradictions = _contradictions(trial, measurement)
-            track = measurement.tracking.track
-            track = replace(track, notes=(*track.notes, *(problem.reason for problem in contradictions)))
-            track = with_pressure_trace(trial, track)
-            columns = {
-                "mm_per_px": 1e3 * measurement.m_per_px,
-                "scale_rel_sigma": measurement.scale_rel_sigma,
-                "tube_width_mm": 1e3 * measurement.m_per_px * measurement.tracking.tube_width_px,
-            }
-            view = _calibration_and_axis(measurement, getattr(experiment.settings.calibration, "image", None))
-            view["contradictions"] = [{"column": one.column, "reason": one.reason} for one in contradictions]
-        summary = summarise_trial(trial, track, settings, model_of(experiment))
+            track, columns, view = _of_recording(trial, measurement, experiment)
+            summary = summarise_trial(trial, track, settings, model_of(experiment))
     except (RecordingError, TrackError, TrialError) as error:
-        from_file = trial.track if isinstance(error, TrackError) and trial.video is None else None
+        from_file = trial.track if trial is not None and trial.video is None and isinstance(error, TrackError) else None
         reason = f"{from_file.name} {error}" if from_file else str(error)
     except Exception as error:
         if is_disk_full(error):
             raise  # a full disk is not a fault of this trial
         reason, fault = TRIAL_NOT_ANALYSED, traceback.format_exc()
-    if summary is None:
-        _write(results, name, failed_row(trial, reason), **view)
-    else:
-        row = dict(summary.row) | columns
-        point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
-        windows = [_window_row(name, window) for window in summary.windows.values()]
-        tables = _track_table(summary.track), _kinematics_table(summary.kinematics)
-        _write(results, name, row, *tables, windows=windows, point=point, **view)
+    row = _bare_row(name, "failed", reason, trial) if summary is None else dict(summary.row) | columns
+    _write(results, name, summary, row, view)
     _draw_trial(name, trial, results, settings.figures, kept)
-    if trial.video is not None:
+    if trial is not None and trial.video is not None:
         _draw_strip(trial, results, measurement, reason, settings.figures, kept)
     return name, reason, fault
 
 
-def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:
-    """Return the measured sizes and exposures that contradict the sheet, as warnings."""
+def _of_recording(
+    trial: Trial, measurement: Measurement, experiment: Experiment
+) -> tuple[Track, dict[str, float], dict[str, Any]]:
+    """Return the track of a recording, its columns of `trials.csv`, and what pages show of it as JSON entries: its
+    calibration, the axis along which its `edge_px` is measured, and what contradicts the sheet.
+    """
+    from vinetrack.tracks.importers import with_pressure_trace
+    from vinetrack.video.curved_axis import axis_entry
     from vinetrack.video.frames import RecordingError
     from vinetrack.video.survey import exposure_problems, size_problems, tracked_facts
 
-    problems = size_problems(trial, tracked_facts(trial, measurement))
-    problems += exposure_problems(trial, measurement.tracking)
-    errors = [problem.reason for problem in problems if problem.severity == "error"]
-    if errors:
+    tracking, calibration = measurement.tracking, measurement.calibration
+    problems = [*size_problems(trial, tracked_facts(trial, measurement)), *exposure_problems(trial, tracking)]
+    if errors := [problem.reason for problem in problems if problem.severity == "error"]:
         raise RecordingError("; ".join(errors))
-    return problems
-
-
-def _calibration_and_axis(measurement: Measurement, image: str | None) -> dict[str, Any]:
-    """Return the calibration of a recording, and the axis along which its `edge_px` is measured, as JSON entries."""
-    from vinetrack.video.curved_axis import axis_entry
-
-    calibration = measurement.calibration
-    entry: dict[str, Any] = {
-        "kind": "sheet" if calibration is None else calibration.kind,
-        "image": image if calibration is not None else None,
-        "mm_per_px": 1e3 * measurement.m_per_px,
-        "scale_rel_sigma": measurement.scale_rel_sigma,
-        "reprojection_px": None if calibration is None else calibration.reprojection_px,
-        "n_corners": 0 if calibration is None else calibration.n_corners,
-        "n_pictures": 0 if calibration is None else calibration.n_pictures,
-        "notes": [] if calibration is None else calibration.notes,
-    }
-    axis, shake_px = measurement.tracking.axis, measurement.tracking.shake_px
-    line = axis_entry(axis) | {"width_px": axis.width_px}
-    line |= {"shake_px": shake_px.round(2)} if np.any(shake_px) else {}
-    return {"calibration": entry, "axis": line}
+    track = replace(tracking.track, notes=(*tracking.track.notes, *(problem.reason for problem in problems)))
+    mm_per_px = 1e3 * measurement.m_per_px
+    scale = {"mm_per_px": mm_per_px, "scale_rel_sigma": measurement.scale_rel_sigma}
+    seen: dict[str, Any] = {"kind": "sheet", "image": None, **scale}
+    if calibration is not None:
+        seen |= {"kind": calibration.kind, "image": getattr(experiment.settings.calibration, "image", None)}
+    known = {"reprojection_px": None, "n_corners": 0, "n_pictures": 0, "notes": []}
+    seen |= {name: getattr(calibration, name, blank) for name, blank in known.items()}
+    axis = axis_entry(tracking.axis) | {"width_px": tracking.axis.width_px}
+    axis |= {"shake_px": tracking.shake_px.round(2)} if np.any(tracking.shake_px) else {}
+    contradictions = [{"column": problem.column, "reason": problem.reason} for problem in problems]
+    view = {"calibration": seen, "axis": axis, "contradictions": contradictions}
+    return with_pressure_trace(trial, track), scale | {"tube_width_mm": mm_per_px * tracking.tube_width_px}, view
 
 
 @lru_cache(maxsize=1)
@@ -389,32 +357,30 @@ def model_of(experiment: Experiment) -> Model:
     return _model(experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects))
 
 
-def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
-    """Return the row of `trials.csv` of a trial that failed."""
-    return _bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
-
-
-def _bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
-    """Return a row of `trials.csv` for a trial without results."""
+def _bare_row(name: str, status: str, reason: str, trial: Trial | None = None) -> dict[str, Any]:
+    """Return a row of `trials.csv` for a trial without results; `trial` is None if its row of the sheet is faulty."""
     blank: dict[str, Any] = dict.fromkeys(TRIALS_COLUMNS, np.nan)
-    return blank | {"trial": trial, "vine": "", "condition": "", "status": status, "reason": reason, "steady_rule": ""}
+    vine, condition = ("", "") if trial is None else (trial.vine, trial.condition)
+    return blank | {
+        "trial": name, "vine": vine, "condition": condition, "status": status, "reason": reason, "steady_rule": "",
+    }  # fmt: skip
 
 
-def _write(
-    results: Results,
-    trial: str,
-    row: dict[str, Any],
-    track: pd.DataFrame | None = None,
-    kinematics: pd.DataFrame | None = None,
-    *,
-    windows: Sequence[dict[str, Any]] = (),
-    point: dict[str, Any] | None = None,
-    **view: Any,
-) -> None:
+def _write(results: Results, name: str, summary: TrialResult | None, row: dict[str, Any], view: dict[str, Any]) -> None:
     """Write the files of a trial; without results, tables with headers only and its row."""
-    write_csv(results.track(trial), empty_table(TRACK_COLUMNS) if track is None else track)
-    write_csv(results.kinematics(trial), empty_table(KINEMATICS_COLUMNS) if kinematics is None else kinematics)
-    write_json(results.analysed(trial), {"row": row, "windows": windows, "point": point, **view})
+    import pandas as pd
+
+    content: dict[str, Any] = {"row": row, "windows": (), "point": None}
+    track, kinematics = empty_table(TRACK_COLUMNS), empty_table(KINEMATICS_COLUMNS)
+    if summary is not None:
+        track = _track_table(summary.track)
+        kinematics = pd.DataFrame({column: getattr(summary.kinematics, column) for column in KINEMATICS_COLUMNS})
+        point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
+        windows = [_window_row(name, window) for window in summary.windows.values()]
+        content |= {"windows": windows, "point": point}
+    write_csv(results.track(name), track)
+    write_csv(results.kinematics(name), kinematics)
+    write_json(results.analysed(name), content | view)
 
 
 def _track_table(track: Track) -> pd.DataFrame:
@@ -434,13 +400,6 @@ def _track_table(track: Track) -> pd.DataFrame:
     return pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
 
 
-def _kinematics_table(kinematics: Kinematics) -> pd.DataFrame:
-    """Return kinematics as the table `kinematics/<trial>.csv`."""
-    import pandas as pd
-
-    return pd.DataFrame({column: getattr(kinematics, column) for column in KINEMATICS_COLUMNS})
-
-
 def _window_row(trial: str, window: Window) -> dict[str, Any]:
     low, high = window.drift_95
     row = {column: getattr(window, column, None) for column in STEADY_COLUMNS}
@@ -449,30 +408,26 @@ def _window_row(trial: str, window: Window) -> dict[str, Any]:
 
 def _draw_trial(name: str, trial: Trial | None, results: Results, settings: FigureSettings, kept: Kept) -> None:
     """Draw position, speed and steady windows of a trial, unless nothing in them changed."""
-    windows = _frame(read_json(results.analysed(name))["windows"], STEADY_COLUMNS)
+    title, ratio = (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
 
     def draw() -> Figure:
         from vinetrack.figures.style import blank
 
-        title = describe_trial(trial) if trial is not None else name
-        return draw_trial(results, trial, name, windows) or blank(f"{title}: no positions to draw.")
+        return draw_trial(results, trial, name) or blank(f"{title}: no positions to draw.")
 
-    shown = [results.track(name), results.kinematics(name)]
-    content = hashlib.sha256(b"".join(path.read_bytes() for path in shown)).hexdigest()
-    about = describe_trial(trial) if trial is not None else "", trial.travel_ratio if trial is not None else 0
-    inputs = "trial", name, *about, content, windows.to_csv()
-    kept.figure(inputs, partial(results.trial_figure, name), settings, draw)
+    shown = [path(name).read_bytes() for path in (results.track, results.kinematics, results.analysed)]
+    kept.figure(("trial", title, ratio, *shown), partial(results.trial_figure, name), settings, draw)
 
 
-def draw_trial(results: Results, trial: Trial | None, name: str, windows: pd.DataFrame | None = None) -> Figure | None:
+def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | None:
     """Draw position, speed and steady windows of one trial; None if there are no positions."""
     from vinetrack.figures.motion_figures import draw_trial_motion
 
-    title, ratio = (describe_trial(trial), trial.travel_ratio) if trial is not None else (name, 2.0)
-    if windows is None:
-        windows = read_result(results.steady).loc[lambda table: table["trial"] == name]
-    tables = read_result(results.track(name)), read_result(results.kinematics(name))
-    return draw_trial_motion(title, *tables, windows, ratio)
+    title, ratio = (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
+    windows = _frame(read_json(results.analysed(name))["windows"], STEADY_COLUMNS)
+    return draw_trial_motion(
+        title, read_result(results.track(name)), read_result(results.kinematics(name)), windows, ratio
+    )
 
 
 def _draw_strip(
@@ -488,9 +443,8 @@ def _draw_strip(
             return blank(f"{trial.name}: {reason}")
         return draw_strip(trial.name, measurement.tracking, measurement.m_per_px)
 
-    inputs: tuple[object, ...] = ("strip", trial.name, reason)
-    if measurement is not None:
-        inputs = ("strip", trial.name, kept.tracked, measurement.m_per_px, trial.corrections)
+    shown = (reason,) if measurement is None else (kept.tracked, measurement.m_per_px, trial.corrections)
+    inputs: tuple[object, ...] = ("strip", trial.name, *shown)
     kept.figure(inputs, partial(results.strip_figure, trial.name), settings, draw)
 
 
@@ -509,12 +463,11 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     rows = {name: content["row"] for name, content in analysed.items()}
     rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
     table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
-    write_csv(
-        results.steady, _frame([row for content in analysed.values() for row in content["windows"]], STEADY_COLUMNS)
-    )
-    points = _frame([c["point"] for c in analysed.values() if c["point"]], POINT_COLUMNS)
-    write_csv(results.points, mark_left_out(points))
+    windows = _frame([row for content in analysed.values() for row in content["windows"]], STEADY_COLUMNS)
+    points = _frame([content["point"] for content in analysed.values() if content["point"]], POINT_COLUMNS)
     evaluated_at = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
+    write_csv(results.steady, windows)
+    write_csv(results.points, mark_left_out(points))
     write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
     write_csv(results.trials, table)
     for row in table.itertuples():
@@ -526,22 +479,21 @@ def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]
     """Return, as failed trials, those whose axis is askew to that of most other trials with the same growth angle."""
     from vinetrack.video.axis import askew_trials, slope_deg
 
-    failed: dict[str, dict[str, Any]] = {}
     if experiment.settings.axis is not None:
-        return failed
-    tracked = [
-        (name, content.get("axis")) for name, content in analysed.items() if content["row"]["status"] != "failed"
-    ]
+        return {}
+    axes = {name: content.get("axis") for name, content in analysed.items() if content["row"]["status"] != "failed"}
     slopes_deg = {
-        name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis) for name, axis in tracked if axis
+        name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis) for name, axis in axes.items() if axis
     }
+    failed: dict[str, dict[str, Any]] = {}
     for names, agreed in askew_trials(slopes_deg, experiment.trials):
+        reason = (
+            f"its growth axis was found askew to that of {agreed} other recordings: another moving object, such as "
+            "a door, was taken for the tube; state its axis in the column `axis`, even if the camera was turned"
+        )
         for name in names:
-            reason = (
-                f"its growth axis was found askew to that of {agreed} other recordings: another moving object, such as "
-                "a door, was taken for the tube; state its axis in the column `axis`, even if the camera was turned"
-            )
-            failed[name] = {"row": failed_row(experiment.trial(name), reason), "windows": [], "point": None}
+            row = _bare_row(name, "failed", reason, experiment.trial(name))
+            failed[name] = {"row": row, "windows": [], "point": None}
     return failed
 
 
@@ -549,12 +501,12 @@ def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame
     """Return rows, or none, as a table with typed columns; a number that JSON stores as null becomes NaN."""
     import pandas as pd
 
-    frame = pd.DataFrame(rows, columns=list(columns))
-    counts = [column for column in columns if column in COUNT_COLUMNS]
-    truths = [column for column in columns if column in TRUTH_COLUMNS]
-    numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS | COUNT_COLUMNS]
-    kinds = dict.fromkeys(numbers, "float") | dict.fromkeys(counts, "Int64") | dict.fromkeys(truths, "bool")
-    return frame.astype(kinds)
+    kinds = {
+        column: "Int64" if column in COUNT_COLUMNS else "bool" if column in TRUTH_COLUMNS else "float"
+        for column in columns
+        if column not in TEXT_COLUMNS
+    }
+    return pd.DataFrame(rows, columns=list(columns)).astype(kinds)
 
 
 def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
