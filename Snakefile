@@ -13,7 +13,7 @@ include: "vinetrack/pipeline/Snakefile"
 
 
 onstart:  # Snakemake takes hooks from this file alone
-    begin_run_or_exit(plan)
+    atexit.register(or_exit(begin_run, plan.results, plan.experiment).release)
 
 
 onerror:

@@ -20,7 +20,6 @@ from vinetrack.pipeline.workflow import (
     RunPaths,
     begin_run,
     check_before_run,
-    claim_results,
     command_for_results,
     make_plan,
     run_chain,
@@ -208,7 +207,7 @@ def test_the_command_that_renews_results_writes_them_where_they_are(
 
 def test_experiments_of_one_name_never_share_results(tmp_path: Path) -> None:
     first, second = (experiment(tmp_path / week / "vines") for week in ("monday", "friday"))
-    claim_results(tmp_path / "out" / "vines", first)
+    begin_run(tmp_path / "out" / "vines", first).release()
     with pytest.raises(ExperimentError) as refused:
         run_paths(second, tmp_path / "out")
     assert str(first) in str(refused.value)
@@ -220,7 +219,7 @@ def test_experiments_of_one_name_never_share_results(tmp_path: Path) -> None:
 
 def test_an_experiment_that_has_moved_keeps_its_results(tmp_path: Path) -> None:
     first = experiment(tmp_path / "vines")
-    claim_results(tmp_path / "out" / "vines", first)
+    begin_run(tmp_path / "out" / "vines", first).release()
     moved = first.rename(tmp_path / "else")
     moved = moved.rename(tmp_path / "new") / "."
     assert make_plan({"experiment": str(moved), "results": str(tmp_path / "out" / "vines")}, tmp_path).trials == ("a",)

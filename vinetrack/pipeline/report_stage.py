@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, campaign_figures, draw, figures_of
-from vinetrack.pipeline.workflow import SHARED_FILES
+from vinetrack.pipeline.workflow import SHARED_FILES, input_files
 from vinetrack.results.folder_layout import Results, ResultsError, read_fit, read_json, read_result
 from vinetrack.results.folder_layout import read_diagnosis as stored_diagnosis
 
@@ -227,12 +227,8 @@ def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
 
 
 def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
-    inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
-    target = getattr(experiment.settings.calibration, "image", None)
-    inputs += [experiment.folder / target] if target is not None else []
-    inputs += [experiment.folder / path for path in experiment.settings.effects]
-    shared = [path for name in SHARED_FILES if (path := experiment.folder / name).exists()]
-    return describe_run(experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model)
+    inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
+    return describe_run(experiment.folder, inputs, dict(settings), experiment.settings.model)
 
 
 def _paper_section(tables: FigureTables) -> ReportSection:

@@ -5,7 +5,6 @@ Imports stay light: Snakemake loads this module at every start and in every job.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import difflib
 import json
@@ -19,7 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
 from vinetrack.core.tables import is_readable, write_text
@@ -31,8 +30,12 @@ from vinetrack.pipeline.trials import PACKAGE, Kept, code_hash
 if TYPE_CHECKING:
     from filelock import FileLock
 
+    from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
     from vinetrack.video.survey import Keep
+
+Say = Callable[[str], None]
+Made = TypeVar("Made")
 
 
 # ------------------------------------------------------------------------------
@@ -89,11 +92,9 @@ def find_ground_truth(folder: Path, base: Path) -> Path | None:
 def refuse_shared_results(results: Path, experiment: Path) -> None:
     """Refuse a results folder that holds the results of another experiment."""
     for name in ("provenance.json", CLAIM_FILE):
-        try:
-            made_from = Path(str(json.loads((results / name).read_text(encoding="utf-8"))["experiment"]))
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        if made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
+        stated = _claim(results / name).get("experiment")
+        made_from = Path(str(stated))
+        if stated and made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
             message = f"holds the results of {made_from}, not of {experiment.absolute()}"
             remedy = (
                 "choose another results folder (vinetrack run --results DIR, snakemake --config results=DIR), "
@@ -102,17 +103,10 @@ def refuse_shared_results(results: Path, experiment: Path) -> None:
             raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)])
 
 
-def claim_results(results: Path, experiment: Path) -> None:
-    """Record to which experiment a results folder belongs, before the first result is written, and who writes it."""
-    write_text(
-        results / CLAIM_FILE, json.dumps({"experiment": experiment.absolute().as_posix(), "process": os.getpid()})
-    )
-
-
-def _claim(results: Path) -> dict[str, Any]:
-    """Read what `claim_results` has written; empty where there is nothing readable."""
+def _claim(path: Path) -> dict[str, Any]:
+    """Read what a file of the results says of its experiment; empty where there is nothing readable."""
     try:
-        content = json.loads((results / CLAIM_FILE).read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -142,10 +136,6 @@ def has_wildcard(path: Path) -> bool:
 # when a run is killed; the profile and `vinetrack run` do without them.
 
 
-# Temporary names of files that are being written
-UNFINISHED_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
-
-
 def refuse_running(results: Path) -> None:
     """Refuse a results folder that another running process writes."""
     if results.is_dir():
@@ -156,30 +146,27 @@ def _locked(results: Path) -> FileLock:
     """Return the lock of a results folder, held by this process."""
     from filelock import FileLock, Timeout
 
-    run_lock = ".run.lock"
     results.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(results.absolute() / ".run.lock", timeout=0)
     try:
-        lock = FileLock(results.absolute() / run_lock, timeout=0)
         lock.acquire()
     except Timeout:
-        process = _claim(results).get("process", "unknown")
-        problem = Problem(
-            message=f"is being written by another run, process {process}",
-            file=str(results),
-            remedy="wait until it ends, or stop it",
-        )
-        raise ExperimentError([problem]) from None
+        process = _claim(results / CLAIM_FILE).get("process", "unknown")
+        message, remedy = f"is being written by another run, process {process}", "wait until it ends, or stop it"
+        raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)]) from None
     return lock
 
 
 def begin_run(results: Path, experiment: Path) -> FileLock:
-    """Make this process the owner of a results folder until it ends, and clean up after a killed run."""
+    """Make this process the owner of a results folder until it ends, record that, and clean up after a killed run."""
     lock = _locked(results)
-    claim_results(results, experiment)
+    claim = {"experiment": experiment.absolute().as_posix(), "process": os.getpid()}
+    write_text(results / CLAIM_FILE, json.dumps(claim))
+    unfinished = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")  # names of files that are being written
     for path in [*results.rglob("*"), *experiment.glob("*")]:
         with contextlib.suppress(OSError):
             # 60.0: age from which an unfinished file counts as abandoned; others may be written now (chosen)
-            if UNFINISHED_FILES.fullmatch(path.name) and time.time() - path.stat().st_mtime >= 60.0:
+            if unfinished.fullmatch(path.name) and time.time() - path.stat().st_mtime >= 60.0:
                 path.unlink()
     return lock
 
@@ -259,8 +246,6 @@ class WorkflowPlan:
         if group.startswith("<made of"):
             stage = self.stages.get(group[9:-1])
             return [path for part in stage.writes for path in self.files(part)] if stage else []
-        stated = [path for path in self.inputs if path.name in SHARED_FILES or path.suffix == ".py"]
-        measured = [path for path in self.inputs if path not in stated]
         per_trial = {"<tracks>": ".csv", "<kinematics>": ".csv", "<analysed>": ".json"}
         if group in per_trial:
             return [self.result(group[1:-1], f"{trial}{per_trial[group]}") for trial in trials]
@@ -269,8 +254,8 @@ class WorkflowPlan:
             return [*self._figures("trial_", trials), *self._figures("strip_", filmed)]
         if group == "<paper>":
             return [*(self.result(f"{name}.csv") for name in PAPER_TABLES), *self._figures("", figures_of("paper"))]
-        chosen = {"<experiment>": stated, "<measurements>": measured, "<inputs>": self.inputs}[group]
-        return [path.as_posix() for path in chosen]
+        kinds = {"<experiment>": (True,), "<measurements>": (False,), "<inputs>": (True, False)}[group]
+        return [path.as_posix() for path in self.inputs if _is_stated(path) in kinds]
 
     def result(self, *parts: str) -> str:
         """Path of a result."""
@@ -288,6 +273,23 @@ class WorkflowPlan:
         return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
 
+def input_files(experiment: Experiment) -> list[Path]:
+    """The files of an experiment, whether they are there or not: what is stated, then what was measured."""
+    folder, settings = experiment.folder, experiment.settings
+    effects = [folder / path for path in settings.effects]
+    beside = [file for path in effects for file in sorted(path.parent.glob("*.py"))]  # which an effect may import
+    target = getattr(settings.calibration, "image", None)
+    targets = [] if target is None else [folder / target]
+    measured = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace)]
+    files = [*(folder / name for name in SHARED_FILES), *effects, *beside, *targets, *filter(None, measured)]
+    return list(dict.fromkeys(files))
+
+
+def _is_stated(path: Path) -> bool:
+    """Whether an input is written by people: the sheet, settings, corrections, and effects."""
+    return path.name in SHARED_FILES or path.suffix == ".py"
+
+
 def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     """Plan a run: read the settings and the sheet, and list the input files."""
     from vinetrack.experiment.folder import read_experiment
@@ -301,62 +303,36 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     if not folder.exists() and find_ground_truth(base / folder, base):
         folder = base / folder
     ground_truth = find_ground_truth(folder, base)
-    is_virtual = ground_truth is not None
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
     if problems := path_problems(folder, results):
         raise ExperimentError(problems)
     refuse_shared_results(results, folder)
-    trials = tuple(name for name in experiment.names if name not in experiment.left_out)
-    files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
-    present = (path for path in files if path is not None and (is_virtual or is_readable(path)))
-    # An own effect may import what lies beside it.
-    effects = [folder / path for path in experiment.settings.effects]
-    effect_files = dict.fromkeys([*effects, *(file for path in effects for file in sorted(path.parent.glob("*.py")))])
-    shared = [path for path in (*(folder / name for name in SHARED_FILES), *effect_files) if is_readable(path)]
-    target = getattr(experiment.settings.calibration, "image", None)
-    targets = [folder / target] if target is not None and (is_virtual or is_readable(folder / target)) else []
-    inputs = dict.fromkeys([*shared, *targets, *present])
-    watched = {path: None for path in inputs if not has_wildcard(path)}
+    # The virtual laboratory has yet to make the measurements of its experiments.
+    inputs = [path for path in input_files(experiment) if is_readable(path) or (ground_truth and not _is_stated(path))]
+    unwatched = [(path.name, path.stat()) for path in inputs if has_wildcard(path) and path.exists()]
     return WorkflowPlan(
         experiment=folder,
         results=results,
-        trials=trials,
+        trials=tuple(name for name in experiment.names if name not in experiment.left_out),
         filmed=tuple(trial.name for trial in experiment.trials if trial.video is not None),
-        inputs=tuple(watched),
-        unwatched=_fingerprint(inputs),
+        inputs=tuple(path for path in inputs if not has_wildcard(path)),
+        unwatched=";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in unwatched),
         settings=settings,
         ground_truth=ground_truth,
         published=experiment.settings.published is not None,
     )
 
 
-def _fingerprint(inputs: Iterable[Path]) -> str:
-    """Size and modification time of the inputs that Snakemake cannot watch, so that their changes cause a rerun."""
-    stats = [(path.name, path.stat()) for path in inputs if has_wildcard(path) and path.exists()]
-    return ";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats)
-
-
-def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
-    """Call `make_plan`; print its problems in at most 20 lines and exit with status 1. For the Snakefile, where an
+def or_exit(function: Callable[..., Made], *given: Any) -> Made:
+    """Call a function; print its problems in at most 20 lines and exit with status 1. For the Snakefile, where an
     exception would be printed with Snakemake's traceback.
     """
     try:
-        return make_plan(config, base)
-    except ExperimentError as error:
-        print("\n".join(format_problems(error.problems)), file=sys.stderr)
-        sys.stderr.flush()
-        raise SystemExit(1) from None
-
-
-def begin_run_or_exit(plan: WorkflowPlan) -> None:
-    """Call `begin_run`; print a refusal and exit with status 1. For the Snakefile, like `make_plan_or_exit`."""
-    try:
-        lock = begin_run(plan.results, plan.experiment)
+        return function(*given)
     except ExperimentError as error:
         print("\n".join(format_problems(error.problems)), file=sys.stderr, flush=True)
         raise SystemExit(1) from None
-    atexit.register(lock.release)
 
 
 def print_report_path(plan: WorkflowPlan, workflow: Any) -> None:
@@ -398,8 +374,7 @@ class CheckReport:
 
     def lines(self) -> list[str]:
         """Return facts and notes, then the problems in at most 20 lines, notes included."""
-        facts = [*self.recording_lines, *self.notes]
-        return [*facts, *format_problems(self.problems, 20 - len(self.notes))]
+        return [*self.recording_lines, *self.notes, *format_problems(self.problems, 20 - len(self.notes))]
 
     def to_json(self) -> dict[str, Any]:
         """Return the report for a program."""
@@ -425,18 +400,18 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         return CheckReport(tuple(problems), (), (), ())
     facts = {trial.name: recording_facts for trial, recording_facts in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
-    speeds = [(trial, facts[trial.name].mean_speed_m_s) for trial in trials]
+    entries = [facts[trial.name] for trial in trials]
     tracks = []
     for trial in experiment.trials:
         if trial.track is not None:
             with contextlib.suppress(TrackError):
                 tracks.append((trial, load_track(trial)))
+    speeds = [(trial, entry.mean_speed_m_s) for trial, entry in zip(trials, entries, strict=True)]
     speeds += [(trial, mean_speed(track)) for trial, track in tracks]
     # The plausibility of a pressure depends on the sizes, so it is tested only if these have no errors.
     if not any(problem.severity == "error" for problem in problems):
         stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
         problems += [replace(problem, file=stated_in) for problem in pressure_problems(speeds)]
-    entries = [facts[trial.name] for trial in trials]
     lines = facts_rows(entries, trials) if entries else []
     if 0 < len(surveyor.looked_into) < len(entries):
         lines.append(f"{len(surveyor.looked_into)} of {len(entries)} recordings were examined, one of each condition")
@@ -453,8 +428,6 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
         )
     return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), tuple(lines), tuple(notes))
 
-
-Say = Callable[[str], None]
 
 RUN = "VINETRACK_RUN"  # Variable that asks stages to say in a line what they have done
 _PROGRESS = re.compile(r"(\d+) of (\d+) \w+")  # What a stage says while it works
@@ -493,7 +466,7 @@ def check_before_run(paths: RunPaths, say: Say) -> None:
     faulty_trials = {problem.trial for problem in errors}  # "" stands for the experiment as a whole
     if errors and ("" in faulty_trials or trials <= faulty_trials):
         raise ExperimentError(report.problems)
-    for line in [*report.notes, *format_problems(report.problems, 20 - len(report.notes))]:
+    for line in replace(report, recording_lines=()).lines():
         say(line)
 
 
