@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import INTERNAL_ERROR, UserError
-from vinetrack.core.records import UNUSABLE_FLAGS, PictureAxis, Trial, hand_corrected, with_flag
+from vinetrack.core.records import PictureAxis, Trial, hand_corrected, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
@@ -107,8 +107,6 @@ def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) ->
     from vinetrack.video.curved_axis import axis_from_entry
     from vinetrack.video.frames import RecordingError, inspect_recording
 
-    if trial.video is None:
-        raise ResultsError(f"{trial.name} has no recording to draw on")
     track, analysed = read_result(results.track(trial.name)), read_json(results.analysed(trial.name))
     shown, line = frames_to_show(track), analysed.get("axis")
     if line is None:
@@ -121,6 +119,7 @@ def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) ->
     scale = 1e3 * trial.diameter_m / mm_per_px, mm_per_px
     path = results.overlay(trial.name)
     try:
+        assert trial.video is not None
         recording = inspect_recording(trial.video)
         _write_clip(path, trial.name, recording, axis_from_entry(line), *scale, edges, since_s, shown, settings)
     except RecordingError as error:
@@ -200,29 +199,28 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
     from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
 
     edge_px = track["edge_px"].to_numpy(dtype=float)
-    edges = [Edge("tracked edge", TRACKED, edge_px)]
-    by_hand = hand_corrected(track["flag"].fillna(""))
-    corrected = [Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan), by_hand=True)]
-    corrected = corrected if by_hand.any() else []
+    edges, release_s = [Edge("tracked edge", TRACKED, edge_px)], _first_moving_s(track)
     path = results.predictions(trial)
-    if not path.exists():
-        return [*edges, *corrected], float(_first_moving_s(track))
-    predicted = read_result(path)
-    to_px = position_to_px(track)
-    diagnosis = read_diagnosis(results)
-    added = " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
-    labels = {"model_before_m": "initial model", "model_after_m": f"with {added}" if added else ""}
-    time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
-    for column, label in labels.items():
-        prediction = predicted[["time_s", column]].dropna()
-        if not label or prediction.empty:
-            continue
-        # There is no prediction before the first and after the last frame of the fit.
-        position_m = np.interp(time_s, prediction["time_s"], prediction[column], left=math.nan, right=math.nan)
-        error_mm = 1e3 * (position_m - measured_m)
-        edges.append(Edge(label, BEFORE if column == "model_before_m" else AFTER, to_px(position_m), error_mm))
-    fitted = read_fit(results).trials if results.fit.exists() else {}
-    return [*edges, *corrected], fitted[trial].release_s if trial in fitted else _first_moving_s(track)
+    if path.exists():
+        predicted, to_px = read_result(path), position_to_px(track)
+        diagnosis = read_diagnosis(results)
+        added = " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
+        models = [("model_before_m", "initial model", BEFORE)]
+        models += [("model_after_m", f"with {added}", AFTER)] if added else []
+        time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
+        for column, label, colour in models:
+            prediction = predicted[["time_s", column]].dropna()
+            if not prediction.empty:
+                # There is no prediction before the first and after the last frame of the fit.
+                ends = {"left": math.nan, "right": math.nan}
+                position_m = np.interp(time_s, prediction["time_s"], prediction[column], **ends)
+                edges.append(Edge(label, colour, to_px(position_m), 1e3 * (position_m - measured_m)))
+        fitted = read_fit(results).trials if results.fit.exists() else {}
+        release_s = fitted[trial].release_s if trial in fitted else release_s
+    by_hand = hand_corrected(track["flag"].fillna(""))
+    if by_hand.any():
+        edges.append(Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan), by_hand=True))
+    return edges, release_s
 
 
 def position_to_px(track: pd.DataFrame) -> Any:
@@ -234,8 +232,7 @@ def position_to_px(track: pd.DataFrame) -> Any:
     if len(both) < FEWEST_POINTS or np.ptp(metres) <= 0:
         raise ResultsError("too few of its positions are known in pixels and in metres")
     middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
-    quadratic = np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
-    return quadratic
+    return np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
 
 
 def _first_moving_s(track: pd.DataFrame) -> float:
@@ -295,13 +292,9 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
             frames_used=options.frames_used,
         )
         measurement = measure_recording(trial, settings, folder)
-        if not math.isfinite(rate):
-            unknown = np.full(len(measurement.tracking.track.time_s), math.nan)
-            track = replace(measurement.tracking.track, time_s=unknown)
-            measurement = replace(measurement, tracking=replace(measurement.tracking, track=track))
     except RecordingError as error:
         raise UserError(str(error)) from None
-    table = _table(measurement, options.scaled)
+    table = _table(measurement, options.scaled, math.isfinite(rate))
     written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled)
     tracking_facts = _tracking_facts(measurement, table, options, rate)
     for line in _tracking_lines(tracking_facts):
@@ -394,8 +387,10 @@ def _recording_lines(facts: dict[str, Any]) -> list[str]:
     return [f"{first}.", f"{second}."]
 
 
-def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
-    """One row per frame: the edge along the axis and in the picture, with errors, and in metres if there is a scale."""
+def _table(measurement: Measurement, scaled: bool, timed: bool) -> pd.DataFrame:
+    """One row per frame: the edge along the axis and in the picture, with errors, and in metres if there is a scale.
+    Times are NaN if the capture rate is unknown.
+    """
     import pandas as pd
 
     tracking = measurement.tracking
@@ -405,7 +400,7 @@ def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
     assert systematic_m is not None
     columns = {
         "frame": np.arange(len(track.time_s)),
-        "time_s": track.time_s,
+        "time_s": track.time_s if timed else math.nan,
         "edge_px": track.edge_px,
         "edge_sigma_px": track.lead_position_sigma_m / measurement.m_per_px,
         "edge_systematic_px": systematic_m / measurement.m_per_px,
@@ -429,12 +424,11 @@ def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: 
         raise UserError(f"{folder}: is a file; name a folder with --out")
     tracking, recording = measurement.tracking, measurement.recording
     name, settings = recording.path.name, OverlaySettings()
-    # "track.csv", "strip.png", "overlay.mp4": names of the output files
     written = {"table": folder / "track.csv", "strip": folder / "strip.png", "clip": folder / "overlay.mp4"}
     write_csv(written["table"], table)
     m_per_px = measurement.m_per_px if scaled else math.nan
     write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
-    shown, time_s = frames_to_show(table), tracking.track.time_s
+    shown, time_s = frames_to_show(table), table["time_s"].to_numpy(dtype=float)
     tube_px = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else tracking.axis.width_px
     edges = [Edge("tracked edge", TRACKED, tracking.track.edge_px + tracking.shake_px)]
     since_s = time_s - time_s[min(shown.start + MARGIN_FRAMES, len(time_s) - 1)]
@@ -449,10 +443,7 @@ def _tracking_facts(
     from vinetrack.video.curved_axis import axis_entry
 
     tracking = measurement.tracking
-    edge_px = tracking.track.edge_px
-    usable = np.isfinite(edge_px)
-    for flag in UNUSABLE_FLAGS:
-        usable &= ~with_flag(tracking.track.flag, flag)
+    edge_px, usable = tracking.track.edge_px, tracking.track.usable
     moving = usable & ~with_flag(tracking.track.flag, "before_release")
     frame = np.flatnonzero(usable)
     scale = measurement.m_per_px if options.scaled else math.nan

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,18 +14,18 @@ from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, campaign_figures, draw, figures_of
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
-from vinetrack.results.folder_layout import Results, ResultsError, read_fit, read_json, read_result
-from vinetrack.results.folder_layout import read_diagnosis as stored_diagnosis
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from vinetrack.diagnosis.result import Diagnosis
     from vinetrack.effects import Effect
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import FigureSettings
     from vinetrack.figures.diagnosis_figures import DiagnosisTables
-    from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection, TrackedRecording
+    from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
     from vinetrack.report.section import DiagnosisResult
 
 
@@ -37,12 +37,11 @@ log = logging.getLogger(__name__)
 
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
-    results = Results(folder)
+    results, tables = Results(folder), FigureTables(folder, experiment.trials)
+    drawn = []
     for name in campaign_figures():
         for form in ("png", "svg", "pdf"):
             results.figure(name, f".{form}").unlink(missing_ok=True)
-    tables, drawn = FigureTables(folder, experiment.trials), []
-    for name in campaign_figures():
         if picture := draw(name, tables):
             _write(picture, partial(results.figure, name), settings)
             drawn.append(name)
@@ -72,17 +71,25 @@ def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     results = Results(folder)
     mark = paper.SIMULATED if kind == "simulated" else paper.MEASURED
     tables = _tables(experiment, results)
-    results_given = _experiment_results(mark, results, tables)
+    measured = paper.ExperimentResults(
+        mark=mark,
+        damping=read_json(results.damping),
+        scaling=read_json(results.scaling),
+        conditions=read_result(results.conditions),
+        fit=read_fit(results),
+        positions=tables["paper_positions"],
+        speeds=tables["paper_speeds"],
+        departures=tables["paper_departures"],
+    )
     rows = [
         *paper.protocol_rows(experiment.trials, read_result(results.steady), mark),
-        *paper.result_rows(results_given),
+        *paper.result_rows(measured),
         *paper.computed_rows(),
         *paper.theory_rows(experiment.trials),
     ]
     table = paper.as_table(rows)
-    for name, table_of_figure in tables.items():
-        write_csv(folder / f"{name}.csv", table_of_figure)
-    write_csv(folder / "paper.csv", table)
+    for name, content in {**tables, "paper": table}.items():
+        write_csv(folder / f"{name}.csv", content)
     for mark in paper.MARKS:
         log.info("%s: %d rows", mark, int((table["mark"] == mark).sum()))
     return table
@@ -127,21 +134,6 @@ def draw_paper(folder: Path, settings: FigureSettings) -> None:
         _write(drawn, partial(Results(folder).figure, name), settings)
 
 
-def _experiment_results(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> Any:
-    from vinetrack.paper.rows import ExperimentResults
-
-    return ExperimentResults(
-        mark=mark,
-        damping=read_json(results.damping),
-        scaling=read_json(results.scaling),
-        conditions=read_result(results.conditions),
-        fit=read_fit(results),
-        positions=tables["paper_positions"],
-        speeds=tables["paper_speeds"],
-        departures=tables["paper_departures"],
-    )
-
-
 MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 
 
@@ -159,13 +151,19 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
     """Collect the content of the report from a results folder."""
-    from vinetrack.report.build import ModelResult, ReportContent
+    from vinetrack.report.build import ModelResult, ReportContent, TrackedRecording
+    from vinetrack.report.section import paper_section
 
-    results = Results(folder)
-    trials = read_result(results.trials)
+    results, tables = Results(folder), FigureTables(folder, experiment.trials)
+    trials, diagnosis = read_result(results.trials), read_diagnosis(results)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
-    tables = FigureTables(folder, experiment.trials)
+    names = set(read_json(results.figure_list)["figures"])
+    drawings = [one for name, one in campaign_figures().items() if name in names]
+    paper: list[ReportSection] = []
+    if experiment.settings.published:
+        figures = _figures(tables, figures_of("paper").values(), diagnosis)
+        paper = [paper_section(tables.paper, tables.paper_departures, figures)]
     return ReportContent(
         name=experiment.name,
         trials=trials,
@@ -173,30 +171,31 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         damping=read_json(results.damping),
         provenance=_provenance(experiment, settings),
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
-        figures=[_figure(tables, figure) for figure in _drawn(results)],
+        figures=_figures(tables, drawings, diagnosis),
         trial_figures={name: picture for name in drawn if (picture := _picture(partial(results.trial_figure, name)))},
-        recordings={name: _recording(results, name) for name in filmed},
+        recordings={
+            name: TrackedRecording(
+                strip=_picture(partial(results.strip_figure, name)),
+                flags=read_result(results.track(name))["flag"].tolist(),
+                calibration=read_json(results.analysed(name)).get("calibration"),
+            )
+            for name in filmed
+        },
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
         clip=_clip(results, tables.diagnosed, trials),
         model=ModelResult(
-            read_fit(results),
-            read_result(results.comparison),
-            read_result(results.model_check),
-            stored_diagnosis(results),
+            read_fit(results), read_result(results.comparison), read_result(results.model_check), diagnosis
         ),
-        diagnosis=read_diagnosis_section(results, experiment),
-        sections=[_paper_section(tables)] if experiment.settings.published else [],
+        diagnosis=None if diagnosis is None else _diagnosis_section(results, diagnosis, experiment),
+        sections=paper,
         notes=experiment.blank_notes,
     )
 
 
-def read_diagnosis_section(results: Results, experiment: Experiment) -> DiagnosisResult | None:
-    """Return the content of the report's section on the diagnosis; None if there is no diagnosis."""
+def _diagnosis_section(results: Results, diagnosis: Diagnosis, experiment: Experiment) -> DiagnosisResult:
+    """Return the content of the report's section on the diagnosis."""
     from vinetrack.report.section import DiagnosisResult
 
-    diagnosis = stored_diagnosis(results)
-    if diagnosis is None:
-        return None
     paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
     moved, laws = (table if path.exists() and len(table := read_result(path)) else None for path in paths)
     reported = [*diagnosis.effects, *diagnosis.answer_set]
@@ -231,24 +230,6 @@ def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str
     return describe_run(experiment.folder, inputs, dict(settings), experiment.settings.model)
 
 
-def _paper_section(tables: FigureTables) -> ReportSection:
-    from vinetrack.report.section import paper_section
-
-    figures = [
-        _figure(tables, one)
-        for one in figures_of("paper").values()
-        if _picture(partial(tables.results.figure, one.name))
-    ]
-    return paper_section(tables.paper, tables.paper_departures, figures)
-
-
-def _drawn(results: Results) -> list[RegisteredFigure]:
-    """Return the figures of the whole experiment that were drawn."""
-    names = set(read_json(results.figure_list)["figures"])
-    figures = campaign_figures().items()
-    return [figure for name, figure in figures if name in names and _picture(partial(results.figure, name))]
-
-
 def _picture(path: Callable[[str], Path]) -> str | bytes:
     """Return a figure for the page: its SVG, or its PNG if there is none or it is too large; empty if there is none."""
     svg, png = path(".svg"), path(".png")
@@ -257,25 +238,27 @@ def _picture(path: Callable[[str], Path]) -> str | bytes:
     return png.read_bytes() if png.exists() else b""
 
 
-def _figure(tables: FigureTables, figure: RegisteredFigure) -> ReportFigure:
-    """Return a figure for the page, with its data: a file of the results, or a table of its own."""
+def _figures(
+    tables: FigureTables, figures: Iterable[RegisteredFigure], diagnosis: Diagnosis | None
+) -> list[ReportFigure]:
+    """Return the figures that were drawn for the page, each with its data: a file of the results, or a table of its own
+    with five digits, more than a figure can show.
+    """
     from vinetrack.report.build import ReportFigure
 
-    is_file = "." in figure.data
-    data_name = figure.data if is_file else f"{figure.name}.csv" if figure.data else ""
-    data = ""
-    if figure.data:
-        path = tables.results.folder / figure.data
-        data = path.read_text(encoding="utf-8") if is_file else _as_csv(getattr(tables, figure.data))
-    picture = _picture(partial(tables.results.figure, figure.name))
-    diagnosis = stored_diagnosis(tables.results)
-    refuted = figure.if_refuted if diagnosis is not None and diagnosis.refutes else ""
-    return ReportFigure(figure.name, figure.title, f"{figure.caption} {refuted}".strip(), picture, data_name, data)
-
-
-def _as_csv(table: pd.DataFrame) -> str:
-    """Return a table to download as CSV with five digits, more than a figure can show."""
-    return str(table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
+    shown = []
+    for one in figures:
+        if picture := _picture(partial(tables.results.figure, one.name)):
+            name, data = one.data, ""
+            if "." in name:
+                data = (tables.results.folder / name).read_text(encoding="utf-8")
+            elif name:
+                data = getattr(tables, name).to_csv(index=False, float_format="%.5g", lineterminator="\n")
+                name = f"{one.name}.csv"
+            refuted = one.if_refuted if diagnosis is not None and diagnosis.refutes else ""
+            caption = f"{one.caption} {refuted}".strip()
+            shown.append(ReportFigure(one.name, one.title, caption, picture, name, data))
+    return shown
 
 
 def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFrame) -> Clip | None:
@@ -313,13 +296,3 @@ def _poster(path: Path) -> bytes:
     file = io.BytesIO()
     picture.save(file, "WEBP", quality=60)
     return file.getvalue()
-
-
-def _recording(results: Results, name: str) -> TrackedRecording:
-    from vinetrack.report.build import TrackedRecording
-
-    return TrackedRecording(
-        strip=_picture(partial(results.strip_figure, name)),
-        flags=read_result(results.track(name))["flag"].tolist(),
-        calibration=read_json(results.analysed(name)).get("calibration"),
-    )
