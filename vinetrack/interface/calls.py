@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from vinetrack.experiment.folder import Experiment
 from vinetrack.inference.fit import fit as fit_pairs
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.interface.loaded import LoadedResults, Source, TrialSource, read_source
+from vinetrack.interface.loaded import LoadedResults, Source, read_source
 
 
 def fit(model: Model, source: Source, **options: Any) -> Fit:
@@ -55,12 +56,6 @@ def fit(model: Model, source: Source, **options: Any) -> Fit:
         return fit_pairs(model, source, **options)  # type: ignore[arg-type]
     given = read_source(source)
     fitted = fit_pairs(model, given.pairs, **options)
-    return fitted if not given.left_out else _with_left_out(fitted, given)
-
-
-def _with_left_out(fitted: Fit, given: TrialSource) -> Fit:
-    from dataclasses import replace
-
     return replace(fitted, left_out={**given.left_out, **fitted.left_out})
 
 
@@ -135,12 +130,10 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     """
     from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
 
-    if isinstance(source, LoadedResults):
+    if isinstance(source, LoadedResults | Experiment):
         source = source.folder
-    if isinstance(source, (str, Path)):
+    if isinstance(source, str | Path):
         return power_of_target(PowerRequest(Path(source), effects, **options))
-    if isinstance(source, Experiment):
-        return power_of_target(PowerRequest(source.folder, effects, **options))
     given = source if isinstance(source, Fit) else read_source(source).pairs
     return power_of_target(PowerRequest(Path("trials"), effects, **options), given)
 
@@ -174,8 +167,8 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     """
     if not isinstance(fitted, Fit):
         given = read_source(fitted)
-        model = make_model() if given.experiment is None else named_model(given)
-        return compare_pairs(fit_pairs(model, given.pairs), given.pairs, kinematics=given.kinematics, **options)
+        fit_of_source = fit_pairs(named_model(given.experiment), given.pairs)
+        return compare_pairs(fit_of_source, given.pairs, kinematics=given.kinematics, **options)
     if "tracks" in options:
         return compare_pairs(fitted, source, **options)  # type: ignore[arg-type]
     if source is None:
@@ -186,14 +179,14 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     return compare_pairs(fitted, given.pairs, **{"kinematics": given.kinematics, **options})
 
 
-def named_model(given: TrialSource) -> Model:
-    """Return the model that the experiment of a source names, including the user's own effects."""
+def named_model(experiment: Experiment | None) -> Model:
+    """Return the model that an experiment names, including the user's own effects; without one, the base model."""
     from vinetrack.effects import own_effects
 
-    if given.experiment is None:
+    if experiment is None:
         return make_model()
-    settings = given.experiment.settings
-    return make_model(settings.model, own_effects([given.experiment.folder / path for path in settings.effects]))
+    settings = experiment.settings
+    return make_model(settings.model, own_effects([experiment.folder / path for path in settings.effects]))
 
 
 def example_tracks() -> pd.DataFrame:

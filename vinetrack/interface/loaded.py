@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -33,7 +33,7 @@ from vinetrack.experiment.sheet import (
     table_of_texts,
 )
 from vinetrack.figures.prediction_figures import draw_power
-from vinetrack.figures.registry import campaign_figures, draw
+from vinetrack.figures.registry import FigureTables, campaign_figures, describe_conditions, draw, label_conditions
 from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
@@ -120,7 +120,7 @@ class LoadedResults:
     @cached_property
     def initial_model(self) -> Model:
         """The model in use with its fitted values."""
-        return self._model(self.fit.names, self.fit.fitted_values)
+        return self._model(self.fit)
 
     @cached_property
     def final_model(self) -> Model:
@@ -128,26 +128,22 @@ class LoadedResults:
         diagnosis = self.diagnosis
         if diagnosis is None or not diagnosis.effects:
             return self.initial_model
-        values = FitSummary(diagnosis.final_model, diagnosis.parameters).fitted_values
-        return self._model(diagnosis.final_model, values)
+        return self._model(FitSummary(diagnosis.final_model, diagnosis.parameters))
 
-    def _model(self, names: tuple[str, ...], values: Mapping[str, Any]) -> Model:
+    def _model(self, fit: FitSummary) -> Model:
         from vinetrack.effects import catalogue
         from vinetrack.interface.calls import named_model
 
-        user_effects: Mapping[str, Any] = {}
-        if not set(names) <= set(catalogue()):
-            user_effects = named_model(TrialSource([], self.experiment)).user_effects
-        model = make_model(names, user_effects)
-        return model.with_values({key: value for key, value in values.items() if key in model.parameter_names})
+        own = not set(fit.names) <= set(catalogue())
+        model = make_model(fit.names, named_model(self.experiment).user_effects if own else {})
+        return model.with_values({key: one for key, one in fit.fitted_values.items() if key in model.parameter_names})
 
-    def _concatenated(self, path_of: Any) -> pd.DataFrame:
+    def _concatenated(self, path_of: Callable[[str], Path]) -> pd.DataFrame:
         paths = {name: path_of(name) for name in self.trials["trial"]}
-        parts = [read_result(path).assign(trial=name) for name, path in paths.items() if path.exists()]
+        parts = {name: read_result(path) for name, path in paths.items() if path.exists()}
         if not parts:
             return pd.DataFrame(columns=["trial"])
-        whole = pd.concat(parts, ignore_index=True)
-        return whole[["trial", *(name for name in whole.columns if name != "trial")]]
+        return pd.concat(parts, names=["trial"]).reset_index(level="trial").reset_index(drop=True)
 
     def plot(self, name: str = "", **options: Any) -> Figure:
         """Return a figure of the report."""
@@ -406,64 +402,37 @@ def _with_content(drawn: Figure | None, name: str) -> Figure:
 
 
 def _comparison_tables(shown: Comparison) -> SimpleNamespace:
-    from vinetrack.figures.registry import label_conditions
-
-    table = label_conditions(shown.table, _condition_labels([compared.trial for compared in shown.trials]))
+    table = label_conditions(shown.table, _described([compared.trial for compared in shown.trials]))
     return SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
 
 
-def _condition_labels(trials: list[Trial]) -> Any:
-    import pandas as pd
-
-    from vinetrack.figures.registry import describe_conditions
-
+def _described(trials: Sequence[Trial]) -> pd.DataFrame:
+    """Trials as figures name them: with vine, condition and its label."""
+    columns = ("name", "vine", "condition")
     rows = pd.DataFrame(
-        {
-            "trial": [trial.name for trial in trials],
-            "vine": [trial.vine for trial in trials],
-            "condition": [trial.condition for trial in trials],
-            "status": "ok",
-        }
+        [[getattr(trial, name) for name in columns] for trial in trials], columns=["trial", *columns[1:]]
     )
     return describe_conditions(rows, tuple(trials))
 
 
 def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
-    import pandas as pd
-
-    from vinetrack.diagnosis.drift import drift_groups
-    from vinetrack.diagnosis.ladder import in_sample
+    """The tables of a diagnosis as a results folder would hold them."""
     from vinetrack.figures.diagnosis_figures import CURVE_COLUMNS, assemble_tables
+    from vinetrack.pipeline.model_stage import diagnosis_tables, predictions
 
-    nothing = pd.DataFrame()
-    if not shown.fits:
-        curves = pd.DataFrame(columns=list(CURVE_COLUMNS))
-        return assemble_tables(shown, _condition_labels([]), curves, nothing, nothing, nothing)
-    before, after = shown.fits[0], shown.fits[-1]
-    final = {motion.name: motion for motion in in_sample(after).trials} if after is not before else {}
-    parts = []
-    for motion in in_sample(before).trials:
-        final_m = final[motion.name].predicted_position_m if final else np.full(motion.time_s.size, math.nan)
-        positions = (motion.lead_position_m, motion.predicted_position_m, final_m)
-        columns = (
-            motion.name,
-            motion.trial.condition,
-            motion.time_s - motion.release_s,
-            *(y - motion.origin_m for y in positions),
-        )
-        parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True))))
-    located, drifting = nothing, nothing
-    if shown.failure is not None:
-        located = shown.failure.along_position
-        drifting = drift_groups(shown.failure.drift, after if final else None)
-    force = nothing if shown.force_table is None else shown.force_table
-    conditions = _condition_labels([fitted.trial for fitted in before.trials])
-    trials = pd.concat(parts, ignore_index=True)
-    return assemble_tables(shown, conditions, trials, located, drifting, force, shown.learned_table)
+    curves = []
+    for one, table in predictions(shown.fits[0], shown.fits[-1]) if shown.fits else ():
+        positions = {name: table[name] - one.origin_m for name in CURVE_COLUMNS[3:]}
+        of_trial = {"trial": one.name, "condition": one.trial.condition, "time_s": table["time_s"] - one.release_s}
+        curves.append(pd.DataFrame({**of_trial, **positions}))
+    trials = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=list(CURVE_COLUMNS))
+    conditions = _described([fitted.trial for fitted in shown.fits[0].trials] if shown.fits else [])
+    tables = diagnosis_tables(shown)
+    names = ("along_position.csv", "drift_groups.csv", "missing_force.csv", "learned_force.csv")
+    return assemble_tables(shown, conditions, trials, *(tables.get(name, pd.DataFrame()) for name in names))
 
 
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
-    from vinetrack.figures.registry import FigureTables
     from vinetrack.pipeline.trials import draw_trial
 
     trials: tuple[Trial, ...] = ()
@@ -473,10 +442,10 @@ def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
         if name == "trial_motion":
             raise ResultsError(f"{error}") from None
     tables = FigureTables(shown.folder, trials)
-    if name == "trial_motion":
-        names = list(shown.trials["trial"])
-        if trial not in names:
-            raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
-        stated = next((row for row in trials if row.name == trial), None)
-        return _with_content(draw_trial(tables.results, stated, trial), name)
-    return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))
+    if name != "trial_motion":
+        return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))
+    names = list(shown.trials["trial"])
+    if trial not in names:
+        raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
+    stated = next((row for row in trials if row.name == trial), None)
+    return _with_content(draw_trial(tables.results, stated, trial), name)

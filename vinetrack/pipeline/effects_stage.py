@@ -15,31 +15,41 @@ if TYPE_CHECKING:
     from vinetrack.effects import Effect
 
 
-def describe_effects(name: str | None, experiment: Path | None, figure: Path | None) -> list[str]:
-    """List all effects, or explain one and draw it."""
+def describe_effects(
+    name: str | None, experiment: Path | None, figure: Path | None
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """List all effects, or explain one and draw it. Returns lines, and the same for a program."""
     from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
     from vinetrack.effects import catalogue, explanation, find_effect, listing
     from vinetrack.figures.prediction_figures import draw_effect
 
-    user_effects = {} if experiment is None else effects_of(experiment)
-    if name is None:
+    own = {} if experiment is None else effects_of(experiment)
+    if name is not None:
+        effect = find_effect(name, own)
+        shown, lines = [effect], explanation(effect)
         if figure is not None:
-            raise ExperimentError(
-                [Problem(message="needs the name of one effect to draw", file=str(figure), remedy="give NAME")]
-            )
-        return listing(
-            [*(e for e in catalogue().values() if e.name not in user_effects), *user_effects.values()], user_effects
-        )
-    effect = find_effect(name, user_effects)
-    lines = explanation(effect)
-    if figure is not None:
-        from vinetrack.pipeline.predict_stage import check_figure, write_figure
+            from vinetrack.pipeline.predict_stage import check_figure, write_figure
 
-        check_figure(figure)
-        shown = effect.name, size_words(effect), reference_words(effect), effect_motion(effect)
-        write_figure(draw_effect(*shown), figure)
-        lines.append(f"Picture: {figure}")
-    return lines
+            check_figure(figure)
+            drawing = draw_effect(effect.name, size_words(effect), reference_words(effect), effect_motion(effect))
+            write_figure(drawing, figure)
+            lines.append(f"Picture: {figure}")
+    elif figure is None:
+        shown = [*(effect for effect in catalogue().values() if effect.name not in own), *own.values()]
+        lines = listing(shown, own)
+    else:
+        problem = Problem(message="needs the name of one effect to draw", file=str(figure), remedy="give NAME")
+        raise ExperimentError([problem])
+    return lines, [
+        {
+            "name": effect.name,
+            "kind": effect.kind,
+            "text": effect.text,
+            "parameters": [asdict(parameter) for parameter in effect.parameters],
+            "own": effect.name in own,
+        }
+        for effect in shown
+    ]
 
 
 def effects_of(experiment: Path) -> Mapping[str, Effect]:
@@ -84,24 +94,6 @@ def model_problems(experiment: Path) -> list[Problem]:
     except EffectError as error:
         return [Problem(message=str(error).rstrip("."), file="experiment.yaml", column=column)]
     return []
-
-
-def effects_content(name: str | None, experiment: Path | None) -> list[dict[str, Any]]:
-    """Describe all effects, or one, for a program; see `describe_effects`."""
-    from vinetrack.effects import catalogue, find_effect
-
-    user_effects = {} if experiment is None else effects_of(experiment)
-    effects = {**catalogue(), **user_effects}.values() if name is None else [find_effect(name, user_effects)]
-    return [
-        {
-            "name": effect.name,
-            "kind": effect.kind,
-            "text": effect.text,
-            "parameters": [asdict(parameter) for parameter in effect.parameters],
-            "own": effect.name in user_effects,
-        }
-        for effect in effects
-    ]
 
 
 # ------------------------------------------------------------------------------

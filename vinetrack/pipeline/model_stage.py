@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from vinetrack.dynamics.audit import Audit
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
-    from vinetrack.inference.fit_result import Fit
+    from vinetrack.inference.fit_result import Fit, TrialFit
 
 log = logging.getLogger(__name__)
 
@@ -90,11 +90,13 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     falls by gravity alone, whose fitted g tests the whole chain, is fitted otherwise than for a diagnosis.
     """
     from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
+    from vinetrack.effects import own_effects
     from vinetrack.inference.solving import assemble
     from vinetrack.pipeline.trials import model_of
 
-    model = model_of(experiment)
-    candidates = candidates_of(model, experiment.settings.candidates, model.user_effects)
+    model, settings = model_of(experiment), experiment.settings
+    checked = own_effects([experiment.folder / path for path in settings.effects])
+    candidates = candidates_of(model, settings.candidates, checked)
     if model.names == ("gravity",):
         return None, initial_fit(model, pairs, candidates, free=("gravity.g",))
     initial = initial_fit(model, pairs, candidates, profile=False)
@@ -266,8 +268,8 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
         write_csv(folder / name, table)
     if has_added:
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
-    for name, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]).items():
-        write_csv(results.predictions(name), table)
+    for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]):
+        write_csv(results.predictions(one.name), table)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
     write_json(results.diagnosis, diagnosis.to_json())
 
@@ -303,26 +305,30 @@ def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     return {name: table for name, table in tables.items() if table is not None}
 
 
-def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
+def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     """Predict every trial with the initial and the final model. As in `comparison.csv` and the ladder, only release and
-    origin are fitted per trial. `model_after_m` is NaN if no effect was added. Returns by name of trial: s and m.
+    origin are fitted per trial. Returns each trial under the initial model, and a table: s and m, `model_after_m` NaN
+    if no effect was added.
     """
     import pandas as pd
 
     from vinetrack.diagnosis.ladder import in_sample
 
     final = {} if after is before else {one.name: one.predicted_position_m for one in in_sample(after).trials}
-    return {
-        one.name: pd.DataFrame(
-            {
-                "time_s": one.time_s,
-                "lead_position_m": one.lead_position_m,
-                "model_before_m": one.predicted_position_m,
-                "model_after_m": final.get(one.name, np.nan),
-            }
+    return [
+        (
+            one,
+            pd.DataFrame(
+                {
+                    "time_s": one.time_s,
+                    "lead_position_m": one.lead_position_m,
+                    "model_before_m": one.predicted_position_m,
+                    "model_after_m": final.get(one.name, np.nan),
+                }
+            ),
         )
         for one in in_sample(before).trials
-    }
+    ]
 
 
 def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> list[str]:

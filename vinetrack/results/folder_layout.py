@@ -6,7 +6,8 @@ Names of trials are always text: `007` stays `007`, and a trial may be called `N
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,18 +125,29 @@ class Results:
         return self.folder / "diagnosis" / name
 
 
-def _missing(path: Path) -> ResultsError:
-    """What to say of a file that is not in its results folder: an experiment may have been named instead."""
-    if (path.parent / "experiment.yaml").exists():
-        return ResultsError(f"{path.parent} is an experiment: give its results, such as results/{path.parent.name}")
-    return ResultsError(f"{path} does not exist: give a results folder, or write it with vinetrack run or snakemake")
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Say in a sentence that a file is not there, where an experiment may have been named instead of its results, or
+    that it does not hold what a stage wrote.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        if (path.parent / "experiment.yaml").exists():
+            where = f"{path.parent} is an experiment: give its results, such as results/{path.parent.name}"
+        else:
+            where = f"{path} does not exist: give a results folder, or write it with vinetrack run or snakemake"
+        raise ResultsError(where) from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        fault = error if isinstance(error, OSError | ValueError) else repr(error)
+        raise ResultsError(f"{path} cannot be read ({fault}): delete it and run snakemake again") from None
 
 
 def read_result(path: Path) -> pd.DataFrame:
     """Read a table that a stage wrote: text stays text, numbers are floats, truth values are bool."""
     import pandas as pd
 
-    try:
+    with _reading(path):
         with path.open(encoding="utf-8") as file:
             columns = file.readline().strip().split(",")
         numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS]
@@ -145,23 +157,15 @@ def read_result(path: Path) -> pd.DataFrame:
             keep_default_na=False,
             na_values={column: ["", "NaN"] for column in numbers},
         )
-    except FileNotFoundError:
-        raise _missing(path) from None
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
-    for column in TRUTH_COLUMNS.intersection(columns):
-        table[column] = (table[column] == "True").astype(bool)
+        for column in TRUTH_COLUMNS.intersection(columns):
+            table[column] = (table[column] == "True").astype(bool)
     return table
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that a stage wrote; see `read_result`. SI units; None for an unknown number."""
-    try:
+    with _reading(path):
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise _missing(path) from None
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
     return content
 
 
@@ -172,42 +176,23 @@ def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
     return pd.DataFrame({column: pd.Series(dtype=object if column in TEXT_COLUMNS else float) for column in columns})
 
 
-# ------------------------------------------------------------------------------
-# Reading the fit of a results folder as a typed object; the only reader of `fit.json`.
-
-
 def read_fit(results: Results) -> FitSummary:
-    """Read `fit.json`."""
+    """Read `fit.json` as a typed object; its only reader."""
     from vinetrack.inference.fit_summary import FitSummary
 
-    content = read_json(results.fit)
-    try:
-        return FitSummary.from_json(content)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise unreadable_file_error(results.fit, error) from None
-
-
-def unreadable_file_error(path: Path, error: Exception) -> ResultsError:
-    """Return the error for a file of the results with unexpected content."""
-    return ResultsError(f"{path} cannot be read ({error!r}): delete it and run snakemake again")
-
-
-# ------------------------------------------------------------------------------
-# Reading the diagnosis of a results folder as a typed object; the only reader of `diagnosis.json`.
+    with _reading(results.fit):
+        return FitSummary.from_json(read_json(results.fit))
 
 
 def read_diagnosis(results: Results) -> Diagnosis | None:
-    """Read `diagnosis.json` and `ladder.csv`."""
+    """Read `diagnosis.json` and `ladder.csv` as a typed object; their only reader. None if there is none."""
     from vinetrack.diagnosis.result import Diagnosis
 
     if not results.diagnosis.exists():
         return None
-    content = read_json(results.diagnosis)
     ladder = read_result(results.ladder) if results.ladder.exists() else None
-    try:
-        return Diagnosis.from_json(content, ladder if ladder is not None and len(ladder) else None)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise unreadable_file_error(results.diagnosis, error) from None
+    with _reading(results.diagnosis):
+        return Diagnosis.from_json(read_json(results.diagnosis), None if ladder is None or ladder.empty else ladder)
 
 
 # ------------------------------------------------------------------------------
@@ -218,10 +203,8 @@ def read_source_experiment(folder: Path, experiment: Path | None = None) -> Expe
     """Read the experiment that a results folder was made from, as stated by its `provenance.json`."""
     from vinetrack.experiment.folder import read_experiment
 
-    results = Results(folder)
-    if not results.provenance.exists():
-        raise _missing(results.provenance)
-    path = experiment or Path(str(read_json(results.provenance)["experiment"]))
+    provenance = read_json(Results(folder).provenance)
+    path = experiment or Path(str(provenance["experiment"]))
     if not path.is_dir():
         raise ResultsError(
             f"{folder} was made from {path}, which does not exist any more: give its new path with --experiment PATH"
@@ -254,15 +237,11 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     """
     from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
 
-    systematic_m = table["lead_position_systematic_m"].to_numpy(dtype=float)
-    track = Track(
-        time_s=table["time_s"].to_numpy(dtype=float),
-        lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
-        lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
-        flag=table["flag"].to_numpy(dtype=str),
-        edge_px=table["edge_px"].to_numpy(dtype=float),
-        lead_position_systematic_m=systematic_m if np.isfinite(systematic_m).any() else None,
-    )
+    names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px", "lead_position_systematic_m")
+    columns = {name: table[name].to_numpy(dtype=float) for name in names}
+    track = Track(**columns, flag=table["flag"].to_numpy(dtype=str))
+    if not np.isfinite(columns["lead_position_systematic_m"]).any():
+        track = replace(track, lead_position_systematic_m=None)
     try:
         if trial.pressure_trace is not None:
             return with_pressure_trace(trial, track)
