@@ -9,15 +9,12 @@ import shutil
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commanded import run, succeed
 from lsoda_vine import grown_position, vine_trial
-from typer.testing import CliRunner
-
-from vinetrack.cli.main import app
 
 # A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
 
@@ -224,9 +221,7 @@ def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
     """All stages by their own commands, in this process; the rows of trials.csv."""
     settings = '{"damping": {"resamples": 200}, "figures": {"dpi": 50}}'
     for stage in ("trials", "damping", "model", "figures", "report"):
-        arguments = [stage, str(experiment), str(results), "--settings", settings]
-        done = CliRunner().invoke(app, arguments, catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        succeed(stage, experiment, results, "--settings", settings)
     return read_rows(results / "trials.csv")
 
 
@@ -253,20 +248,18 @@ def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_pa
         "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
         "a,a.csv,12,100,300,20,3\nb,a.csv,12,100,300,20,3\nc,a.csv,12,100,300,9999,3\nd,a.csv,12,100,300,9999,3\n"
     )
-    invoke = partial(CliRunner().invoke, app)
     for stage, *options in (
         ("trials", "--trials", '["a", "c"]', "--settings", '{"figures": {"formats": ["png"]}}'),
         ("trials", "--trials", '["b", "d"]'),
         ("damping",),
     ):
-        done = invoke([stage, str(folder), str(results), *options], catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        succeed(stage, folder, results, *options)
     assert sorted(path.suffix for path in (results / "figures").glob("trial_[ad].*")) == [".png", ".png", ".svg"]
     assert {name: row["status"] for name, row in read_rows(results / "trials.csv").items()} == {
         "a": "ok", "b": "ok", "c": "failed", "d": "failed",
     }  # fmt: skip
     for given, said in (('["x"]', "'x' is not a trial"), ("x", "is not JSON"), ('"a"', "is not a JSON list")):
-        refused = invoke(["trials", str(folder), str(results), "--trials", given])
+        refused = run("trials", folder, results, "--trials", given)
         assert refused.exit_code == 2
         assert said in " ".join(refused.output.split())
 

@@ -16,10 +16,9 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
+from commanded import run, succeed
 from test_pipeline import read_rows, snakemake
-from typer.testing import CliRunner
 
-from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.filming import Filming, film, picture_target
 from vinetrack.laboratory.render import Truth
@@ -206,7 +205,7 @@ def test_a_recording_of_every_condition_has_a_clip_and_one_plays_in_the_report(f
 @pytest.mark.slow
 @pytest.mark.pipeline
 def test_check_says_of_the_same_folder_what_is_wrong(filmed: Filmed) -> None:
-    done = CliRunner().invoke(app, ["check", str(filmed.results.parents[1] / "vines")], catch_exceptions=False)
+    done = run("check", filmed.results.parents[1] / "vines")
     assert done.exit_code == 1
     lines = [line for line in done.output.splitlines() if line.startswith(("error", "warning"))]
     assert [next(name for name in BAD if f"trial {name}" in line) for line in lines] == [
@@ -225,8 +224,7 @@ def plainly_filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trut
 def measured(folder: Path, results: Path, trial: str) -> dict[str, str]:
     """Two stages by their own commands, in this process; the row of the one trial."""
     for stage in ("trials", "damping"):
-        done = CliRunner().invoke(app, [stage, str(folder), str(results)], catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        succeed(stage, folder, results)
     return read_rows(results / "trials.csv")[trial]
 
 

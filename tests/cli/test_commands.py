@@ -11,15 +11,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import Result
+from commanded import run, succeed
 from explorer_campaign import FEW_CANDIDATES
 from grown import FORCES, effect_file, grown
 from grown import sheet as sheet_command
 from hidden_truth import sheet
-from typer.testing import CliRunner
 
 import vinetrack
-from vinetrack.cli.main import app
 from vinetrack.diagnosis import propose as search
 from vinetrack.diagnosis.propose import add, propose
 from vinetrack.dynamics.model import Model
@@ -33,10 +31,6 @@ from vinetrack.pipeline.workflow import command_for_results
 
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
 TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20))
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3\n") -> Path:
@@ -126,11 +120,6 @@ LADDER = (
 )
 
 
-def run_commands(*arguments: str | Path) -> tuple[int, str]:
-    done = CliRunner().invoke(app, [str(one) for one in arguments])
-    return done.exit_code, done.output
-
-
 @pytest.fixture(scope="module")
 def experiment_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hidden") / "campaign"
@@ -150,8 +139,7 @@ def experiment_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(experiment_commands: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("out") / "campaign"
     for stage in ("trials", "damping", "model"):
-        code, output = run_commands(stage, experiment_commands, folder)
-        assert code == 0, output
+        succeed(stage, experiment_commands, folder)
     (folder / "provenance.json").write_text(json.dumps({"experiment": str(experiment_commands)}))
     return folder
 
@@ -159,8 +147,7 @@ def results(experiment_commands: Path, tmp_path_factory: pytest.TempPathFactory)
 @pytest.mark.slow
 def test_straight_from_a_folder_of_tracks_to_one_file_and_no_other(experiment_commands: Path, tmp_path: Path) -> None:
     before = sorted(experiment_commands.rglob("*"))
-    code, output = run_commands("diagnose", experiment_commands, "--json", tmp_path / "answer.json")
-    assert code == 0, output
+    output = succeed("diagnose", experiment_commands, "--json", tmp_path / "answer.json")
     assert output.startswith("missing: reservoir_depletion is missing")
     answer = json.loads((tmp_path / "answer.json").read_text())
     assert answer["effects"] == ["reservoir_depletion"]
@@ -197,25 +184,22 @@ def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
 ) -> None:
     added = []
     monkeypatch.setattr(search, "add", lambda *given: added.append(add(*given)) or added[-1])
-    code, output = run_commands("add", "air_drag", results)
-    assert code == 0, output
+    output = succeed("add", "air_drag", results)
     assert re.search(r"Δχ² = -", output) is None
     assert "highest pressure" in output
     rows = list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
     assert [row["added"] for row in rows] == ["", "reservoir_depletion", "air_drag"]
     monkeypatch.setattr(search, "add", lambda *_: added[0])  # the same once more, without the fits
-    assert run_commands("add", "air_drag", results)[0] == 0
+    succeed("add", "air_drag", results)
     assert len(list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))) == 3
 
 
 @pytest.mark.slow
 def test_saved_it_stands_in_the_model_of_the_experiment(results: Path, experiment_commands: Path) -> None:
-    code, output = run_commands("add", "reservoir_depletion", results, "--save")
-    assert code == 0, output
+    output = succeed("add", "reservoir_depletion", results, "--save")
     assert "reservoir_depletion" in (experiment_commands / "experiment.yaml").read_text()
     assert command_for_results(experiment_commands, results) in output.replace("\n", " ")
-    code, output = run_commands("add", "reservoir_depletion", results)
-    assert code == 1
+    assert run("add", "reservoir_depletion", results).exit_code == 1
 
 
 @pytest.mark.parametrize("arguments", [("diagnose", "nowhere"), ("add", "air_drag", "nowhere"), ("check", "nowhere")])
@@ -235,8 +219,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     experiment, results = place / "bench", place / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
     for stage in ("trials", "damping", "model"):
-        code, output = run_commands(stage, experiment, results)
-        assert code == 0, output
+        succeed(stage, experiment, results)
     (results / "provenance.json").write_text(json.dumps({"experiment": str(experiment)}))
     return experiment, results
 
@@ -249,22 +232,18 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     assert json.loads((results / "diagnosis.json").read_text())["verdict"] == "unexplained"
     proposals = []
     monkeypatch.setattr(search, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
-    code, output = run_commands("propose", results)
-    assert code == 0, output
+    succeed("propose", results)
     path = experiment / "proposed_time.py"
     effect = own_effects([path])["proposed_time"]
     assert "4 trials of bench" in effect.text
     monkeypatch.setattr(search, "propose", lambda *_: proposals[0])  # the same once more, without the search
-    code, output = run_commands("propose", results)
-    assert code == 1
-    assert "exists already" in output
-    elsewhere = shutil.copy(path, tmp_path)
-    code, output = run_commands("add", elsewhere, results, "--save")
-    assert code == 1
+    again = run("propose", results)
+    assert again.exit_code == 1
+    assert "exists already" in again.output
+    assert run("add", shutil.copy(path, tmp_path), results, "--save").exit_code == 1
     # Without the rest of the catalogue, with which this effect would be compiled once more.
     monkeypatch.setattr("vinetrack.diagnosis.ladder.host_for", lambda model, more: Model((*model.effects, *more)))
-    code, output = run_commands("add", path, results, "--save")
-    assert code == 0, output
+    succeed("add", path, results, "--save")
     settings = read_experiment_settings(experiment / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("proposed_time", ("proposed_time.py",))
 
@@ -276,6 +255,6 @@ def test_nothing_is_proposed_where_the_verdict_is_another(bench: tuple[Path, Pat
     for asked in diagnosis["rounds"]:
         asked["verdict"] = "adequate"
     (copy / "diagnosis.json").write_text(json.dumps(diagnosis | {"verdict": "adequate", "final_verdict": "adequate"}))
-    code, output = run_commands("propose", copy)
-    assert code == 1
-    assert "Traceback" not in output
+    done = run("propose", copy)
+    assert done.exit_code == 1
+    assert "Traceback" not in done.output

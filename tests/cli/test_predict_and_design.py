@@ -8,12 +8,10 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from click.testing import Result
+from commanded import run, succeed
 from lsoda_vine import N_TRUE, small_campaign
-from typer.testing import CliRunner
 
 import vinetrack as vt
-from vinetrack.cli.main import app
 from vinetrack.core.tables import write_json
 from vinetrack.inference.fit_summary import summary_of
 from vinetrack.pipeline.design_stage import read_list, read_range
@@ -28,13 +26,9 @@ SHEET = "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kP
 FEW = ("--samples", 60)
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
-
-
 def row(output: str, begins: str) -> list[str]:
     """Cells of the line that begins so."""
-    line = next(line for line in output.splitlines() if line.startswith(begins))
+    line = next(line for line in output.splitlines() if line.strip().startswith(begins))
     return [cell.strip() for cell in line.split("  ") if cell.strip()]
 
 
@@ -147,44 +141,32 @@ def test_python_predicts_what_the_command_does() -> None:
 
 
 INJECTOR = ("--diameter-mm", 2.5, "--length-mm", 12.5, "--pressure-kPa", 48, "--chamber-l", 0.003534)
+FASTEST = ("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60)
 RESERVOIR = ("reservoir", *INJECTOR, "--thickness-um", 50)
 
 
-def run_design(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["design", *map(str, arguments)], catch_exceptions=False)
-
-
-def cells(output: str, begins: str) -> list[str]:
-    line = next(line for line in output.splitlines() if line.strip().startswith(begins))
-    return [cell.strip() for cell in line.split("  ") if cell.strip()]
-
-
 def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path: Path) -> None:
-    done = run_design(
-        "vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60, "--figure", tmp_path / "a.svg"
-    )
-    assert done.exit_code == 0, done.output
-    film, diameter, length, pressure, hoop, *_ = cells(done.output, "100")
+    output = succeed("design", *FASTEST, "--figure", tmp_path / "a.svg")
+    film, diameter, length, pressure, hoop, *_ = row(output, "100")
     assert (film, diameter, length, pressure, hoop) == ("100", "25", "400", "62", "7.75")
     assert (tmp_path / "a.svg").read_text().startswith("<?xml")
 
 
 def test_the_injectors_chamber_loses_5_per_cent_of_gauge_and_not_1_7(tmp_path: Path) -> None:
-    done = run_design("reservoir", *INJECTOR, "--figure", tmp_path / "a.png")
-    assert done.exit_code == 0, done.output
-    assert cells(done.output, "asked about")[1:] == ["3.53 mL", "5.3", "7.4"]
-    assert cells(done.output, "needed if slow")[2] == "5.0"
-    assert "sweeps 0.0614 mL" in done.output
-    assert "speed" not in done.output
+    output = succeed("design", "reservoir", *INJECTOR, "--figure", tmp_path / "a.png")
+    assert row(output, "asked about")[1:] == ["3.53 mL", "5.3", "7.4"]
+    assert row(output, "needed if slow")[2] == "5.0"
+    assert "sweeps 0.0614 mL" in output
+    assert "speed" not in output
     assert (tmp_path / "a.png").exists()
 
 
 def test_the_answers_of_both_designs_are_numbers_in_json(tmp_path: Path) -> None:
-    run_design("reservoir", *INJECTOR, "--json", tmp_path / "r.json")
+    run("design", "reservoir", *INJECTOR, "--json", tmp_path / "r.json")
     asked = next(e for e in json.loads((tmp_path / "r.json").read_text())["chambers"] if e["chamber"] == "asked about")
     assert asked["volume_l"] == pytest.approx(0.003534)
     assert list(asked["loss_of_gauge_pressure"].values()) == pytest.approx([0.053, 0.074], abs=5e-4)
-    run_design("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60, "--json", tmp_path / "v.json")
+    run("design", *FASTEST, "--json", tmp_path / "v.json")
     best = json.loads((tmp_path / "v.json").read_text())["films"][0]
     assert (best["thickness_um"], best["diameter_mm"]) == pytest.approx((100, 25), rel=0.01)
     speed = best["final_speed_m_s"]
@@ -207,7 +189,7 @@ MISSING_OR_WRONG = (
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", MISSING_OR_WRONG)
 def test_design_refuses_with_exit_code_1(arguments: tuple[object, ...]) -> None:
-    done = run_design(*arguments)
+    done = run("design", *arguments)
     assert done.exit_code == 1
     assert "internal error of the program" not in done.output
 

@@ -13,9 +13,8 @@ from pathlib import Path
 import av
 import numpy as np
 import pandas as pd
-from typer.testing import CliRunner
+from commanded import succeed as run
 
-from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.__main__ import DEMO
@@ -46,13 +45,6 @@ def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = S
     (folder / "experiment.yaml").write_text(settings, encoding="utf-8")
     grow([str(folder), "--nature", str(nature)])
     return folder
-
-
-def run(*arguments: object) -> str:
-    """Run a command of vinetrack that must succeed; return its output."""
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.output
 
 
 def make_results(experiment: Path, results: Path) -> Path:

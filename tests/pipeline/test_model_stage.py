@@ -11,11 +11,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import Result
+from commanded import succeed
 from lsoda_vine import small_campaign
-from typer.testing import CliRunner
 
-from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.pipeline.model_stage import fit_model
@@ -34,10 +32,6 @@ AUDIT_HEADER = (
 )
 TRAJECTORY_HEADER = "trial,time_s,lead_position_m,model_position_m,replicates_mean_m,replicates_sigma_m"
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def write_experiment(folder: Path, settings: str = "") -> Path:
@@ -59,7 +53,7 @@ def write_experiment(folder: Path, settings: str = "") -> Path:
 
 def analysed(experiment: Path, results: Path) -> Path:
     for stage in ("trials", "damping"):
-        assert run(stage, experiment, results, "--settings", '{"damping": {"resamples": 200}}').exit_code == 0
+        succeed(stage, experiment, results, "--settings", '{"damping": {"resamples": 200}}')
     return results
 
 
@@ -115,9 +109,7 @@ def test_steady_windows_and_trajectories_agree_on_the_model_the_tracks_were_grow
 
 def test_compare_prints_a_finished_folder_aligned_and_with_units(campaign: tuple[Path, Path]) -> None:
     _, results = campaign
-    done = run("compare", results)
-    assert done.exit_code == 0
-    lines = done.output.splitlines()
+    lines = succeed("compare", results).splitlines()
     assert lines[2].split() == ["mm", "mm", "m/s", "ms", "mm"]
     assert lines[3].startswith("24mm-200um-280mm_12kPa_0g ")
     assert len({len(line) for line in lines[3:11]}) == 1
@@ -198,11 +190,6 @@ SHEET_AXES = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_
 LEVEL, DOOR, DOWN = ((10.0, 50.0), (300.0, 52.0)), ((40.0, 90.0), (200.0, 30.0)), ((60.0, 5.0), (62.0, 200.0))
 
 
-def run_axes(*arguments: object) -> None:
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-
-
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Five trials filmed level and two filmed straight down, analysed; the axes are those of `write_axes`."""
@@ -217,7 +204,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         sizes = f"{1e3 * trial.diameter_m:g},{1e6 * trial.thickness_m:g},{1e3 * trial.length_m:g}"
         rows.append(f"t{k},tracks/t{k}.csv,{sizes},{trial.pressure_Pa / 1e3:g},3,{90 if k < 5 else 0}\n")
     (experiment / "trials.csv").write_text("".join(rows))
-    run_axes("trials", experiment, results)
+    succeed("trials", experiment, results)
     return experiment, results
 
 
@@ -230,7 +217,7 @@ def gathered(
     for name, axis in axes.items():
         path = Results(folder).analysed(name)
         path.write_text(json.dumps(json.loads(path.read_text()) | {"axis": axis}))
-    run_axes("damping", experiment, folder)
+    succeed("damping", experiment, folder)
     with (folder / "trials.csv").open() as file:
         states = {row["trial"]: (row["status"], row["reason"]) for row in csv.DictReader(file)}
     pairs, _ = measured_trials(read_experiment(experiment), Results(folder))

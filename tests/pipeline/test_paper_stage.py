@@ -10,10 +10,8 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
+from commanded import run, succeed
 
-from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.figures.registry import figures_of
 from vinetrack.laboratory.tracks import grow, read_ground_truth, write_experiment
@@ -28,10 +26,6 @@ CHOSEN = (
 HEADER = (
     "row,where,quantity,setting,unit,published,as_printed,ours,ours_low_95,ours_high_95,mark,how,beside"  # the contract
 )
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
 def small_part(folder: Path, published: str) -> Path:
@@ -52,9 +46,8 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     )
     settings = ("--settings", '{"damping": {"resamples": 100}, "figures": {"formats": ["svg"], "dpi": 60}}')
     for stage in ("trials", "damping", "model", "paper"):
-        done = run(stage, experiment, results, *settings)
-        assert done.exit_code == 0, done.output
-    return results, done.output
+        said = succeed(stage, experiment, results, *settings)
+    return results, said
 
 
 @pytest.mark.slow

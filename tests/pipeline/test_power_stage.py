@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
+from commanded import succeed
 
-from vinetrack.cli.main import app
 from vinetrack.diagnosis.campaign_power import CampaignDesign, SimulatedDiagnosis
 from vinetrack.pipeline import power_stage
 from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
@@ -52,13 +51,11 @@ def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder
 @pytest.mark.slow
 def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> None:
     file, figure = tmp_path / "power.json", tmp_path / "power.png"
-    arguments = ["power", str(folder), "--effect", "leak", "--json", str(file), "--figure", str(figure)]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    output = succeed("power", folder, "--effect", "leak", "--json", file, "--figure", figure)
     content = json.loads(file.read_text())
     (leak,) = content["effects"]
     assert 0 < leak["size_50"] < leak["size_90"]
-    assert "90 % power" in result.output
+    assert "90 % power" in output
     assert figure.stat().st_size > 10_000
 
 
@@ -68,10 +65,7 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
     (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, new_vines: no}\n")
     now = power_of_target(PowerRequest(folder))["leak"]
     rows, size = tmp_path / "more.csv", f"leak={0.7 * now.size_at(0.9):.4g}"
-    arguments = ["power", str(tmp_path), "--effect", size, "--reach", "0.9", "--sheet", str(rows)]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    assert "of campaigns" in result.output
+    assert "of campaigns" in succeed("power", tmp_path, "--effect", size, "--reach", "0.9", "--sheet", rows)
     (tmp_path / "trials.csv").write_text(
         pd.concat([pd.read_csv(folder / "trials.csv"), pd.read_csv(rows)]).to_csv(index=False)
     )

@@ -10,11 +10,9 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import Result
+from commanded import run
 from plain_scene import Plan, Scene, plain_scene, write_images, write_video
-from typer.testing import CliRunner
 
-from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import OverlaySettings
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
@@ -44,13 +42,9 @@ def clip(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_video(tmp_path_factory.mktemp("films") / "vine.mp4", scene.frames, options={"crf": "12"})
 
 
-def track(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["track", *map(str, arguments)], catch_exceptions=False)
-
-
 def refused(*arguments: object) -> str:
     """What is said on the terminal of a recording that is refused: one sentence, and nothing is written."""
-    done = track(*arguments)
+    done = run("track", *arguments)
     assert done.exit_code == 1
     (sentence,) = done.stderr.strip().splitlines()
     return sentence
@@ -58,7 +52,7 @@ def refused(*arguments: object) -> str:
 
 @pytest.mark.slow
 def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, clip: Path, tmp_path: Path) -> None:
-    done = track(clip, "--out", tmp_path / "out")
+    done = run("track", clip, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     assert f"{len(scene.frames)} frames of 640 × 160 px, 8 bit" in done.stdout
     assert "Capture rate unknown; it plays at 60 per second" in done.stdout
@@ -78,8 +72,19 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, cli
 
 @pytest.mark.slow
 def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_path: Path) -> None:
-    done = track(
-        clip, "--capture-fps", 2000, "--exposure-us", 100, "--mm-per-px", 0.25, "--out", tmp_path, "--json", "-"
+    done = run(
+        "track",
+        clip,
+        "--capture-fps",
+        2000,
+        "--exposure-us",
+        100,
+        "--mm-per-px",
+        0.25,
+        "--out",
+        tmp_path,
+        "--json",
+        "-",
     )
     content = json.loads(done.stdout)
     assert content["duration_s"] == pytest.approx(len(scene.frames) / 2000)
@@ -98,14 +103,14 @@ def test_scale_is_that_of_the_settings_of_an_experiment(clip: Path, tmp_path: Pa
     (tmp_path / "experiment.yaml").write_text(
         "calibration: {kind: two_points, from_px: [10, 20], to_px: [410, 20], length_mm: 200}\n"
     )
-    done = track(clip, "--calibration", tmp_path, "--out", tmp_path / "out", "--json", "-")
+    done = run("track", clip, "--calibration", tmp_path, "--out", tmp_path / "out", "--json", "-")
     assert json.loads(done.stdout)["mm_per_px"] == pytest.approx(0.5)
 
 
 @pytest.mark.slow
 def test_a_folder_of_pictures_is_one_recording(scene: Scene, tmp_path: Path) -> None:
     folder = write_images(tmp_path / "shots", scene.frames)
-    done = track(folder, "--out", tmp_path / "out")
+    done = run("track", folder, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
 
 
@@ -116,7 +121,7 @@ def test_a_film_without_motion_is_told(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_an_axis_that_is_none_is_a_fault_of_the_command(clip: Path) -> None:
-    done = track(clip, "--axis", "10,20")
+    done = run("track", clip, "--axis", "10,20")
     assert done.exit_code == 2
     assert "--axis" in done.stderr
 
