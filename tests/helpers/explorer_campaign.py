@@ -20,6 +20,7 @@ from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.__main__ import DEMO
 from vinetrack.laboratory.__main__ import main as grow
 from vinetrack.pipeline.model_stage import fit_model
+from vinetrack.pipeline.stages import Job
 from vinetrack.results.folder_layout import Results
 
 DEMO_SHEET = Path(__file__).parents[2] / "data" / "demo" / "trials.csv"
@@ -51,7 +52,7 @@ def make_results(experiment: Path, results: Path) -> Path:
     """The results of the workflow, as far as the explorer reads them."""
     run("trials", experiment, results)
     run("damping", experiment, results, "--settings", '{"damping": {"resamples": 100}}')
-    fit_model(read_experiment(experiment), results, run_settings({}))
+    fit_model(Job(read_experiment(experiment), results, run_settings({})))
     made = {"experiment": experiment.absolute().as_posix(), "settings": {"damping": {"resamples": 100}}}
     Results(results).provenance.write_text(json.dumps(made))
     return results

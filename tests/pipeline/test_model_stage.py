@@ -17,6 +17,7 @@ from lsoda_vine import small_campaign
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.pipeline.model_stage import fit_model
+from vinetrack.pipeline.stages import Job
 from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_result, read_stored_track
 
 # The model in use on a results folder: exact columns, what a refused fit leaves, and tracks read back.
@@ -63,7 +64,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("campaign")
     experiment = write_experiment(folder / "vines")
     results = analysed(experiment, folder / "results")
-    fit_model(read_experiment(experiment), results, run_settings({}))
+    fit_model(Job(read_experiment(experiment), results, run_settings({})))
     return experiment, results
 
 
@@ -142,7 +143,7 @@ def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> 
 
 def refused(experiment: Path, results: Path) -> str:
     """The reason in `fit.json`, once every table has its header alone."""
-    content, _ = fit_model(read_experiment(experiment), results, run_settings({}))
+    content, _ = fit_model(Job(read_experiment(experiment), results, run_settings({})))
     assert (results / "comparison.csv").read_text() == COMPARISON_HEADER + "\n"
     assert (results / "model_check.csv").read_text() == CHECK_HEADER + "\n"
     assert (results / "audit.csv").read_text() == AUDIT_HEADER + "\n"
@@ -175,7 +176,7 @@ def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> 
     (experiment / "trials.csv").write_text("".join(sheet))
     (experiment / "experiment.yaml").write_text("travel_ratio: 1\nmodel: [gravity]\n")
     results = analysed(experiment, tmp_path / "results")
-    content, _ = fit_model(read_experiment(experiment), results, run_settings({}))
+    content, _ = fit_model(Job(read_experiment(experiment), results, run_settings({})))
     (g,) = content["numbers"]
     assert abs(g["value"] - 9.80665) < 4 * g["sigma"] < 0.04
     (row,) = read_result(results / "comparison.csv").itertuples()

@@ -14,7 +14,7 @@ from commanded import run
 from plain_scene import Plan, Scene, plain_scene, write_images, write_video
 
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.experiment.settings import OverlaySettings
+from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
 from vinetrack.pipeline.overlays_stage import (
     MARGIN_FRAMES,
@@ -26,6 +26,7 @@ from vinetrack.pipeline.overlays_stage import (
     playback_rate,
     position_to_px,
 )
+from vinetrack.pipeline.stages import Job
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video.write import write_clip
 
@@ -258,9 +259,10 @@ def test_one_recording_a_condition_unless_all_or_none_are_asked_for(tmp_path: Pa
 def test_a_recording_that_cannot_be_drawn_does_not_stop_the_others(tmp_path: Path) -> None:
     experiment, results = campaign(tmp_path)
     (results / "analysed" / "a.json").write_text(json.dumps({"row": {"mm_per_px": 0.5}}))
-    said = draw_overlays(read_experiment(experiment), results, OverlaySettings(seconds=1, width_px=320))
+    settings = run_settings({"overlays": {"seconds": 1, "width_px": 320}})
+    said = draw_overlays(Job(read_experiment(experiment), results, settings))
     assert len(said) == 1
-    assert said[0].startswith("a: no clip: ")
+    assert said[0].startswith("  a: no clip: ")
     assert [path.name for path in (results / "overlays").iterdir()] == ["c.mp4"]
 
 

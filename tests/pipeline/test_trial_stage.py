@@ -18,6 +18,7 @@ from plain_scene import Plan, plain_scene, write_video
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
+from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import Kept, analyse_trials, map_unordered, packed, unpacked
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
@@ -28,6 +29,7 @@ SHEET: dict[str, object] = {
     "capture_fps": 1000, "diameter_mm": 13.2, "thickness_um": 100, "length_mm": 190, "pressure_kPa": 30,
     "yield_pressure_kPa": 3, "mm_per_px": 0.3,
 }  # fmt: skip
+PNG = run_settings({"figures": {"formats": ["png"]}})
 PLAN = Plan(seed=20940, width=640, height=160, from_px=(30.0, 80.0), end_px=560.0, radius=22.0)
 
 
@@ -48,7 +50,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         write_video(folder / f"{name}.mp4", frames, options={"crf": "12"})
     write_sheet(folder)
     results = folder.parent / "results"
-    assert analyse_trials(read_experiment(folder), results, run_settings({"figures": {"formats": ["png"]}})) == {}
+    assert analyse_trials(Job(read_experiment(folder), results, PNG)) == []
     return folder, results
 
 
@@ -65,7 +67,7 @@ def again(tracked: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> list[s
     with monkeypatch.context() as changed:
         changed.setattr(survey, "track_pixels", track)
         changed.setattr(Kept, "figure", lambda *_: None)
-        analyse_trials(read_experiment(folder), results, run_settings({}))
+        analyse_trials(Job(read_experiment(folder), results, run_settings({})))
     return films
 
 
@@ -122,7 +124,7 @@ def test_a_changed_scale_gives_the_metres_of_a_film_that_is_tracked_anew(
     folder, results = tracked
     write_sheet(folder, mm_per_px=0.29)
     for place in (results, tmp_path):
-        analyse_trials(read_experiment(folder), place, run_settings({"figures": {"formats": ["png"]}}), only=["a"])
+        analyse_trials(Job(read_experiment(folder), place, PNG, ["a"]))
     files = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*a.*") if ".kept" not in path.parts)
     assert len(files) == 5
     for file in files:
@@ -155,7 +157,7 @@ def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked: tuple
     assert kept
     subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
     assert {path: path.stat().st_ino for path in kept} == kept
-    analyse_trials(read_experiment(folder), results, run_settings({"figures": {"formats": ["png"]}}))
+    analyse_trials(Job(read_experiment(folder), results, PNG))
     for name in ("a", "b"):
         pd.testing.assert_frame_equal(
             read_result(Results(tmp_path).track(name)), read_result(Results(results).track(name)), atol=1e-5

@@ -17,6 +17,7 @@ from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import Tube, preset
+from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import analyse_trials
 from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video import survey as module
@@ -335,7 +336,7 @@ def test_a_scale_a_fifth_off_is_kept_with_the_trial_for_the_verdict(clip: Path, 
     columns = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,mm_per_px,capture_fps"
     for name, scale in (("right", SCALE_MM), ("off", 0.8 * SCALE_MM)):
         (folder / "trials.csv").write_text(f"{columns}\n{name},a.mp4,12,100,140,60,3,{scale},{FPS}\n")
-        analyse_trials(read_experiment(folder), tmp_path / "out", run_settings({}))
+        analyse_trials(Job(read_experiment(folder), tmp_path / "out", run_settings({})))
     noted = {name: read_json(Results(tmp_path / "out").analysed(name)) for name in ("right", "off")}
     assert (noted["right"]["contradictions"], noted["right"]["row"]["status"]) == ([], "ok")
     (entry,) = noted["off"]["contradictions"]

@@ -299,7 +299,7 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
         lines = stage.run(job)
         return [stage.done] if in_run else lines, None
 
-    run_stage.__doc__ = stage.run.__doc__
+    run_stage.__doc__ = stage.does
     return run_stage
 
 

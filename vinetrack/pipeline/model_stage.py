@@ -41,11 +41,20 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
     from vinetrack.inference.fit_result import Fit, TrialFit
+    from vinetrack.pipeline.stages import Job
 
 log = logging.getLogger(__name__)
 
 
-def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> tuple[dict[str, Any], Fit | None]:
+def fit_and_diagnose(job: Job) -> list[str]:
+    """Fit the model in use, compare and audit it, and diagnose what it lacks."""
+    job.say("fitting the model")
+    _, fitted = fit_model(job)
+    diagnose_results(job, fitted)
+    return [*comparison_lines(job.results), *diagnosis_lines(job.results)]
+
+
+def fit_model(job: Job) -> tuple[dict[str, Any], Fit | None]:
     """Fit the model in use to all trials. Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv` and
     `audit.csv`. Returns `fit.json` as written, whose `refused` is None or the reason; and the fit for a diagnosis.
     """
@@ -54,13 +63,13 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> tu
     from vinetrack.inference.fit_result import CHECK_COLUMNS
     from vinetrack.inference.fit_summary import FitSummary, summary_of
 
-    results = Results(folder)
+    experiment, results = job.experiment, Results(job.results)
     damping = read_json(results.damping)
     pairs, kinematics = measured_trials(experiment, results)
     initial: Fit | None = None
     try:
         initial, fit = _fits(experiment, pairs)
-        comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
+        comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=job.settings.final_at_fraction)
         check, messages = _damping_check(fit, damping)
         audited = _audit(fit, comparison, pairs, kinematics)
         content = summary_of(fit, audited.warnings, messages).to_json()
@@ -70,7 +79,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> tu
         trajectories, tables = {}, tuple(map(empty_table, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS)))
     for path, table in zip((results.comparison, results.model_check, results.audit), tables, strict=True):
         write_csv(path, table)
-    _emptied(folder / "comparison")
+    _emptied(results.folder / "comparison")
     for condition, table in trajectories.items():
         write_csv(results.trajectories(condition), table)
     write_json(results.fit, content)
@@ -181,28 +190,28 @@ Report = Callable[[str], None]
 Pairs = Sequence[tuple[Trial, Track]]
 
 
-def diagnose_results(
-    experiment: Experiment, folder: Path, report: Report, settings: RunSettings, fitted: Fit | None = None
-) -> None:
-    """Diagnose the trials of a results folder; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
+def diagnose_results(job: Job, fitted: Fit | None) -> None:
+    """Diagnose the trials of a results folder, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and the
+    folder `diagnosis`.
+    """
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS
     from vinetrack.diagnosis.result import Diagnosis
 
-    results = Results(folder)
+    results = Results(job.results)
     try:
-        diagnosis, pairs = diagnosed(experiment, results, report, fitted)
+        diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
     except Exception as error:
         reason = _reason(error)
         explanation = f"No diagnosis could be made: {reason}"
         refusal = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
-        _emptied(folder / "diagnosis")
+        _emptied(results.folder / "diagnosis")
         write_csv(results.ladder, empty_table(LADDER_COLUMNS))
-        write_json(results.diagnosis, {**refusal.to_json(), "model": list(experiment.settings.model)})
+        write_json(results.diagnosis, {**refusal.to_json(), "model": list(job.experiment.settings.model)})
         log.info("%s", explanation)
         return
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
-    report("fitting the damping law under every model")
-    write_diagnosis(results, diagnosis, pairs, settings)
+    job.say("fitting the damping law under every model")
+    write_diagnosis(results, diagnosis, pairs, job.settings)
 
 
 def diagnosed(

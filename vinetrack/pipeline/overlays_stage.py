@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from vinetrack.experiment.folder import Experiment
     from vinetrack.figures.overlay import ClipView, Edge
+    from vinetrack.pipeline.stages import Job
     from vinetrack.video.axis import Axis
     from vinetrack.video.frames import Recording
     from vinetrack.video.survey import Measurement
@@ -44,16 +45,16 @@ MARGIN_FRAMES = 8  # Frames before and after the motion that a clip shows (chose
 FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a prediction into the picture (derived)
 
 
-def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySettings, n_workers: int = 1) -> list[str]:
+def draw_overlays(job: Job) -> list[str]:
     """Write the clips that the settings request; return a line for every clip that could not be made. A recording that
     cannot be drawn does not stop the others. The folder is created even without clips.
     """
-    results = Results(folder)
+    experiment, results, settings = job.experiment, Results(job.results), job.settings.overlays
     results.overlays.mkdir(parents=True, exist_ok=True)
     chosen = chosen_trials(experiment, results, settings.of)
     work = partial(_try_overlay, results=results, settings=settings)
-    messages = map_unordered(work, [experiment.trial(name) for name in chosen], n_workers)
-    return sorted(line for line in messages if line)
+    messages = map_unordered(work, [experiment.trial(name) for name in chosen], job.threads)
+    return sorted(f"  {line}" for line in messages if line)
 
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import FigureSettings
     from vinetrack.figures.diagnosis_figures import DiagnosisTables
+    from vinetrack.pipeline.stages import Job
     from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
     from vinetrack.report.section import DiagnosisResult
 
@@ -35,19 +36,19 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> list[str]:
+def draw_campaign(job: Job) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
-    results, tables = Results(folder), FigureTables(folder, experiment.trials)
+    results, tables = Results(job.results), FigureTables(job.results, job.experiment.trials)
     drawn = []
     for name in campaign_figures():
         for form in ("png", "svg", "pdf"):
             results.figure(name, f".{form}").unlink(missing_ok=True)
         if picture := draw(name, tables):
-            _write(picture, partial(results.figure, name), settings)
+            _write(picture, partial(results.figure, name), job.settings.figures)
             drawn.append(name)
             log.info("drew %s", name)
     write_json(results.figure_list, {"figures": drawn})
-    return drawn
+    return [f"{len(drawn)} figures."]
 
 
 def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
@@ -61,14 +62,16 @@ def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings
 # Comparison of a results folder with the published numbers and figures: `paper.csv`, figures, and their tables.
 
 
-def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
-    """Write `paper.csv` and the tables of the figures; return `paper.csv` as written."""
+def compare_with_paper(job: Job) -> list[str]:
+    """Write `paper.csv`, and the tables and figures of the comparison."""
+    from vinetrack.figures.style import blank
     from vinetrack.paper import rows as paper
+    from vinetrack.report.section import tally
 
+    experiment, results = job.experiment, Results(job.results)
     kind = experiment.settings.published
     if kind is None:
         raise ResultsError("experiment.yaml has no key `published`: set it to `simulated` or `measured`")
-    results = Results(folder)
     mark = paper.SIMULATED if kind == "simulated" else paper.MEASURED
     tables = _tables(experiment, results)
     measured = paper.ExperimentResults(
@@ -89,10 +92,14 @@ def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     ]
     table = paper.as_table(rows)
     for name, content in {**tables, "paper": table}.items():
-        write_csv(folder / f"{name}.csv", content)
+        write_csv(results.folder / f"{name}.csv", content)
     for mark in paper.MARKS:
         log.info("%s: %d rows", mark, int((table["mark"] == mark).sum()))
-    return table
+    shown = FigureTables(results.folder, ())
+    for name in figures_of("paper"):
+        drawn = draw(name, shown) or blank("No trial of this experiment is compared with this figure.")
+        _write(drawn, partial(results.figure, name), job.settings.figures)
+    return [f"Comparison with the paper: {tally(table)}"]
 
 
 def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]:
@@ -124,29 +131,20 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
     }
 
 
-def draw_paper(folder: Path, settings: FigureSettings) -> None:
-    """Draw the figures of the comparison from the tables of `compare_with_paper`."""
-    from vinetrack.figures.style import blank
-
-    tables = FigureTables(folder, ())
-    for name in figures_of("paper"):
-        drawn = draw(name, tables) or blank("No trial of this experiment is compared with this figure.")
-        _write(drawn, partial(Results(folder).figure, name), settings)
-
-
 MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 
 
-def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
-    """Write `provenance.json` and `report.html`; return the path of the report."""
+def write_report(job: Job) -> list[str]:
+    """Write `provenance.json` and `report.html`."""
     from vinetrack.report.build import build_report
 
-    results = Results(folder)
-    content = report_content(experiment, folder, settings)
+    results = Results(job.results)
+    settings = job.settings.model_dump(mode="json", exclude={"experiment", "results"})
+    content = report_content(job.experiment, job.results, settings)
     page = build_report(content)
     write_json(results.provenance, dict(content.provenance))
     write_text(results.report, page)
-    return results.report
+    return [f"Report: {results.report}"]
 
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:

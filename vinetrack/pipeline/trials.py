@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -51,8 +51,9 @@ if TYPE_CHECKING:
 
     from vinetrack.dynamics.model import Model
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import DampingSettings, FigureSettings, RunSettings
+    from vinetrack.experiment.settings import FigureSettings, RunSettings
     from vinetrack.kinematics.summary import TrialResult
+    from vinetrack.pipeline.stages import Job
     from vinetrack.video.survey import Measurement
     from vinetrack.video.track import Tracking
 
@@ -238,33 +239,26 @@ def _end_with_parent() -> None:
 TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
 
 
-def analyse_trials(
-    experiment: Experiment,
-    folder: Path,
-    settings: RunSettings,
-    n_workers: int = 1,
-    only: Collection[str] | None = None,
-    say: Callable[[str], None] = lambda _: None,
-) -> dict[str, str]:
+def analyse_trials(job: Job) -> list[str]:
     """Analyse all trials that are used, or only some; write the files of each in `tracks/`, `kinematics/`, `analysed/`
-    and `figures/`. Trials with a faulty row of the sheet get empty files. Returns reasons of failed trials by name;
-    `say` is told how many are finished.
+    and `figures/`. Trials with a faulty row of the sheet get empty files. Returns reasons of failed trials.
     """
+    experiment, only = job.experiment, job.trials
     names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
     model_of(experiment)
-    if n_workers > 1:
+    if job.threads > 1:
         _import_for_workers(experiment)
-    work = partial(_analyse, experiment=experiment, results=Results(folder), settings=settings)
+    work = partial(_analyse, experiment=experiment, results=Results(job.results), settings=job.settings)
     failed = {}
-    for count, (name, reason, fault) in enumerate(map_unordered(work, names, n_workers), 1):
+    for count, (name, reason, fault) in enumerate(map_unordered(work, names, job.threads), 1):
         log.info("%s: %s", name, reason or "analysed")
         if fault:
             log.error("trial %s:\n%s", name, fault)
         if reason:
             failed[name] = reason
-        say(f"{count} of {len(names)} trials")
-    Kept(folder).forget()
-    return {name: failed[name] for name in names if name in failed}
+        job.say(f"{count} of {len(names)} trials")
+    Kept(job.results).forget()
+    return [f"  {name}: {failed[name]}" for name in names if name in failed][:10]
 
 
 def _import_for_workers(experiment: Experiment) -> None:
@@ -452,6 +446,21 @@ def _draw_strip(
 # All trials: the tables of the experiment, and the damping law with its scaling with the size of the vine.
 
 
+def fit_damping(job: Job) -> list[str]:
+    """Gather the trials; fit the damping law and its scaling with size, and write `damping.json` and `scaling.json`."""
+    from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends
+    from vinetrack.narrative.diagnosis_text import damping_headline
+
+    table, results, settings = gather(job.experiment, job.results, job.settings), Results(job.results), job.settings
+    law = fit_laws(read_result(results.points), resamples=settings.damping.resamples, seed=settings.damping.seed)
+    write_json(results.scaling, fit_scaling(law) | fit_trends(read_result(results.conditions)))
+    write_json(results.damping, law)
+    for method, fit in law.items():
+        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
+    failed = int((table["status"] == "failed").sum())
+    return [f"{len(table)} trials, {failed} failed.", damping_headline(law)]
+
+
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
     """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`."""
     from vinetrack.kinematics.damping import mark_left_out
@@ -507,18 +516,3 @@ def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame
         if column not in TEXT_COLUMNS
     }
     return pd.DataFrame(rows, columns=list(columns)).astype(kinds)
-
-
-def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
-    """Fit the damping law to `damping_points.csv`; write `damping.json` and `scaling.json`. Returns `damping.json` as
-    written.
-    """
-    from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends
-
-    results = Results(folder)
-    damping = fit_laws(read_result(results.points), resamples=settings.resamples, seed=settings.seed)
-    write_json(results.scaling, fit_scaling(damping) | fit_trends(read_result(results.conditions)))
-    write_json(results.damping, damping)
-    for method, fit in damping.items():
-        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
-    return damping
