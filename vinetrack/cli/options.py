@@ -139,7 +139,7 @@ Answer = tuple[Iterable[str], Any] | tuple[Iterable[str], Any, bool]
 _Command = Callable[..., Answer | None]
 
 
-def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) -> Callable[[_Command], _Command]:
+def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) -> Callable[[_Command], Callable[..., None]]:
     """Give a function the arguments and options that the table states for its name (or `lines_of`), report its errors
     in sentences, and print the lines that it returns, or the content beside them as JSON.
 
@@ -148,7 +148,7 @@ def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) 
     trial sheet come first, and `options["cells"]` holds the given texts; `meanings` replaces the help of some of them.
     """
 
-    def decorate(function: _Command) -> _Command:
+    def decorate(function: _Command) -> Callable[..., None]:
         wanted = inspect.signature(function).parameters
         table = _table(lines_of or function.__name__.strip("_"))
 

@@ -73,10 +73,10 @@ def fit_model(job: Job) -> tuple[dict[str, Any], Fit | None]:
         check, messages = _damping_check(fit, damping)
         audited = _audit(fit, comparison, pairs, kinematics)
         content = summary_of(fit, audited.warnings, messages).to_json()
-        trajectories, tables = comparison.trajectories, (comparison.table, check, audited.table)
+        trajectories, tables = comparison.trajectories, [comparison.table, check, audited.table]
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
-        trajectories, tables = {}, tuple(map(empty_table, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS)))
+        trajectories, tables = {}, [*map(empty_table, (COMPARISON_COLUMNS, CHECK_COLUMNS, AUDIT_COLUMNS))]
     for path, table in zip((results.comparison, results.model_check, results.audit), tables, strict=True):
         write_csv(path, table)
     _emptied(results.folder / "comparison")

@@ -118,7 +118,7 @@ class Kept:
     ) -> None:
         """Write a figure in every format, kept for these inputs or drawn; `path` gives the path for a suffix."""
         key = _key(code_hash(), settings.dpi, inputs)
-        found = {form: _read(self.folder / f"{key}.{form}") for form in settings.formats}
+        found: dict[str, bytes] = {form: _read(self.folder / f"{key}.{form}") for form in settings.formats}
         if missing := [form for form, data in found.items() if not data]:
             from vinetrack.figures.style import render
 
@@ -329,7 +329,7 @@ def _of_recording(
     seen: dict[str, Any] = {"kind": "sheet", "image": None, **scale}
     if calibration is not None:
         seen |= {"kind": calibration.kind, "image": getattr(experiment.settings.calibration, "image", None)}
-    known = {"reprojection_px": None, "n_corners": 0, "n_pictures": 0, "notes": []}
+    known: dict[str, Any] = {"reprojection_px": None, "n_corners": 0, "n_pictures": 0, "notes": []}
     seen |= {name: getattr(calibration, name, blank) for name, blank in known.items()}
     axis = axis_entry(tracking.axis) | {"width_px": tracking.axis.width_px}
     axis |= {"shake_px": tracking.shake_px.round(2)} if np.any(tracking.shake_px) else {}

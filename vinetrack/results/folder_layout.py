@@ -238,7 +238,7 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
 
     names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px", "lead_position_systematic_m")
-    columns = {name: table[name].to_numpy(dtype=float) for name in names}
+    columns: dict[str, Any] = {name: table[name].to_numpy(dtype=float) for name in names}
     track = Track(**columns, flag=table["flag"].to_numpy(dtype=str))
     if not np.isfinite(columns["lead_position_systematic_m"]).any():
         track = replace(track, lead_position_systematic_m=None)
