@@ -128,18 +128,13 @@ _VINE_COLUMNS = frozenset(
 # Type of an option by its kind; text for all other kinds
 _TYPES: dict[str, Any] = {"number": float, "count": int, "path": Path, "flag": bool, "texts": list[str]}
 
-# Type of a value that is given as JSON, and an example, by kind
-_JSON_KINDS: dict[str, tuple[type, str]] = {
-    "list": (list, '["t1", "t2"]'),
-    "object": (dict, '{"damping": {"seed": 7}}'),
-}
-
 # What a command returns: lines, the same content for a program, and whether it found a fault, by default not
 Answer = tuple[Iterable[str], Any] | tuple[Iterable[str], Any, bool]
 _Command = Callable[..., Answer | None]
+_Decorator = Callable[[_Command], Callable[..., None]]
 
 
-def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) -> Callable[[_Command], Callable[..., None]]:
+def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) -> _Decorator:
     """Give a function the arguments and options that the table states for its name (or `lines_of`), report its errors
     in sentences, and print the lines that it returns, or the content beside them as JSON.
 
@@ -237,12 +232,12 @@ def _value(line: Mapping[str, str], given: Any) -> Any:
             return read_cell(COLUMNS[line["field"]], given)
         except CellError as error:
             raise _refused(line, f"{given!r} {error.message}: {error.allowed or error.remedy}") from None
-    if kind in _JSON_KINDS and given is not None:
-        type_, example = _JSON_KINDS[kind]
+    if kind in ("list", "object") and given is not None:
         try:
             content = json.loads(given)
         except ValueError as error:
             raise _refused(line, f"is not JSON ({error})") from None
+        type_, example = (list, '["t1", "t2"]') if kind == "list" else (dict, '{"damping": {"seed": 7}}')
         if not isinstance(content, type_):
             raise _refused(line, f"is not a JSON {kind} such as {example}")
         return content
