@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,10 @@ TRACK_HEADER = (
 KINEMATICS_HEADER = (
     "time_s,lead_position_m,lead_velocity_m_s,lead_velocity_sigma_m_s,tail_velocity_m_s,lead_acceleration_m_s2"
 )
+
+
+def through_snakemake(test: Callable[..., None]) -> Callable[..., None]:
+    return pytest.mark.slow(pytest.mark.pipeline(test))
 
 
 def steady_tail_speed(diameter_mm: float, pressure_kPa: float) -> float:
@@ -104,16 +109,14 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess
     return workdir / "results" / "my vines (1)", done
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_last_line_says_where_the_report_is(campaign: tuple) -> None:
     results, done = campaign
     assert done.stdout.strip().splitlines()[-1] == f"Report: results/{results.name}/report.html"
     assert (results / "report.html").is_file()
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_headers_are_exactly_those_people_rely_on(campaign: tuple) -> None:
     results, _ = campaign
     assert (results / "trials.csv").read_text().splitlines()[0] == TRIALS_HEADER
@@ -121,8 +124,7 @@ def test_headers_are_exactly_those_people_rely_on(campaign: tuple) -> None:
     assert (results / "kinematics" / "d12_0.csv").read_text().splitlines()[0] == KINEMATICS_HEADER
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_every_trial_of_the_sheet_is_listed_in_its_order_with_its_status(campaign: tuple) -> None:
     rows = read_rows(campaign[0] / "trials.csv")
     good = [f"d{diameter}_{i}" for diameter in B for i in range(len(PRESSURES_KPA))]
@@ -131,8 +133,7 @@ def test_every_trial_of_the_sheet_is_listed_in_its_order_with_its_status(campaig
     assert (rows["torn"]["status"], rows["aside"]["status"]) == ("failed", "left_out")
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_steady_speeds_are_those_the_tracks_were_written_with(campaign: tuple) -> None:
     rows = read_rows(campaign[0] / "trials.csv")
     for diameter_mm in B:
@@ -141,8 +142,7 @@ def test_steady_speeds_are_those_the_tracks_were_written_with(campaign: tuple) -
             assert float(rows[f"d{diameter_mm}_{i}"]["x_ss_m_s"]) == pytest.approx(truth, rel=0.02)
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 @pytest.mark.parametrize("method", ["log_log", "both_axes"])
 def test_the_damping_law_is_the_one_the_tracks_were_written_with(campaign: tuple, method: str) -> None:
     fit = json.loads((campaign[0] / "damping.json").read_text())[method]
@@ -154,8 +154,7 @@ def test_the_damping_law_is_the_one_the_tracks_were_written_with(campaign: tuple
     assert low < fit["n"] < high
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_every_figure_with_content_is_there_as_png_and_svg_and_no_other(campaign: tuple) -> None:
     figures = campaign[0] / "figures"
     drawn = json.loads((figures / "campaign.json").read_text())["figures"]
@@ -167,8 +166,7 @@ def test_every_figure_with_content_is_there_as_png_and_svg_and_no_other(campaign
     assert written == set(drawn)
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_provenance_names_version_settings_and_the_hash_of_every_input(campaign: tuple) -> None:
     import hashlib
 
@@ -183,8 +181,7 @@ def test_provenance_names_version_settings_and_the_hash_of_every_input(campaign:
     assert set(provenance["inputs"]) >= {"tracks/d12_0.csv", "tracks/d24_3.csv", "tracks/torn.csv"}
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_nothing_is_left_to_do_afterwards_and_the_last_line_still_says_where(campaign: tuple) -> None:
     results, _ = campaign
     again = snakemake(results.parents[1], "--cores", "1", "--config", "experiment=my vines (1)")
@@ -193,8 +190,7 @@ def test_nothing_is_left_to_do_afterwards_and_the_last_line_still_says_where(cam
     assert again.stdout.strip().splitlines()[-1] == f"Report: results/{results.name}/report.html"
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_a_setting_reruns_only_what_depends_on_it(campaign: tuple) -> None:
     results, _ = campaign
     arguments = ("--cores", "1", "-n", "--config", "experiment=my vines (1)", "damping={resamples: 500}")
@@ -206,8 +202,7 @@ def test_a_setting_reruns_only_what_depends_on_it(campaign: tuple) -> None:
     assert not planned.stdout.strip().endswith("report.html")
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path: Path) -> None:
     write_track(tmp_path / "vines" / "a.csv", 12, 20, 1)
     done = snakemake(tmp_path, "--cores", "1", "--config", "experiment=vinse")
@@ -295,8 +290,7 @@ def test_the_same_experiment_gives_the_same_bytes(tmp_path: Path) -> None:
         assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "second" / file).read_bytes(), file
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
+@through_snakemake
 def test_the_workflow_has_no_lints_but_the_one_about_conda() -> None:
     done = snakemake(ROOT, "--lint", "--config", "experiment=data/demo")
     lints = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip().startswith("* ")]
@@ -314,8 +308,7 @@ def test_the_snakefile_is_formatted() -> None:
 # A workflow that is killed goes on with the same command.
 
 
-@pytest.mark.pipeline
-@pytest.mark.slow
+@through_snakemake
 def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None:
     write_campaign(tmp_path / "vines")
     results = tmp_path / "results" / "vines"

@@ -25,6 +25,8 @@ from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera, Target
 from vinetrack.laboratory.tracks import GroundTruth, grow
 
+pytestmark = [pytest.mark.slow, pytest.mark.pipeline]
+
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa"
 SHARED = "capture_fps: 1069\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
 FEW = "candidates: [tail_friction]\n"
@@ -128,8 +130,6 @@ def spread_px(found: np.ndarray) -> float:
     return float(found[sure, 0].std())
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 @pytest.mark.parametrize("name", GOOD)
 def test_a_good_recording_is_tracked_within_a_third_of_a_pixel(filmed: Filmed, name: str) -> None:
     assert filmed.rows[name]["status"] in ("ok", "warning")
@@ -138,8 +138,6 @@ def test_a_good_recording_is_tracked_within_a_third_of_a_pixel(filmed: Filmed, n
     assert (np.abs(found[:, 0]) < 6 * found[:, 1]).all()
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 @pytest.mark.parametrize("name", GOOD)
 def test_the_board_gives_the_scale_of_the_axis_within_a_thousandth(filmed: Filmed, name: str) -> None:
     track = pd.read_csv(filmed.results / "tracks" / f"{name}.csv")
@@ -151,8 +149,6 @@ def test_the_board_gives_the_scale_of_the_axis_within_a_thousandth(filmed: Filme
     assert 0 < float(filmed.rows[name]["scale_rel_sigma"]) < 1e-3
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -168,8 +164,6 @@ def test_a_recording_that_cannot_be_read_fails_with_its_sentence(filmed: Filmed,
     assert len((filmed.results / "tracks" / f"{name}.csv").read_text().splitlines()) == 1
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 def test_a_recording_without_its_end_gives_what_is_there_and_says_so(filmed: Filmed) -> None:
     row = filmed.rows["part"]
     assert row["status"] == "warning"
@@ -178,8 +172,6 @@ def test_a_recording_without_its_end_gives_what_is_there_and_says_so(filmed: Fil
     assert spread_px(errors_px(filmed.results, "part", whole)) < 0.35
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> None:
     page = (filmed.results / "report.html").read_text(encoding="utf-8")
     for name in (*GOOD, "part"):
@@ -191,8 +183,6 @@ def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> Non
     assert filmed.said.stdout.strip().splitlines()[-1] == "Report: results/vines/report.html"
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 def test_a_recording_of_every_condition_has_a_clip_and_one_plays_in_the_report(filmed: Filmed) -> None:
     tracked = {name: row["condition"] for name, row in filmed.rows.items() if row["status"] in ("ok", "warning")}
     clips = [path.stem for path in (filmed.results / "overlays").glob("*.mp4")]
@@ -202,8 +192,6 @@ def test_a_recording_of_every_condition_has_a_clip_and_one_plays_in_the_report(f
     assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 def test_check_says_of_the_same_folder_what_is_wrong(filmed: Filmed) -> None:
     done = run("check", filmed.results.parents[1] / "vines")
     assert done.exit_code == 1
@@ -228,8 +216,6 @@ def measured(folder: Path, results: Path, trial: str) -> dict[str, str]:
     return read_rows(results / "trials.csv")[trial]
 
 
-@pytest.mark.slow
-@pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("settings", "rel_sigma"),
     [
