@@ -28,6 +28,7 @@ def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> Mixe
         free=np.ones(keys, dtype=bool),
         points=np.full(n_trials, float(count)),
         stretches=np.ones(n_trials),
+        random=np.zeros(keys, dtype=bool),
     )
 
 

@@ -44,120 +44,78 @@ ACTIVE_SET_CHANGES = 10
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def decrease_within_bounds(
-    matrix: Floats, slope: Floats, below: Floats, above: Floats, free: NDArray[np.bool_]
-) -> tuple[bool, float, float]:
-    """Decrease of a quadratic form by the step to its minimum within bounds, found as in `gauss_newton.bounded_solve`.
-    Returns solved (whether every pivot is large enough; if not, the other two values are meaningless), decrease,
-    log_det (of the information of the parameters that are not at a bound). Shapes: matrix (n, n); slope, below, above,
-    free (n,).
+def step_within_bounds(
+    square: Floats, slope: Floats, below: Floats, above: Floats, free: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Step to the minimum of a quadratic form, at most `below` down and `above` up. Primal active-set method (Nocedal &
+    Wright, Numerical Optimization, 2nd ed., Springer 2006, algorithm 16.3): a parameter that meets its bound is held
+    there while the others go on. Returns step, moving (parameters that do not end at a bound). Shapes: square (n, n);
+    slope, below, above, free (n,).
     """
-    size = len(slope)
-    moving, step, outward = np.empty(size, np.bool_), np.zeros(size), np.zeros(size)
-    for u in range(size):
-        moving[u] = free[u] and matrix[u, u] > 0
-    places, scale = np.empty(size, np.int64), np.empty(size)
-    log_det = 0.0
-    for _ in range(ACTIVE_SET_CHANGES * size + 1):
-        count = 0
-        for u in range(size):
-            if moving[u]:
-                places[count] = u
-                scale[count] = 1 / math.sqrt(matrix[u, u])
-                count += 1
-        scaled, lower, remaining = np.empty((count, count)), np.empty((count, count)), np.empty(count)
-        log_det, fraction_to_bound = 0.0, np.inf
-        for i in range(count):
-            u = places[i]
-            for j in range(i + 1):
-                scaled[i, j] = scale[i] * matrix[u, places[j]] * scale[j]
-            remaining_slope = slope[u]
-            for v in range(size):
-                if not moving[v]:
-                    remaining_slope -= matrix[u, v] * step[v]
-            remaining[i] = scale[i] * remaining_slope
-        _factor(scaled, 0.0, lower)
-        for i in range(count):
-            # 1e-9: least pivot of a factorised system of unit diagonal, the part of its information that
-            # a parameter keeps once the previous ones are eliminated; below it the system is left to
-            # least squares, which drop what is singular (derived)
-            if not lower[i, i] > 1e-9:
-                return False, 0.0, 0.0
-            log_det += math.log(lower[i, i]) - 2 * math.log(scale[i])
-        _solve(lower, remaining)
-        for i in range(count):
-            u = places[i]
-            remaining[i] = scale[i] * remaining[i] - step[u]
-            distance_to_bound = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
-            if remaining[i] != 0:
-                fraction_to_bound = min(fraction_to_bound, max(distance_to_bound / remaining[i], 0.0))
-        bound_met = fraction_to_bound < 1
-        for i in range(count):
-            u = places[i]
-            distance_to_bound = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
-            if bound_met and remaining[i] != 0 and max(distance_to_bound / remaining[i], 0.0) <= fraction_to_bound:
-                moving[u], outward[u] = False, 1.0 if remaining[i] > 0 else -1.0
-            step[u] += min(fraction_to_bound, 1.0) * remaining[i]
-        if bound_met:
-            continue
-        released, largest = -1, LEAST_RELEASE_DECREASE
-        for u in range(size):
-            if moving[u] or outward[u] == 0.0:
+    diagonal = np.diag(square)
+    moving = free & (diagonal > 0)
+    step, outward = np.zeros_like(slope), np.zeros_like(slope)
+    for _ in range(ACTIVE_SET_CHANGES * slope.size + 1):
+        k = np.flatnonzero(moving)
+        if k.size:
+            slope_left = slope - square @ np.where(moving, 0.0, step)
+            remaining = solve_scaled(square[k][:, k], slope_left[k]) - step[k]
+            # Go as far as the first bound, which lowers the sum of squares; fix those parameters, go on with the rest.
+            room = np.where(remaining > 0, above[k] - step[k], below[k] + step[k])
+            part = np.where(remaining == 0, np.inf, np.maximum(room, 0.0) / np.abs(remaining))
+            first = part.min()
+            step[k] += min(first, 1.0) * remaining
+            if first < 1:
+                met = part <= first
+                outward[k[met]] = np.sign(remaining[met])
+                moving[k[met]] = False
                 continue
-            pull = slope[u]
-            for v in range(size):
-                pull -= matrix[u, v] * step[v]
-            if -outward[u] * pull > 0.0 and pull * pull / matrix[u, u] > largest:
-                released, largest = u, pull * pull / matrix[u, u]
-        if released < 0:
+        # Decrease of the form if a parameter alone left its bound.
+        inward = np.where(moving, 0.0, np.maximum(-outward * (slope - square @ step), 0.0))
+        decrease = inward**2 / np.where(outward != 0, diagonal, 1.0)
+        if not decrease.max() > LEAST_RELEASE_DECREASE:
             break
-        moving[released] = True
-    decrease = 0.0
-    for u in range(size):
-        product = 0.0
-        for v in range(size):
-            product += matrix[u, v] * step[v]
-        decrease += step[u] * (2 * slope[u] - product)
-    return True, decrease, log_det
+        moving[np.argmax(decrease)] = True
+    return step, moving
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations_without_deviations(
-    blocks: Floats, places: NDArray[np.int_], deviation_sd: Floats, size: int
-) -> tuple[Floats, Floats, float, float]:
-    """Normal equations of the free parameters with the two deviations of each trial integrated out, summed over trials.
-    Returns information, slope, square (residual sum of squares), log_det (sum over trials of ln det(I + S Z S), S the
-    standard deviations and Z the cross products of deviations). Shapes: blocks (n_trials, 2 + n_keys + 1, 2 + n_keys +
-    1); places (n_trials, n_keys); deviation_sd (n_trials, 2) → (size, size).
+def solve_scaled(square: Floats, slope: Floats) -> Floats:
+    """Solve a symmetric system scaled to a unit diagonal, by least squares where it is singular. Shapes: square (n, n);
+    slope (n,) → (n,).
     """
-    last = blocks.shape[1] - 1
-    information, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
-    square, log_det = 0.0, 0.0
-    of_pressure, of_damping = np.empty(last + 1), np.empty(last + 1)
+    size = len(slope)
+    scale = 1 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+    scaled, lower = square * np.outer(scale, scale), np.empty((size, size))
+    _factor(scaled, lower)
+    # 1e-9: least pivot, the part of its information that a parameter keeps once the previous ones are eliminated, below
+    # which least squares drop what is singular (derived)
+    if np.diag(lower).min() > 1e-9:
+        return scale * _solved(lower, scale * slope)
+    return scale * np.linalg.lstsq(scaled, scale * slope, 1e-12)[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def without_deviations(blocks: Floats, deviation_sd: Floats) -> tuple[Floats, float]:
+    """Blocks of trials with their first two unknowns, of standard deviations S, integrated out; and the sum over trials
+    of ln det(I + S Z S), Z the cross products of the two. Shapes: blocks (n_trials, k, k); deviation_sd (n_trials, 2) →
+    (n_trials, k − 2, k − 2).
+    """
+    left, log_det = np.empty((len(blocks), blocks.shape[1] - 2, blocks.shape[1] - 2)), 0.0
     for i in range(len(blocks)):
-        block, places_of_trial = blocks[i], places[i]
-        sd_pressure, sd_damping = deviation_sd[i, 0], deviation_sd[i, 1]
+        block, sd_pressure, sd_damping = blocks[i], deviation_sd[i, 0], deviation_sd[i, 1]
         # Eliminated one after the other, by the Cholesky factor of I + S Z S. At steady speed its two columns are
         # nearly collinear, and the explicit inverse would lose the residual of precise positions to cancellation.
-        pivot_pressure = 1.0 + sd_pressure * sd_pressure * block[0, 0]
-        for u in range(1, last + 1):
-            of_pressure[u] = sd_pressure * block[0, u] / math.sqrt(pivot_pressure)
-        pivot_damping = 1.0 + sd_damping * sd_damping * (block[1, 1] - of_pressure[1] * of_pressure[1])
-        for u in range(2, last + 1):
-            of_damping[u] = sd_damping * (block[1, u] - of_pressure[1] * of_pressure[u]) / math.sqrt(pivot_damping)
+        pivot_pressure = 1.0 + sd_pressure**2 * block[0, 0]
+        of_pressure = sd_pressure * block[0] / math.sqrt(pivot_pressure)
+        pivot_damping = 1.0 + sd_damping**2 * (block[1, 1] - of_pressure[1] ** 2)
+        of_damping = sd_damping * (block[1] - of_pressure[1] * of_pressure) / math.sqrt(pivot_damping)
         log_det += math.log(pivot_pressure) + math.log(pivot_damping)
-        for u in range(2, last + 1):
-            for v in range(2, u + 1):
-                left = block[u, v] - of_pressure[u] * of_pressure[v] - of_damping[u] * of_damping[v]
-                if u < last:
-                    information[places_of_trial[u - 2], places_of_trial[v - 2]] += left
-                    if v < u:
-                        information[places_of_trial[v - 2], places_of_trial[u - 2]] += left
-                elif v < last:
-                    slope[places_of_trial[v - 2]] += left
-                else:
-                    square += left
-    return information[:size, :size].copy(), slope[:size].copy(), square, log_det
+        for u in range(len(left[i])):
+            for v in range(len(left[i])):
+                of_both = of_pressure[u + 2] * of_pressure[v + 2] + of_damping[u + 2] * of_damping[v + 2]
+                left[i, u, v] = block[u + 2, v + 2] - of_both
+    return left, log_det
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -178,39 +136,22 @@ def noise_at_correlations(
     trials, m = prior_precision.shape
     scores = np.zeros(len(rhos))
     squares, degrees = np.empty((len(rhos), trials)), np.empty((len(rhos), trials))
-    white, scaled, lower = np.empty((m + 1, m + 1)), np.empty((m, m)), np.empty((m, m))
-    scale, solution = np.empty(m), np.empty(m)
+    lower = np.empty((m, m))
     for k in range(len(rhos)):
-        rho = rhos[k]
         for i in range(trials):
             lag_zero, lag_one, inner = cross_products[i, 0], cross_products[i, 1], cross_products[i, 2]
-            for u in range(m + 1):
-                for v in range(m + 1):
-                    white[u, v] = lag_zero[u, v] - rho * lag_one[u, v] + rho * rho * inner[u, v]
-            log_det = 0.0
+            white = lag_zero - rhos[k] * lag_one + rhos[k] ** 2 * inner
+            gradient = white[:m, m] - prior_gradient[i]
+            scale = 1 / np.sqrt(np.diag(white)[:m] + prior_precision[i])
+            scaled = np.outer(scale, scale) * white[:m, :m]
+            information = scaled + np.diag(prior_precision[i] * scale**2 + RIDGE)
+            _factor(information, lower)
+            log_det, dof_taken = 0.0, shared
             for u in range(m):
-                scale[u] = 1 / math.sqrt(white[u, u] + prior_precision[i, u])
-                log_det -= 2 * math.log(scale[u])
-            for u in range(m):
-                for v in range(m):
-                    scaled[u, v] = scale[u] * white[u, v] * scale[v]
-                scaled[u, u] += scale[u] * prior_precision[i, u] * scale[u]
-            _factor(scaled, 0.0, lower)
-            for u in range(m):
-                log_det += math.log(abs(lower[u, u]))
-            _factor(scaled, RIDGE, lower)
-            dof_taken, explained = shared, 0.0
-            for v in range(m):
-                for u in range(m):
-                    solution[u] = scale[u] * white[u, v] * scale[v]
-                _solve(lower, solution)
-                dof_taken += solution[v]
-            for u in range(m):
-                solution[u] = scale[u] * (white[u, m] - prior_gradient[i, u])
-            _solve(lower, solution)
-            for u in range(m):
-                explained += scale[u] * (white[u, m] - prior_gradient[i, u]) * solution[u]
+                log_det += math.log(abs(lower[u, u])) - 2 * math.log(scale[u])
+                dof_taken += _solved(lower, scaled[u])[u]
             dof = max(points[i] - dof_taken, 1.0)
+            explained = np.sum(scale * gradient * _solved(lower, scale * gradient))
             residual_square = max(white[m, m] - explained, least_residual_part * white[m, m])
             scores[k] += dof * math.log(residual_square / dof) + log_det
             squares[k, i], degrees[k, i] = residual_square, dof
@@ -218,29 +159,29 @@ def noise_at_correlations(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _factor(matrix: Floats, ridge: float, lower: Floats) -> None:
-    """LDLᵀ factorisation of a symmetric matrix with `ridge` added to its diagonal; D is the diagonal of `lower`."""
-    size = len(matrix)
-    for u in range(size):
+def _factor(matrix: Floats, lower: Floats) -> None:
+    """LDLᵀ factorisation of a symmetric matrix; D is the diagonal of `lower`."""
+    for u in range(len(matrix)):
         for v in range(u + 1):
-            left = matrix[u, v] + (ridge if u == v else 0.0)
+            left = matrix[u, v]
             for w in range(v):
                 left -= lower[u, w] * lower[v, w] * lower[w, w]
             lower[u, v] = left if u == v else left / lower[v, v]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(lower: Floats, right: Floats) -> None:
-    """Solve with the factors of `_factor`, in place."""
-    size = len(right)
+def _solved(lower: Floats, right: Floats) -> Floats:
+    """The solution with the factors of `_factor`."""
+    size, solution = len(right), right.copy()
     for u in range(size):
         for v in range(u):
-            right[u] -= lower[u, v] * right[v]
+            solution[u] -= lower[u, v] * solution[v]
     for u in range(size):
-        right[u] /= lower[u, u]
+        solution[u] /= lower[u, u]
     for u in range(size - 1, -1, -1):
         for v in range(u + 1, size):
-            right[u] -= lower[v, u] * right[v]
+            solution[u] -= lower[v, u] * solution[v]
+    return solution
 
 
 LEAST_BETWEEN_TRIAL_SD = 1e-5  # Least between-trial standard deviation (chosen)
@@ -277,7 +218,7 @@ class MixedProblem:
     free: NDArray[np.bool_]
     points: Floats
     stretches: Floats
-    random: NDArray[np.bool_] | None = None
+    random: NDArray[np.bool_]
 
     @cached_property
     def places(self) -> NDArray[np.int_]:
@@ -356,19 +297,32 @@ def solve_per_trial(square: Floats, right: Floats) -> Floats:
     return np.asarray(scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * right))
 
 
+def eliminated(blocks: Floats, precision: Floats) -> tuple[Floats, Floats]:
+    """Blocks of trials with their first m unknowns, of these prior precisions, integrated out (Schur complement); and
+    the response of these unknowns to the others. Shapes: blocks (n_trials, k, k); precision (n_trials, m) → (n_trials,
+    k − m, k − m), (n_trials, m, k − m).
+    """
+    m = precision.shape[1]
+    response = solve_per_trial(with_diagonal(blocks[:, :m, :m], precision), blocks[:, :m, m:])
+    return blocks[:, m:, m:] - blocks[:, m:, :m] @ response, response
+
+
+def with_diagonal(square: Floats, diagonal: Floats) -> Floats:
+    """Matrices with something added to their diagonals. Shapes: square (n, k, k); diagonal (n, k)."""
+    return np.asarray(square + diagonal[:, :, None] * np.eye(diagonal.shape[1]))
+
+
+def whitened_products(cross_products: Floats, state: FitState) -> Floats:
+    """Cross products in units of the noise. Shapes: cross_products (n_trials, 3, k, k) → (n_trials, k, k)."""
+    return np.asarray(at_correlation(cross_products, state.rho) / state.variance[:, None, None])
+
+
 def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: MixedProblem, state: FitState) -> Floats:
     """Whitened cross products of keys, residual and further columns with the trial effects integrated out. Shapes:
     cross_products (n_trials, 3, k, k) → (n_trials, k − 4, k − 4).
     """
-    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
-    white = at_zero_deviations(white, state, N_TRIAL_EFFECTS + n_keys)
-    within_trial = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + trial_effect_prior(problem, state)[1][
-        :, :, None
-    ] * np.eye(N_TRIAL_EFFECTS)
-    cross = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:]
-    return np.asarray(
-        white[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - np.swapaxes(cross, 1, 2) @ solve_per_trial(within_trial, cross)
-    )
+    white = at_zero_deviations(whitened_products(cross_products, state), state, N_TRIAL_EFFECTS + n_keys)
+    return eliminated(white, trial_effect_prior(problem, state)[1])[0]
 
 
 def at_zero_deviations(white: Floats, state: FitState, residual: int) -> Floats:
@@ -399,30 +353,22 @@ def levenberg_marquardt_step(
     of squares along this step, by the linear model without the damping). Shapes: cross_products (n_trials, 3, k, k) →
     (n_free,).
     """
-    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
-    effect_information, effect_gradient = _trial_effect_equations(white, problem, state)
-    damped = effect_information * (1 + damping * np.eye(N_TRIAL_EFFECTS))
-    cross = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
-    solved = solve_per_trial(damped, np.concatenate([cross, effect_gradient[:, :, None]], axis=2))
-    square = sum_matrix_blocks(white[:, N_TRIAL_EFFECTS:-1, N_TRIAL_EFFECTS:-1], problem) + np.diag(
-        problem.prior_precision
-    )
-    slope = sum_vector_blocks(white[:, N_TRIAL_EFFECTS:-1, -1], problem) - problem.prior_precision * (
-        state.theta - problem.prior_mean
-    )
-    reduced = square * (1 + damping * np.eye(square.shape[0]))
-    reduced = reduced - sum_matrix_blocks(np.swapaxes(cross, 1, 2) @ solved[:, :, :-1], problem)
-    reduced_slope = slope - sum_vector_blocks(np.einsum("nuk,nu->nk", cross, solved[:, :, -1]), problem)
-    step, _ = bounded_solve(reduced, reduced_slope, problem, state.theta)
+    keys, precision = slice(N_TRIAL_EFFECTS, -1), trial_effect_prior(problem, state)[1]
+    white = _with_prior_gradient(cross_products, problem, state)
+    prior, prior_slope = problem.prior_precision, problem.prior_precision * (problem.prior_mean - state.theta)
+    damped = precision + damping * (np.einsum("nkk->nk", white)[:, :N_TRIAL_EFFECTS] + precision)
+    reduced, response = eliminated(white, damped)
+    diagonal = np.diag(sum_matrix_blocks(white[:, keys, keys], problem)) + prior
+    square = sum_matrix_blocks(reduced[:, :-1, :-1], problem) + np.diag(prior + damping * diagonal)
+    slope = sum_vector_blocks(reduced[:, :-1, -1], problem) + prior_slope
+    step, _ = bounded_solve(square, slope, problem, state.theta)
     step_of_keys = np.append(step, 0.0)[problem.index]
-    trial_effect_step = solved[:, :, -1] - np.einsum("nuk,nk->nu", solved[:, :, :-1], step_of_keys)
+    trial_effect_step = response[:, :, -1] - np.einsum("nuk,nk->nu", response[:, :, :-1], step_of_keys)
     # 2 sᵀg − sᵀHs with the undamped H. Only for a full Gauss–Newton step, where Hs = g, is that sᵀg.
-    curvature = (
-        step @ square @ step
-        + 2 * np.einsum("nu,nuk,nk->", trial_effect_step, cross, step_of_keys)
-        + np.einsum("nu,nuv,nv->", trial_effect_step, effect_information, trial_effect_step)
-    )
-    predicted_decrease = float(2 * (step @ slope + np.sum(trial_effect_step * effect_gradient)) - curvature)
+    steps = np.hstack([trial_effect_step, step_of_keys])
+    curvature = np.einsum("nu,nuv,nv->", steps, white[:, :-1, :-1], steps, optimize=True)
+    curvature += np.sum(precision * trial_effect_step**2) + np.sum(prior * step**2)
+    predicted_decrease = float(2 * (step @ prior_slope + np.sum(steps * white[:, :-1, -1])) - curvature)
     return step, trial_effect_step, predicted_decrease
 
 
@@ -432,71 +378,33 @@ def trial_effect_step(
     """Gauss–Newton step of the trial effects at fixed parameters. Shapes: cross_products (n_trials, 3, k, k) →
     (n_trials, 4).
     """
-    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
-    square, slope = _trial_effect_equations(white, problem, state)
+    white = _with_prior_gradient(cross_products, problem, state)
+    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
+    slope = white[:, :N_TRIAL_EFFECTS, -1:]
     if fixed_release:
         square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
         square[:, RELEASE, RELEASE] = 1.0
-    return np.asarray(solve_per_trial(square, slope[:, :, None])[:, :, 0])
+    return solve_per_trial(square, slope)[:, :, 0]
 
 
-def _trial_effect_equations(white: Floats, problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
-    """Information of the trial effects, and half the negative gradient of the sum of squares, their priors included."""
+def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
+    """Whitened cross products; those of the trial effects with the residual include the pull of their priors, which
+    makes them half the negative gradient of the penalised sum of squares.
+    """
+    white = whitened_products(cross_products, state)
     centre, precision = trial_effect_prior(problem, state)
-    information = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
-    return information, white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
+    white[:, :N_TRIAL_EFFECTS, -1] -= precision * (state.trial_effects - centre)
+    white[:, -1, :N_TRIAL_EFFECTS] = white[:, :N_TRIAL_EFFECTS, -1]
+    return white
 
 
 def bounded_solve(
     square: Floats, slope: Floats, problem: MixedProblem, theta: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Step to the minimum of a quadratic form within bounds. Primal active-set method (Nocedal & Wright, Numerical
-    Optimization, 2nd ed., Springer 2006, algorithm 16.3): a parameter that meets its bound is held there while the
-    others go on. Returns step, moving (parameters that do not end at a bound). Shapes: square (n_free, n_free); slope,
-    theta (n_free,) → (n_free,).
-    """
-    moving = problem.free & (np.diag(square) > 0)
-    if moving.all():
-        # In most calls no bound is active, and a single solve suffices. A fit calls this some hundred times.
-        full_step = solve_scaled(square, slope)
-        distance_to_bound = np.where(full_step > 0, problem.upper - theta, theta - problem.lower)
-        if (np.abs(full_step) <= distance_to_bound).all():
-            return full_step, moving
-    step, outward = np.zeros_like(slope), np.zeros_like(slope)
-    for _ in range(ACTIVE_SET_CHANGES * slope.size + 1):
-        k = np.flatnonzero(moving)
-        if k.size:
-            at_bound = np.flatnonzero(~moving)
-            remaining_step = (
-                solve_scaled(square[np.ix_(k, k)], slope[k] - square[np.ix_(k, at_bound)] @ step[at_bound]) - step[k]
-            )
-            # Go as far as the first bound, which lowers the sum of squares; fix those parameters, go on with the rest.
-            current = theta[k] + step[k]
-            distance_to_bound = np.where(remaining_step > 0, problem.upper[k] - current, problem.lower[k] - current)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                part = np.where(remaining_step == 0, np.inf, np.maximum(distance_to_bound / remaining_step, 0.0))
-            first = float(np.min(part))
-            step[k] += min(first, 1.0) * remaining_step
-            if first < 1:
-                met = part <= first
-                outward[k[met]], moving[k[met]] = np.sign(remaining_step[met]), False
-                continue
-        # Decrease of the form if a parameter alone left its bound.
-        inward = np.where(moving, 0.0, np.maximum(-outward * (slope - square @ step), 0.0))
-        decrease = inward**2 / np.where(outward != 0, np.diag(square), 1.0)
-        if not decrease.max(initial=0.0) > LEAST_RELEASE_DECREASE:
-            break
-        moving[np.argmax(decrease)] = True
-    return step, moving
-
-
-def solve_scaled(square: Floats, slope: Floats) -> Floats:
-    """Solve a symmetric system scaled to a unit diagonal, by least squares where it is singular. Shapes: square (n, n);
-    slope (n,) → (n,).
-    """
-    scale = 1 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-    scaled = square * scale[:, None] * scale
-    return np.asarray(scale * np.linalg.lstsq(scaled, scale * slope, rcond=1e-12)[0])
+    """`step_within_bounds` of the parameters of a problem. Shapes: square (n_free, n_free); slope, theta (n_free,)."""
+    if not slope.size:
+        return slope, problem.free
+    return step_within_bounds(square, slope, theta - problem.lower, problem.upper - theta, problem.free)
 
 
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
@@ -529,26 +437,22 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
     """Eliminate release and origin, and take the residual at zero deviations. Shapes: cross_products (n_trials, 3, k,
     k).
     """
-    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
-    white = at_zero_deviations(white, state, -1)
-    alignment_information = white[:, :2, :2] + problem.release_origin_precision[:, :, None] * np.eye(2)
-    reduced = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(alignment_information, white[:, :2, 2:])
+    white = at_zero_deviations(whitened_products(cross_products, state), state, -1)
+    precision = problem.release_origin_precision
     log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
     log_alignment = np.sum(
-        np.linalg.slogdet(alignment_information)[1] - np.log(problem.release_origin_precision).sum(axis=1)
+        np.linalg.slogdet(with_diagonal(white[:, :2, :2], precision))[1] - np.log(precision).sum(axis=1)
     )
-    return Marginal(reduced, float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi)))
+    constant = float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi))
+    return Marginal(eliminated(white, precision)[0], constant)
 
 
-def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Whitened cross products of the keys and residual of each trial, all trial effects integrated out. Returns blocks
-    (the last row and column belong to the residual), inner (I + S Z S of the deviations, whose determinant enters ln L;
-    S are the standard deviations). Shape (n_trials, n_keys + 1, n_keys + 1).
+def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, float]:
+    """Whitened cross products of the keys and residual of each trial, all trial effects integrated out; and the sum
+    over trials of ln det(I + S Z S) of the deviations, of standard deviations S. Shape (n_trials, n_keys + 1, n_keys +
+    1); the last row and column belong to the residual.
     """
-    root = trial_deviation_sd(problem, spread) * problem.has_deviation
-    inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
-    side = root[:, :, None] * part.blocks[:, :2, 2:]
-    return part.blocks[:, 2:, 2:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(inner, side), inner
+    return without_deviations(part.blocks, trial_deviation_sd(problem, spread) * problem.has_deviation)
 
 
 def normal_equations(
@@ -558,13 +462,12 @@ def normal_equations(
     (half the negative gradient of the sum of squares), square (penalised sum of squares at the current parameters),
     log_det (sum over trials of ln det(I + S Z S)). Shape (n_free, n_free).
     """
-    root = trial_deviation_sd(problem, spread) * problem.has_deviation
-    size = problem.prior_mean.size
-    information, slope, square, log_det = normal_equations_without_deviations(part.blocks, problem.places, root, size)
-    deviation = state.theta - problem.prior_mean
-    information.flat[:: size + 1] += problem.prior_precision
-    slope -= problem.prior_precision * deviation
-    return information, slope, square + float(np.sum(problem.prior_precision * deviation**2)), log_det
+    blocks, log_det = deviations_eliminated(part, problem, spread)
+    prior, deviation = problem.prior_precision, state.theta - problem.prior_mean
+    information = sum_matrix_blocks(blocks[:, :-1, :-1], problem) + np.diag(prior)
+    slope = sum_vector_blocks(blocks[:, :-1, -1], problem) - prior * deviation
+    square = float(np.sum(blocks[:, -1, -1]) + np.sum(prior * deviation**2))
+    return information, slope, square, log_det
 
 
 def deviance(
@@ -582,31 +485,19 @@ def profiled_deviance(
     """−2 ln L minimised over the free parameters, from their normal equations. Shapes: information (n_free, n_free);
     slope (n_free,).
     """
-    if restricted or problem.random is None:
-        below, above = state.theta - problem.lower, problem.upper - state.theta
-        solved, decrease, log_information = decrease_within_bounds(information, slope, below, above, problem.free)
-        if solved:
-            return constant - decrease + (log_information if restricted else 0.0)
     # A parameter at its bound must not be credited with the decrease beyond the bound.
     step, moving = bounded_solve(information, slope, problem, state.theta)
     total = constant - float(step @ (2 * slope - information @ step))
-    k = np.flatnonzero(moving)
+    if restricted:
+        return total + float(np.linalg.slogdet(information[np.ix_(moving, moving)])[1])
+    k = np.flatnonzero(moving & problem.random)
     if k.size:
-        information_inside = information if moving.all() else information[np.ix_(k, k)]
-        if restricted:
-            total += float(np.linalg.slogdet(information_inside)[1])
-        elif problem.random is not None and problem.random[k].any():
-            total += _groups_integrated(information_inside, problem.prior_precision[k], problem.random[k])
+        # Random effects w of groups of trials are integrated out. With w ~ N(0, D²) and M the information of the data
+        # on w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is det(D (M + D⁻²) D)^(−½). So a hypothesis with
+        # many groups is penalised for each of them.
+        sd = 1 / np.sqrt(problem.prior_precision[k])
+        total += float(np.linalg.slogdet(sd[:, None] * information[np.ix_(k, k)] * sd)[1])
     return total
-
-
-def _groups_integrated(information: Floats, prior_precision: Floats, random: NDArray[np.bool_]) -> float:
-    """Change of −2 ln L when the random effects w of groups of trials are integrated out: ln det(I + D M D). With w ~
-    N(0, D²) and M the data's information of w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is det(D (M + D⁻²)
-    D)^(−½). So a hypothesis with many groups is penalised for each of them.
-    """
-    sd = 1 / np.sqrt(prior_precision[random])
-    return float(np.linalg.slogdet(sd[:, None] * information[np.ix_(random, random)] * sd)[1])
 
 
 def estimate_between_trial_sd(

@@ -73,7 +73,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
         free=np.ones(lower.size, dtype=bool),
         points=np.array([float(trial_data.time_s.size) for trial_data in data]),
         stretches=np.array([float(np.count_nonzero(trial_data.first)) for trial_data in data]),
-        random=layout.random if layout.between else None,
+        random=layout.random,
     )
 
 

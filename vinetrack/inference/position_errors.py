@@ -409,7 +409,7 @@ def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
         lower=np.append(problem.lower, np.full(count, -np.inf)),
         upper=np.append(problem.upper, np.full(count, np.inf)),
         free=np.append(problem.free, np.ones(count, dtype=bool)),
-        random=None if problem.random is None else np.append(problem.random, np.zeros(count, dtype=bool)),
+        random=np.append(problem.random, np.zeros(count, dtype=bool)),
     )
 
 

@@ -151,7 +151,7 @@ def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, p
         free=problem.free[places],
         points=problem.points[rows],
         stretches=problem.stretches[rows],
-        random=None if problem.random is None else problem.random[places],
+        random=problem.random[places],
     )
 
 
