@@ -226,6 +226,33 @@ def test_film_that_explains_all_alone_brings_in_nothing_beside_it():
     assert _labels(_ratio(FILM, 96.0), drag) == {"film_mass", "air_drag"}
 
 
+@pytest.mark.usefixtures("unlike")
+@pytest.mark.parametrize(("inflation", "kept"), [(1.0, {"supply_refill"}), (3.0, {"reservoir_depletion"})])
+def test_a_larger_form_must_gain_what_excludes_a_hypothesis(inflation, kept):
+    """A form that contains the other and gains 20 in −2 ln L: more than 9 of noise, less than 9 of noise three times
+    as large.
+    """
+    larger, contained = catalogue()["supply_refill"], catalogue()["reservoir_depletion"]
+    both = [replace(_ratio(larger, 110.0), inflation=inflation), replace(_ratio(contained, 100.0), inflation=inflation)]
+    assert _labels(*both) == kept
+
+
+def test_two_predictions_are_as_far_apart_as_the_noise_of_the_fit_makes_them():
+    """Against the inverse of the covariance of AR(1) noise, whatever noise another model of the errors has."""
+    rho, variance, difference = 0.6, 1e-8, np.array([1.0, 2.0, -1.0, 0.5]) * 1e-4
+    lags = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
+    expected = difference @ np.linalg.solve(variance / (1 - rho**2) * rho**lags, difference)
+
+    def fit(position_m):
+        state = SimpleNamespace(rho=rho, variance=np.array([variance]))
+        data = [SimpleNamespace(relative_sd=None)]
+        trials = [SimpleNamespace(predicted_position_m=position_m)]
+        parts = {"predictor": SimpleNamespace(data=data), "solution": SimpleNamespace(state=state)}
+        return SimpleNamespace(trials=trials, noise_correlation=0.1, **parts)
+
+    assert likelihood_ratio._distance(fit(difference), fit(0 * difference)) == pytest.approx(expected)
+
+
 def _numbers(fit, *changed):
     """A fit with these numbers in place of its own of the same names."""
     by_name = {number.name: number for number in changed}

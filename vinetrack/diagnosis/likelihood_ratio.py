@@ -514,7 +514,7 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
 
 def _distance(fit: Fit, other: Fit) -> float:
     """Squared distance of the predictions of two fits, whitened by the AR(1) noise of the first."""
-    rho = fit.noise_correlation
+    rho = fit.solution.state.rho
     total = 0.0
     data = fit.predictor.data
     for a, b, variance, trial_data in zip(fit.trials, other.trials, fit.solution.state.variance, data, strict=True):
@@ -570,7 +570,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
         simpler = [
             other
             for other in plausible
-            if 2 * (ratio.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET_DELTA_CHI2
+            if other.deviance_excess(ratio) <= ANSWER_SET_DELTA_CHI2 * best.inflation
             and _complexity(other) < _complexity(ratio)
             and (_contains(ratio, other) or (_comparable(ratio, other) and _distance(other.fit, ratio.fit) < 4.0))
         ]
