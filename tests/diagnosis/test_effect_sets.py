@@ -67,10 +67,14 @@ def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others
         assert (told.facts["sigmas"], told.facts["required"]) == (pytest.approx(worth), 6.0)
 
 
-def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely() -> None:
+@pytest.mark.parametrize(("scattered", "worth"), [(2, 5.5), (0, 11.0)])
+def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely_in_its_own_size(
+    scattered: int, worth: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(selection, "robust_ratio", lambda _, names: 2.0 if NAMES[scattered] in names else 1.0)
     triple, sets = of(NAMES, TRIPLE, inflation=4.0), sets_of(pairs(11.0))
-    assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(5.5)
-    assert sets.superfluous(triple)
+    assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
+    assert bool(sets.superfluous(triple)) == (worth < 6)
 
 
 def test_a_member_that_is_tried_in_many_shapes_is_asked_for_its_own_threshold() -> None:

@@ -188,13 +188,14 @@ class EffectSets:
 
     def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
         """Significance of a member of a set given the others, in standard deviations; 0 where it is not known. Δχ² is
-        divided by the inflation and has a degree of freedom for each size of the member (`sizes_of`).
+        divided by the inflation of the member's own sizes, and has a degree of freedom for each (`sizes_of`).
         """
         others = self.leave_out(hypothesis, effect)
         if others is None:
             return 0.0
         delta_chi2 = 2 * (hypothesis.fit.log_likelihood - others.fit.log_likelihood)
-        return in_sigmas(max(delta_chi2, 0.0) / hypothesis.inflation, sizes_of((effect,), hypothesis.fit))
+        inflation = robust_ratio(hypothesis.fit, [effect.name]) ** 2
+        return in_sigmas(max(delta_chi2, 0.0) / inflation, sizes_of((effect,), hypothesis.fit))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
         """Find the first member of a set whose significance given the others is too low."""
