@@ -740,7 +740,9 @@ def _single_effect_rounds(
     best, fitted = adequate[0], tuple(hypotheses)
     verdict = verdict_of(adequate)
     if verdict == MISSING and is_within_position_errors(tests.fit, best.fit):
-        return [SelectionStep(ADEQUATE, tests, fitted=fitted, search=search, note=_negligible_note(best, tests))]
+        moved_m = displacement_m(tests.fit, best.fit)
+        note = remark("not_counted", label=best.label, sigma=best.sigma, moved_m=moved_m)
+        return [SelectionStep(ADEQUATE, tests, fitted=fitted, search=search, note=note)]
     first = SelectionStep(
         verdict,
         tests,
@@ -752,11 +754,6 @@ def _single_effect_rounds(
         confounded=confounders_of(after, best.names) if verdict == MISSING else (),
     )
     return [first, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [first]
-
-
-def _negligible_note(best: LikelihoodRatio, tests: MisfitTests) -> Remark:
-    """Why an effect that improves the likelihood is not counted."""
-    return remark("not_counted", label=best.label, sigma=best.sigma, moved_m=displacement_m(tests.fit, best.fit))
 
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
