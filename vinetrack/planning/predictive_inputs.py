@@ -54,9 +54,13 @@ BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
     """Return the prior of B of a vine of this size, N·(s/m)ⁿ."""
     largest = max(published.DAMPING_B)
-    thickness = thickness_m / (1e-6 * published.THICKNESS_UM[largest])
-    diameter = diameter_m / (1e-3 * published.DIAMETER_MM[largest])
-    return published.DAMPING_B[largest] * thickness * diameter**0.75
+    diameter, thickness = _printed_sizes()[largest]
+    return published.DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
+
+
+def _printed_sizes() -> dict[int, tuple[float, float]]:
+    """Diameter and thickness, m, of the printed vines, by their scale R."""
+    return {R: (1e-3 * published.DIAMETER_MM[R], 1e-6 * published.THICKNESS_UM[R]) for R in published.DAMPING_B}
 
 
 def damping_scatter() -> float:
@@ -65,10 +69,7 @@ def damping_scatter() -> float:
     >>> round(damping_scatter(), 3)
     0.113
     """
-    residuals = [
-        math.log(B / damping_prior(1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]))
-        for scale, B in published.DAMPING_B.items()
-    ]
+    residuals = [math.log(published.DAMPING_B[R] / damping_prior(*size)) for R, size in _printed_sizes().items()]
     return math.sqrt(sum(residual**2 for residual in residuals) / SCATTER_DOF)
 
 
@@ -77,10 +78,7 @@ def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
     prediction error of a line fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the
     logarithm of the size; it grows beyond the smallest and the largest vine.
     """
-    sizes = [
-        math.log(damping_prior(1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]))
-        for scale in published.DAMPING_B
-    ]
+    sizes = [math.log(damping_prior(*size)) for size in _printed_sizes().values()]
     middle = sum(sizes) / len(sizes)
     distance = math.log(damping_prior(diameter_m, thickness_m)) - middle
     leverage = 1 / len(sizes) + distance**2 / sum((size - middle) ** 2 for size in sizes)
@@ -91,9 +89,8 @@ def split_leverage(diameter_m: float, thickness_m: float) -> float:
     """Return the change of ln B if 1 is added to the exponent of t and subtracted from that of D; 0 for t/D
     as printed.
     """
-    largest = max(published.DAMPING_B)
-    printed = 1e-6 * published.THICKNESS_UM[largest] / (1e-3 * published.DIAMETER_MM[largest])
-    return math.log(thickness_m / diameter_m / printed)
+    diameter, thickness = _printed_sizes()[max(published.DAMPING_B)]
+    return math.log(thickness_m / diameter_m / (thickness / diameter))
 
 
 def exponent_sigma() -> float:
@@ -301,7 +298,7 @@ def even(name: str, size: Size) -> Sampler:
 #
 # They come from a `Fit` or from `fit.json`. B is held as its logarithm, as in the fit.
 
-_VINE = re.compile(r"([\d.]+)mm-([\d.]+)um(?:-([\d.]+)mm)?")
+_VINE = re.compile(r"([\d.]+)mm-([\d.]+)um.*")  # Diameter and thickness in the name of a vine
 
 
 @dataclass(frozen=True)
@@ -325,26 +322,13 @@ class FitNumbers:
 
     def place(self, key: str, vine: str = "") -> int | None:
         """Return the index of a parameter, shared or of this vine; None where there is none."""
-        for k, (name, of_vine) in enumerate(zip(self.keys, self.vines, strict=True)):
-            if name == key and of_vine in ("", vine):
-                return k
-        return None
+        named = enumerate(zip(self.keys, self.vines, strict=True))
+        return next((k for k, (name, of_vine) in named if name == key and of_vine in ("", vine)), None)
 
     def sizes(self) -> dict[str, tuple[float, float]]:
-        """Diameter and thickness, m, of every vine with a fitted B."""
-        sizes = {}
-        for key, vine in zip(self.keys, self.vines, strict=True):
-            if key == DAMPING and (size := size_of(vine)):
-                sizes[vine] = size
-        return sizes
-
-
-def size_of(vine: str) -> tuple[float, float] | None:
-    """Parse diameter and thickness, m, from the name of a vine; None where the name does not contain them. Returns
-    (float, float) or None.
-    """
-    match = _VINE.match(vine)
-    return (float(match[1]) / 1e3, float(match[2]) / 1e6) if match else None
+        """Diameter and thickness, m, of every vine with a fitted B and a name that contains them."""
+        vines = (vine for key, vine in zip(self.keys, self.vines, strict=True) if key == DAMPING)
+        return {m[0]: (float(m[1]) / 1e3, float(m[2]) / 1e6) for vine in vines if (m := _VINE.match(vine))}
 
 
 def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
@@ -556,59 +540,41 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
     printed_error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
     vine, is_same = anchor
     trial, fit = sources.trial, sources.fit
+    size = trial.diameter_m, trial.thickness_m
+    place = fit.place(DAMPING, vine) if fit else None
     if math.isfinite(stated.B):
         sources.set(DAMPING, stated.B, "given")
         if stated.B_error > 0:
             words = f"B is given to {100 * stated.B_error:.2g} % (one standard deviation)"
             sources.add_uncertainty("error of B", words, f"B given|{trial.vine}", scaled(DAMPING, stated.B_error))
         return
-    place = fit.place(DAMPING, vine) if fit else None
-    if fit is not None and place is not None:
-        if is_same or fit.vines[place] == "":
-            sources.set_fitted(DAMPING, place)
-            return
-        size = fit.sizes()[vine]
-        factor = damping_prior(trial.diameter_m, trial.thickness_m) / damping_prior(*size)
+    if fit is not None and place is not None and (is_same or fit.vines[place] == ""):
+        sources.set_fitted(DAMPING, place)
+        return
+    if place is None and (scale := _printed_scale(trial)) is not None:
+        sources.set(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
+        words = f"the error of the printed B is not printed: assumed to be {100 * printed_error:.0f} %"
+        sources.add_uncertainty("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, printed_error))
+        return
+    # The scaling prior, from the nearest vine of the fit where there is one. Its uncertainties are the scatter of the
+    # printed values about it, and the exponents of t against D.
+    split, scatter = split_leverage(*size), damping_log_sigma(*size)
+    if fit is None or place is None:
+        sources.set(DAMPING, damping_prior(*size), "guess: 6.44 (t/200 µm)(D/24 mm)^0.75")
+    else:
+        like = fit.sizes()[vine]
+        factor = damping_prior(*size) / damping_prior(*like)
         sources.set_fitted(DAMPING, place, factor, f"scaled from {vine} of {{}} as t·D^0.75: a guess")
         sources.notes.append(
             f"no vine of {fit.source} has this diameter and wall: B is carried over from {vine} by the scaling prior, "
             "a guess"
         )
-        split = split_leverage(trial.diameter_m, trial.thickness_m) - split_leverage(*size)
-    elif (scale := _printed_scale(trial)) is not None:
-        sources.set(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
-        words = f"the error of the printed B is not printed: assumed to be {100 * printed_error:.0f} %"
-        sources.add_uncertainty("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, printed_error))
-        return
-    else:
-        sources.set(
-            DAMPING,
-            damping_prior(trial.diameter_m, trial.thickness_m),
-            "guess: 6.44 (t/200 µm)(D/24 mm)^0.75",
-        )
-        split = split_leverage(trial.diameter_m, trial.thickness_m)
-    _add_scaling_uncertainty(sources, split)
-
-
-def _printed_scale(trial: Trial) -> int | None:
-    """Scale R of the printed vine of exactly this size; None for other sizes, which use the scaling prior."""
-    for scale in published.DAMPING_B:
-        size = 1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]
-        if alike(size, (trial.diameter_m, trial.thickness_m)):
-            return scale
-    return None
-
-
-def _add_scaling_uncertainty(sources: _Sources, split: float) -> None:
-    """Uncertainty of the scaling prior of B: scatter of the printed values about it, and exponents of t against D."""
-    scatter = damping_log_sigma(sources.trial.diameter_m, sources.trial.thickness_m)
+        split -= split_leverage(*like)
     words = (
         f"the four printed B scatter by {100 * damping_scatter():.0f} % about it: {100 * scatter:.0f} % at this "
         f"size (Student's t, {SCATTER_DOF} degrees of freedom)"
     )
-    sources.add_uncertainty(
-        "guess of B", words, f"B scatter|{sources.trial.vine}", scaled(DAMPING, scatter, SCATTER_DOF)
-    )
+    sources.add_uncertainty("guess of B", words, f"B scatter|{trial.vine}", scaled(DAMPING, scatter, SCATTER_DOF))
     if abs(split) > 1e-9:
         words = (
             f"B is printed for one t/D only: exponents of t and D ±{SPLIT_SIGMA:g} against each other, "
@@ -617,32 +583,40 @@ def _add_scaling_uncertainty(sources: _Sources, split: float) -> None:
         sources.add_uncertainty("t against D", words, "B split", scaled(DAMPING, split * SPLIT_SIGMA))
 
 
+def _printed_scale(trial: Trial) -> int | None:
+    """Scale R of the printed vine of exactly this size; None for other sizes, which use the scaling prior."""
+    size = trial.diameter_m, trial.thickness_m
+    return next((scale for scale, printed in _printed_sizes().items() if alike(printed, size)), None)
+
+
 def _exponent(sources: _Sources, stated: StatedValues) -> None:
+    place, sigma = sources.fit.place(EXPONENT) if sources.fit else None, exponent_sigma()
     if math.isfinite(stated.n):
         sources.set(EXPONENT, stated.n, "given")
         if stated.n_error > 0:
             words = f"n is given to {stated.n_error:.2g} (one standard deviation)"
             sources.add_uncertainty("error of n", words, "n given", shifted(EXPONENT, stated.n_error))
-        return
-    place = sources.fit.place(EXPONENT) if sources.fit else None
-    if place is not None:
+    elif place is not None:
         sources.set_fitted(EXPONENT, place)
-        return
-    sigma = exponent_sigma()
-    sources.set(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
-    words = f"±{sigma:.2g}, from the printed R² of the fits"
-    sources.add_uncertainty("error of n", words, "n printed", shifted(EXPONENT, sigma))
+    else:
+        sources.set(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
+        words = f"±{sigma:.2g}, from the printed R² of the fits"
+        sources.add_uncertainty("error of n", words, "n printed", shifted(EXPONENT, sigma))
 
 
 def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
     vine, is_same = anchor
     trial, fit = sources.trial, sources.fit
-    place = yield_place(fit, vine, trial.yield_pressure_Pa) if fit and is_same else None
-    if fit is not None and place is not None and _agrees(fit, place, trial):
+    stated, sigma = trial.yield_pressure_Pa, max(np.nan_to_num(trial.yield_pressure_sigma_Pa), 0.0)
+    place = yield_place(fit, vine, stated) if fit and is_same else None
+    if fit is not None and place is not None and math.isfinite(stated):
+        # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
+        tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
+        place = place if abs(stated - float(fit.mean[place])) <= max(tolerance, 1.0) else None
+    if place is not None:
         sources.set_fitted(YIELD, place)
-    elif math.isfinite(trial.yield_pressure_Pa):
-        sources.set(YIELD, trial.yield_pressure_Pa, "given")
-        sigma = trial.yield_pressure_sigma_Pa
+    elif math.isfinite(stated):
+        sources.set(YIELD, stated, "given")
         if sigma > 0:
             words = f"stated to {sigma / 1e3:.2g} kPa"
             sources.add_uncertainty("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
@@ -655,13 +629,6 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
         words = f"{published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine; nine of ten others within a factor 3"
         log_sigma = math.log(3.0) / float(ndtri(0.95))
         sources.add_uncertainty("guess of P_y", words, "P_y guess", scaled(YIELD, log_sigma))
-
-
-def _agrees(fit: FitNumbers, place: int, trial: Trial) -> bool:
-    """Whether the stated yield pressure agrees with the fitted one, within 3 standard errors."""
-    stated, sigma = trial.yield_pressure_Pa, trial.yield_pressure_sigma_Pa
-    tolerance = 3 * math.hypot(sigma if sigma > 0 else 0.0, math.sqrt(fit.covariance[place, place]))
-    return not math.isfinite(stated) or abs(stated - float(fit.mean[place])) <= max(tolerance, 1.0)
 
 
 def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anchor: tuple[str, bool]) -> None:
@@ -726,21 +693,21 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
     fit, trial = sources.fit, sources.trial
     stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else pressure_spread
     pressure = stated if math.isfinite(stated) else pressure_spread
-    damping, origin, dof = damping_spread, "assumed:", {"pressure": math.inf, "B": math.inf}
-    if fit is not None and fit.spreads:
-        pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
-        origin, dof = f"estimated in {fit.source}:", {**dof, **fit.spread_dof}
+    dof: Mapping[str, float] = {}
+    damping, origin = damping_spread, "assumed:"
     if stated_values.spreads is not None:
-        (pressure, damping), origin, dof = stated_values.spreads, "given:", {"pressure": math.inf, "B": math.inf}
+        (pressure, damping), origin = stated_values.spreads, "given:"
+    elif fit is not None and fit.spreads:
+        pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
+        origin, dof = f"estimated in {fit.source}:", fit.spread_dof
     sources.set(PRESSURE, trial.pressure_Pa, "set")
-    if pressure > 0:
-        sample = relative(PRESSURE, pressure, dof["pressure"])
-        words = f"{origin} {100 * pressure:.2g} %"
-        sources.add_uncertainty("P from trial to trial", words, f"P trial|{trial.vine}", sample)
-    if damping > 0:
-        sample = scaled(DAMPING, damping, dof["B"])
-        words = f"{origin} {100 * damping:.2g} %"
-        sources.add_uncertainty("B from trial to trial", words, f"B trial|{trial.vine}", sample)
+    for symbol, spread, sampler in (
+        ("P", pressure, relative(PRESSURE, pressure, dof.get("pressure", math.inf))),
+        ("B", damping, scaled(DAMPING, damping, dof.get("B", math.inf))),
+    ):
+        if spread > 0:
+            words = f"{origin} {100 * spread:.2g} %"
+            sources.add_uncertainty(f"{symbol} from trial to trial", words, f"{symbol} trial|{trial.vine}", sampler)
     return pressure, damping
 
 
