@@ -50,7 +50,7 @@ from vinetrack.planning.discriminating_design import (
     sampling_of,
     worth,
 )
-from vinetrack.planning.predictive_inputs import damping_prior
+from vinetrack.planning.predictive_inputs import prior_ratio
 from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES, DesignProblem, mean_separation, simulated_rises
 
 # ------------------------------------------------------------------------------
@@ -68,8 +68,6 @@ from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES, DesignP
 SUFFICIENT_SEPARATION = 8.0
 
 NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
-
-CHECK_DRAWS = {2: 3, 3: 2}  # Draws of the check by number of hypotheses, otherwise one (chosen)
 
 
 @dataclass(frozen=True)
@@ -262,8 +260,8 @@ def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int)
     names = [hypothesis.name for hypothesis in bench.hypotheses]
     expected_sigma = _by_pair(best.separations)
     worth_it = max(expected_sigma.values()) >= least_separation
-    # 20.0: separation, in standard deviations, beyond which the check takes one draw less (chosen)
-    draws = max(CHECK_DRAWS.get(len(names), 1) - (min(expected_sigma.values()) > 20.0), 1)
+    # Draws of the check by number of hypotheses, otherwise one; one less beyond 20 standard deviations (chosen)
+    draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected_sigma.values()) > 20.0), 1)
     simulated = {}
     if worth_it:
         simulated = _simulated_separations(simulated_rises(bench, best.design, range(draws), seed, thorough=True))
@@ -437,9 +435,8 @@ def tests_with_conditions(
             else {trial.vine: float(stated_B) for trial in design.trials}
         )
         for vine, condition in new.items():
-            like, trial = design.trials[condition.like], condition.trial
-            scaled = [damping_prior(sized.diameter_m, sized.thickness_m) for sized in (trial, like)]
-            B[vine] = B[like.vine] * scaled[0] / scaled[1]
+            like = design.trials[condition.like]
+            B[vine] = B[like.vine] * prior_ratio(condition.trial, like)
         values = {DAMPING: B}
     extended = replace(
         design,

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 PROBABILITIES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 
 
+JSON_NAMES = {"least": "least_plausible", "largest": "largest_plausible"}  # Fields of a power under other names there
+
+
 @dataclass(frozen=True)
 class EffectPower:
     """Detectable sizes of one effect. `sizes` are values of the parameter, SI, at which the effect is detected with
@@ -72,23 +75,12 @@ class EffectPower:
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `power.effects`."""
-        return {
-            "effect": self.effect,
-            "kind": self.kind,
-            "parameter": self.parameter,
-            "symbol": self.symbol,
-            "unit": self.unit,
-            "zero": self.zero,
-            "least_plausible": self.least,
-            "largest_plausible": self.largest,
+        content = {JSON_NAMES.get(name, name): value for name, value in vars(self).items()}
+        return content | {
             "size_50": self.size_at(0.5),
             "size_90": self.size_at(0.9),
             "found_at_largest_plausible": self.probability_at(self.largest),
-            "probabilities": list(PROBABILITIES),
-            "sizes": list(self.sizes),
-            "taken_for": dict(self.taken_for),
-            "named_alone": self.named_alone,
-            "other_values": list(self.other_values),
+            "probabilities": PROBABILITIES,
         }
 
     @classmethod
@@ -96,13 +88,13 @@ class EffectPower:
         """Read what `to_json` wrote."""
         return cls(
             **{key: str(entry.get(key) or "") for key in ("effect", "kind", "parameter", "symbol", "unit")},
-            zero=or_nan(entry.get("zero")),
-            least=or_nan(entry.get("least_plausible")),
-            largest=or_nan(entry.get("largest_plausible")),
+            **{
+                name: or_nan(entry.get(JSON_NAMES.get(name, name)))
+                for name in ("zero", "least", "largest", "named_alone")
+            },
             sizes=tuple(math.inf if size is None else float(size) for size in entry.get("sizes") or ()),
             taken_for={str(name): or_nan(value) for name, value in (entry.get("taken_for") or {}).items()},
-            named_alone=or_nan(entry.get("named_alone")),
-            other_values=tuple(float(value) for value in entry.get("other_values") or ()),
+            other_values=tuple(entry.get("other_values") or ()),
         )
 
 

@@ -26,7 +26,7 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, FreeParameter, ParameterMap
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, ParameterMap
 from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
     LARGEST_SPREAD,
@@ -44,7 +44,7 @@ from vinetrack.inference.sensitivity import (
     Job,
     Predictor,
 )
-from vinetrack.planning.predictive_inputs import damping_prior, damping_scatter, hoop_stress_Pa
+from vinetrack.planning.predictive_inputs import damping_scatter, hoop_stress_Pa, prior_ratio
 from vinetrack.tracks.position_noise import ar1_noise
 
 # ------------------------------------------------------------------------------
@@ -88,14 +88,13 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
         for effort, rig in rigs:
             if effort == least:
                 feasible += _loads(rig, k, NEW_VINE, used, limits)
-    named = [f"next_{i + 1}" for i in range(len(feasible))]
     return [
         replace(
             condition,
-            trial=replace(condition.trial, name=name),
+            trial=replace(condition.trial, name=f"next_{number}"),
             changed=_changed(condition.trial, trials[condition.like]),
         )
-        for condition, name in zip(feasible, named, strict=True)
+        for number, condition in enumerate(feasible, 1)
     ]
 
 
@@ -233,18 +232,12 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
     for diameter, wall in itertools.product(diameters, walls):
         if wall > diameter / 4 or not COLUMNS["diameter_mm"].low <= 1e3 * diameter <= COLUMNS["diameter_mm"].high:
             continue
-        near, like = min(models, key=lambda m: _distance(m[0], diameter, wall))
+        distances = [math.hypot(math.log(v.diameter_m / diameter), math.log(v.thickness_m / wall)) for v in vines]
+        near, like = models[int(np.argmin(distances))]
         lengths = [near.length_m] if limits.length_mm is None else [1e-3 * mm for mm in limits.length_mm]
         for length in lengths:
-            sized = replace(
-                near,
-                diameter_m=diameter,
-                thickness_m=wall,
-                length_m=length,
-                video=None,
-                track=None,
-                pressure_trace=None,
-            )
+            unfilmed = replace(near, video=None, track=None, pressure_trace=None)
+            sized = replace(unfilmed, diameter_m=diameter, thickness_m=wall, length_m=length)
             if not any(_alike(sized, vine) for vine in vines):
                 new_vines.append((with_names([sized])[0], like))
     # 10: new vines considered, at most; those of the most different sizes are taken (chosen)
@@ -268,10 +261,6 @@ def _rounded(value: float) -> float:
     return float(f"{value:.2g}")
 
 
-def _distance(vine: Trial, diameter_m: float, thickness_m: float) -> float:
-    return math.hypot(math.log(vine.diameter_m / diameter_m), math.log(vine.thickness_m / thickness_m))
-
-
 def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "thickness_m", "length_m")) -> bool:
     pairs = [(getattr(trial, name), getattr(other, name)) for name in names]
     return all(_is_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
@@ -292,10 +281,8 @@ def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Tri
 # ------------------------------------------------------------------------------
 # Extension of a fitted hypothesis to trials that have not been made.
 #
-# The free parameters of the fit stay as they are. Every new vine adds its own: B from the scaling prior, multiplied
-# by the mean ratio of the measured vines to their prior, and the yield pressure with the error to which it will be
-# measured.
-
+# The free parameters of the fit stay as they are. Every new vine adds its own: B of the vine nearest in size, scaled by
+# the ratio of their priors, and the yield pressure with the error to which it will be measured.
 
 # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
 SCATTER_FACTORS = ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0))
@@ -349,30 +336,36 @@ class Hypothesis:
 
 def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     """Extend a fit to further conditions; new vines add parameters with priors."""
-    old = fit.predictor.layout
-    state = fit.solution.state
-    numbers, index = list(old.free), []
+    old, state, names = fit.predictor.layout, fit.solution.state, fit.model.parameter_names
+    fitted_rows, _ = old.rows(state.theta)
+    numbers, index, base = list(old.free), [], []
     places: dict[tuple[str, str], int] = {}
     for condition in conditions:
-        row = old.index[condition.like].copy()
+        trial, like = condition.trial, fit.predictor.data[condition.like].trial
+        row, values = old.index[condition.like].copy(), np.array(fitted_rows[condition.like])
+        is_new = trial.vine != like.vine
+        if is_new and fit.predictor.damping_column >= 0:
+            values[fit.predictor.damping_column] *= prior_ratio(trial, like)
         for column, key in enumerate(old.keys):
-            if row[column] >= 0 and old.free[row[column]].vine and _has_new_vine(fit, condition):
-                spot = (key, condition.trial.vine)
-                if spot not in places:
-                    places[spot] = len(numbers)
-                    numbers.append(_of_new_vine(fit, old.free[row[column]], condition.trial))
-                row[column] = places[spot]
+            if is_new and row[column] >= 0 and (of_like := old.free[row[column]]).vine:
+                if (key, trial.vine) not in places:
+                    places[key, trial.vine] = len(numbers)
+                    start = trial.yield_pressure_Pa if key == YIELD_PRESSURE else of_like.start
+                    if key in names:
+                        start = float(np.clip(values[names.index(key)], of_like.lower, of_like.upper))
+                    numbers.append(replace(of_like, vine=trial.vine, start=start))
+                row[column] = places[key, trial.vine]
         index.append(row)
+        base.append(values)
     added = numbers[len(old.free) :]
     # 1.0: prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
     precision_of_new = np.array([1 / 1.0**2 + (number.scale / number.prior_sd) ** 2 for number in added])
     stated_sd = [number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0 for number in added]
     sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
-    base = np.array([_base_row(fit, condition) for condition in conditions])
     return Hypothesis(
         name=name,
         fit=fit,
-        layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index).reshape(len(conditions), -1), base),
+        layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index), np.array(base)),
         theta=np.concatenate([state.theta, [number.to_scaled(number.start) for number in added]]),
         scatter_levels=_scatter_levels(fit, precision_of_new),
         sd_of_new=np.array(sd_of_new),
@@ -411,45 +404,6 @@ def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, .
 
 def _at_least(spread: Sequence[float]) -> tuple[float, float]:
     return max(spread[0], LEAST_BETWEEN_TRIAL_SD), max(spread[1], LEAST_BETWEEN_TRIAL_SD)
-
-
-def _has_new_vine(fit: Fit, condition: Condition) -> bool:
-    return condition.trial.vine != fit.predictor.data[condition.like].trial.vine
-
-
-def _of_new_vine(fit: Fit, like: FreeParameter, trial: Trial) -> FreeParameter:
-    """The parameter of a new vine that replaces the one of the vine it is modelled on."""
-    if like.key == YIELD_PRESSURE:
-        return replace(like, vine=trial.vine, start=trial.yield_pressure_Pa)
-    of_measured = [number.value for number in fit.numbers if number.key == like.key]
-    start = _new_damping(fit, trial) if like.key == DAMPING else float(np.mean(of_measured))
-    return replace(like, vine=trial.vine, start=float(np.clip(start, like.lower, like.upper)))
-
-
-def _new_damping(fit: Fit, trial: Trial) -> float:
-    """B of a vine not yet made, N·(s/m)ⁿ: its scaling prior times the mean ratio of measured vines to their prior."""
-    sizes = {
-        trial_data.trial.vine: trial_data.trial
-        for trial_data in fit.predictor.data
-        if trial_data.trial.travel_ratio != 1
-    }
-    column = fit.predictor.damping_column
-    rows, _ = fit.predictor.layout.rows(fit.solution.state.theta)
-    grown = {trial_data.trial.vine: float(rows[i, column]) for i, trial_data in enumerate(fit.predictor.data)}
-    log_ratios = [
-        math.log(max(grown[vine], 1e-9) / damping_prior(trial_of_vine.diameter_m, trial_of_vine.thickness_m))
-        for vine, trial_of_vine in sizes.items()
-    ]
-    return damping_prior(trial.diameter_m, trial.thickness_m) * math.exp(float(np.mean(log_ratios)))
-
-
-def _base_row(fit: Fit, condition: Condition) -> Floats:
-    """Model parameters of a condition: those of the trial it is modelled on, with the B of the new vine."""
-    rows, _ = fit.predictor.layout.rows(fit.solution.state.theta)
-    row = np.array(rows[condition.like])
-    if fit.predictor.damping_column >= 0 and _has_new_vine(fit, condition):
-        row[fit.predictor.damping_column] = _new_damping(fit, condition.trial)
-    return row
 
 
 # ------------------------------------------------------------------------------
@@ -541,7 +495,10 @@ def growth_courses(
             growth.append(None)
             continue
         length_m = condition.trial.length_m
-        near_s = min(_time_at(moved, END_FRACTION * length_m, cameras[i].longest_s) for moved in trajectories)
+        near_m, longest_s = np.nan_to_num(END_FRACTION * length_m, nan=math.inf), cameras[i].longest_s
+        near_s = min(
+            float(np.interp(near_m, moved.lead_position_m, moved.time_s, right=longest_s)) for moved in trajectories
+        )
         grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in trajectories)
         ratio = _speed_ratio(hypotheses[-1].fit, condition.trial, jobs[i], trajectories[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
@@ -565,15 +522,6 @@ def _simulated(predictor: Predictor, jobs: Sequence[Job]) -> list[Trajectory | N
             return [None]
     middle = len(jobs) // 2
     return _simulated(predictor, jobs[:middle]) + _simulated(predictor, jobs[middle:])
-
-
-def _time_at(moved: Trajectory, position_m: float, otherwise_s: float) -> float:
-    """Time at which a vine reaches a position, s."""
-    beyond = moved.lead_position_m >= position_m
-    if not beyond.any():
-        return otherwise_s
-    k = int(np.argmax(beyond))
-    return float(np.interp(position_m, moved.lead_position_m[k - 1 : k + 1], moved.time_s[k - 1 : k + 1]))
 
 
 def _speed_ratio(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> float:

@@ -58,6 +58,11 @@ def damping_prior(diameter_m: float, thickness_m: float) -> float:
     return published.DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
 
 
+def prior_ratio(trial: Trial, like: Trial) -> float:
+    """Return the ratio of the priors of B of two vines."""
+    return damping_prior(trial.diameter_m, trial.thickness_m) / damping_prior(like.diameter_m, like.thickness_m)
+
+
 def _printed_sizes() -> dict[int, tuple[float, float]]:
     """Diameter and thickness, m, of the printed vines, by their scale R."""
     return {R: (1e-3 * published.DIAMETER_MM[R], 1e-6 * published.THICKNESS_UM[R]) for R in published.DAMPING_B}
@@ -715,53 +720,55 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
 # Check of stated pressures against measured speeds, for errors of unit.
 #
 # The damping coefficient that a trial implies, B = (P − P_y) A / (2 ẏ)ⁿ with the printed n, is compared with the
-# scaling prior (`planning.predictive_inputs`). A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by
+# scaling prior. A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by
 # even more.
-
-
-NEAR = 2.5  # Factor to the prior within which the other unit explains the speeds (chosen)
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     """Return a warning if the speeds contradict the pressures as stated but agree with them in another unit. The other
     unit is psi, kPa where psi are stated, or absolute instead of gauge pressure.
     """
-    far_off = 4.0  # Factor between implied and prior damping from which another unit is tried (chosen)
+    # Factors between implied and prior damping from which, and within which, another unit explains the speeds (chosen)
+    far_off, near = 4.0, 2.5
     pairs = [(trial, speed) for trial, speed in speeds if trial.travel_ratio == 2 and trial.pressure_trace is None]
-    as_stated = _middle_ratio(pairs, 1.0, 1.0)
+    as_stated = _middle_ratio(pairs)
     if not (as_stated < 1 / far_off or as_stated > far_off):
         return []
-    place: dict[str, Any] = {"file": "trials.csv", "column": "pressure_kPa", "severity": "warning"}
-    gauge = [(replace(each, pressure_Pa=each.pressure_Pa - each.ambient_pressure_Pa), speed) for each, speed in pairs]
-    less = _middle_ratio(gauge, 1.0, 1.0)
-    if 1 / NEAR < less < NEAR and all(trial.pressure_Pa > 0 for trial, _ in gauge):
-        message = (
-            f"looks like absolute pressure: the measured speeds imply {number(as_stated, 2)} times the damping of tubes"
-            f" of this size, and {number(less, 2)} times after the ambient pressure is subtracted"
-        )
-        return [Problem(message=message, remedy="state gauge pressure, relative to the ambient pressure", **place)]
     psi = convert(1.0, "psi", "kPa")
-    factor, wrong = (psi, "psi, not kPa") if as_stated < 1 else (1 / psi, "kPa, not psi")
-    for yield_factor in (1.0, factor):
-        converted = _middle_ratio(pairs, factor, yield_factor)
-        if 1 / NEAR < converted < NEAR:
+    factor, wrong, right = (psi, "psi, not kPa", "psi") if as_stated < 1 else (1 / psi, "kPa, not psi", "kPa")
+    in_unit = f"{wrong} (1 psi is {psi:.4g} kPa)", "in the other unit", f"name the column pressure_{right}"
+    gauge = [(replace(t, pressure_Pa=t.pressure_Pa - t.ambient_pressure_Pa), speed) for t, speed in pairs]
+    converted = [(replace(t, pressure_Pa=factor * t.pressure_Pa), speed) for t, speed in pairs]
+    with_yield = [(replace(t, yield_pressure_Pa=factor * t.yield_pressure_Pa), speed) for t, speed in converted]
+    for meant, what, how, remedy in (
+        (
+            gauge if all(trial.pressure_Pa > 0 for trial, _ in gauge) else [],
+            "absolute pressure",
+            "after the ambient pressure is subtracted",
+            "state gauge pressure, relative to the ambient pressure",
+        ),
+        (converted, *in_unit),
+        (with_yield, *in_unit),
+    ):
+        ratio = _middle_ratio(meant)
+        if 1 / near < ratio < near:
             message = (
-                f"looks like {wrong} (1 psi is {psi:.4g} kPa): the measured speeds imply {number(as_stated, 2)} times "
-                f"the damping of tubes of this size, and {number(converted, 2)} times in the other unit"
+                f"looks like {what}: the measured speeds imply {number(as_stated, 2)} times the damping of tubes of "
+                f"this size, and {number(ratio, 2)} times {how}"
             )
-            remedy = "name the column pressure_psi" if factor > 1 else "name the column pressure_kPa"
+            place: dict[str, Any] = {"file": "trials.csv", "column": "pressure_kPa", "severity": "warning"}
             return [Problem(message=message, remedy=remedy, **place)]
     return []
 
 
-def _middle_ratio(pairs: list[tuple[Trial, float]], factor: float, yield_factor: float) -> float:
-    """Median over the trials of the implied damping over its prior, pressures multiplied by `factor`; NaN without
-    growth. A trial that moves although the pressure does not exceed the yield pressure counts as a ratio of 0.
+def _middle_ratio(pairs: Iterable[tuple[Trial, float]]) -> float:
+    """Median over the trials of the implied damping over its prior; NaN without growth. A trial that moves although the
+    pressure does not exceed the yield pressure counts as a ratio of 0.
     """
     ratios = []
     for trial, speed in pairs:
         if speed > 0 and math.isfinite(speed):
-            drive_N = (factor * trial.pressure_Pa - yield_factor * trial.yield_pressure_Pa) * trial.area_m2
+            drive_N = (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
             damping = drive_N / (trial.travel_ratio * speed) ** published.EXPONENT if drive_N > 0 else 0.0
             ratios.append(damping / damping_prior(trial.diameter_m, trial.thickness_m))
     known = [ratio for ratio in ratios if math.isfinite(ratio)]
