@@ -94,9 +94,6 @@ def test_with_a_payload_speed_is_that_of_the_payload() -> None:
 # The chamber that keeps the pressure, against the gas law worked by hand and against a vine grown out of it.
 
 
-ATM = 101_325.0
-
-
 def trial(**values: object) -> Trial:
     known = {
         "diameter_mm": 24,
@@ -114,14 +111,13 @@ def test_the_injectors_1_7_per_cent_are_5_3_of_gauge() -> None:
         diameter_mm=2.5, thickness_um=50, length_mm=12.5, pressure_kPa=48, chamber_l=20 * math.pi * 7.5**2 / 1e6
     )
     assert swept_m3(one) / one.chamber_m3 == pytest.approx(0.017, abs=5e-4)
-    assert gauge_loss(48e3, swept_m3(one), one.chamber_m3, 1.0, ATM) == pytest.approx(0.053, abs=5e-4)
+    assert gauge_loss(one, one.chamber_m3, 1.0) == pytest.approx(0.053, abs=5e-4)
 
 
 @pytest.mark.parametrize("gamma", GAMMAS.values())
 @pytest.mark.parametrize("loss", [0.01, 0.05, 0.5])
 def test_a_chamber_that_is_sized_loses_just_what_it_may(gamma: float, loss: float) -> None:
-    volume = chamber_for(28e3, 1e-4, loss, gamma, ATM)
-    assert gauge_loss(28e3, 1e-4, volume, gamma, ATM) == pytest.approx(loss)
+    assert gauge_loss(trial(), chamber_for(trial(), loss, gamma), gamma) == pytest.approx(loss)
 
 
 def test_speeds_with_a_chamber_are_those_of_the_effect() -> None:
@@ -136,7 +132,7 @@ def test_speeds_with_a_chamber_are_those_of_the_effect() -> None:
 
 def test_a_quick_supply_saves_a_chamber() -> None:
     inputs = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
-    closed = chamber_for(28e3, swept_m3(inputs.trial), 0.05, 1.4, ATM)
+    closed = chamber_for(inputs.trial, 0.05, 1.4)
     volumes = [supplied_chamber(inputs, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
     assert volumes[0] < volumes[1] < closed
     assert supplied_loss(inputs, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.power import EffectPower, Power
-    from vinetrack.planning.prediction import Choice
+    from vinetrack.planning.prediction import Choice, VinePrediction
 
 _LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis
 
@@ -75,7 +74,7 @@ def draw_choice(choices: Sequence[Choice]) -> Figure:
 
 @look()
 def draw_reservoir(
-    volumes_m3: np.ndarray, losses: Mapping[str, np.ndarray], loss: float, swept_m3: float, chosen_m3: float | None
+    volumes_m3: np.ndarray, losses: Mapping[str, np.ndarray], loss: float, swept_m3: float, chosen_m3: float
 ) -> Figure:
     """Draw the fraction of the gauge pressure that a closed chamber loses while a vine grows, by two gas laws, against
     its volume. Shapes: volumes_m3, losses (n_volumes,).
@@ -92,7 +91,7 @@ def draw_reservoir(
     ax.axhline(100 * loss, color=INK, lw=1.0)
     at = (0.99, 100 * loss), (0, 3), ("axes fraction", "data")
     ax.annotate(f"allowed: {100 * loss:g} %", *at, ha="right", **words)
-    if chosen_m3 is not None and volumes_m3[0] < chosen_m3 < volumes_m3[-1]:
+    if volumes_m3[0] < chosen_m3 < volumes_m3[-1]:
         ax.axvline(factor * chosen_m3, color=MUTED, lw=1.2)
         at = (factor * chosen_m3, 0.97), (5, 0), ("data", "axes fraction")
         ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", *at, va="top", **words)
@@ -108,32 +107,21 @@ def draw_reservoir(
 # Predictions, and the motion with and without one effect.
 
 
-@dataclass(frozen=True)
-class PredictionPicture:
-    """The prediction of one condition."""
-
-    title: str
-    curve: pd.DataFrame
-    final_name: str
-    shares: Sequence[tuple[str, float, float]]
-    final: tuple[float, float, float]
-
-
 @look()
-def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
+def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str], at_fraction: float) -> Figure:
     """Draw one condition with the uncertainty budget of its final speed, or several conditions superposed."""
-    drawn = pictures[: len(VINE_COLOURS)]
+    drawn = predictions[: len(VINE_COLOURS)]
     width_in = 9.6
     fig = new_figure(width_in, 7.2, layout=None)
     axes = fig.subplots(2, 2)
-    for colour, picture in zip(VINE_COLOURS, drawn, strict=False):
-        _draw_curves(axes, picture, colour)
+    for colour, prediction in zip(VINE_COLOURS, drawn, strict=False):
+        _draw_curves(axes, prediction.curve, colour)
     _label_prediction(axes, drawn, at_fraction)
     if len(drawn) == 1:
         _draw_shares(axes[1, 1], drawn[0])
     else:
-        _list_conditions(axes[1, 1], pictures)
-    title = drawn[0].title if len(drawn) == 1 else f"{len(pictures)} conditions"
+        _list_conditions(axes[1, 1], titles)
+    title = titles[0] if len(drawn) == 1 else f"{len(titles)} conditions"
     fig.text(0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * width_in, 12))
     words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
     fig.text(0.075, 0.012, words, color=MUTED, fontsize=8.8)
@@ -142,10 +130,9 @@ def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) 
     return fig
 
 
-def _draw_curves(axes: np.ndarray, picture: PredictionPicture, colour: str) -> None:
+def _draw_curves(axes: np.ndarray, table: pd.DataFrame, colour: str) -> None:
     """Position against time; speed and tension against growth."""
     position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
-    table = picture.curve
     y_mm, along = column(table, "lead_position_m", 1e3), column(table, "y_over_L")
     times_ms = [column(table, name, 1e3) for name in ("time_low_90_s", "time_s", "time_high_90_s")]
     # The axis ends with the slow limit, but at most at four times the end of the median.
@@ -162,7 +149,7 @@ def _draw_curves(axes: np.ndarray, picture: PredictionPicture, colour: str) -> N
         ax.plot(along, table[f"{name}_{unit}"], color=colour)
 
 
-def _label_prediction(axes: np.ndarray, drawn: Sequence[PredictionPicture], at_fraction: float) -> None:
+def _label_prediction(axes: np.ndarray, drawn: Sequence[VinePrediction], at_fraction: float) -> None:
     position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
     position.set(xlabel="time since release (ms)", ylabel="leading edge y (mm)")
     position.set_ylim(bottom=0.0)
@@ -173,22 +160,22 @@ def _label_prediction(axes: np.ndarray, drawn: Sequence[PredictionPicture], at_f
     speed.set_ylim(max(low, 0.0), high)
     at: dict[str, Any] = {"transform": speed.get_xaxis_transform(), "ha": "right", "fontsize": 9, "color": MUTED}
     speed.text(at_fraction - 0.015, 0.03, f"y/L = {at_fraction:g}", **at)
-    lowest = min(picture.curve["tension_low_90_N"].min() for picture in drawn)
+    lowest = min(prediction.curve["tension_low_90_N"].min() for prediction in drawn)
     # Compression below 1 % of the largest tension is rounding of the simulation.
-    if lowest < -0.01 * max(picture.curve["tension_high_90_N"].max() for picture in drawn):
+    if lowest < -0.01 * max(prediction.curve["tension_high_90_N"].max() for prediction in drawn):
         tension.axhline(0.0, color=INK, lw=0.8)
         small_title(tension, "below 0 the model predicts compression in the tail", fontsize=9.5, color=MUTED)
-    ends = [float(picture.curve["time_s"].replace(np.inf, np.nan).max()) for picture in drawn]
+    ends = [float(prediction.curve["time_s"].replace(np.inf, np.nan).max()) for prediction in drawn]
     if max(ends) > _LOG_RATIO * min(ends):
         position.set_xscale("log")
         position.set_xlim(left=10.0 * min(ends))
         plain_log_ticks(position, "x")
 
 
-def _draw_shares(ax: Axes, picture: PredictionPicture) -> None:
+def _draw_shares(ax: Axes, prediction: VinePrediction) -> None:
     """Bars of the final speed: with all uncertainties, then with each alone."""
-    low, median, high = picture.final
-    bars = [("all inputs", low, high), *picture.shares]
+    low, median, high = prediction.final.low, prediction.final.median, prediction.final.high
+    bars = [("all inputs", low, high), *((share.name, share.low, share.high) for share in prediction.shares)]
     for k, (_, start, stop) in enumerate(bars):
         ax.barh(k, stop - start, left=start, height=0.55, color=BLUE, alpha=0.85 if k == 0 else 0.4, lw=0)
     ax.axvline(median, color=INK, lw=1.0)
@@ -201,18 +188,18 @@ def _draw_shares(ax: Axes, picture: PredictionPicture) -> None:
         ax.set_xscale("log")
         plain_log_ticks(ax, "x")
     ax.grid(visible=False, axis="y")
-    ax.set_xlabel(f"{picture.final_name} (m/s)")
+    ax.set_xlabel(f"{prediction.final.name} (m/s)")
     ax.set_title("Uncertainty budget", fontsize=10.5)
 
 
-def _list_conditions(ax: Axes, pictures: Sequence[PredictionPicture]) -> None:
+def _list_conditions(ax: Axes, titles: Sequence[str]) -> None:
     """List the condition of each colour, instead of the bars."""
     ax.set_axis_off()
-    for k, (colour, picture) in enumerate(zip(VINE_COLOURS, pictures, strict=False)):
+    for k, (colour, title) in enumerate(zip(VINE_COLOURS, titles, strict=False)):
         y = 0.97 - 0.155 * k
         ax.plot([0.0, 0.07], [y - 0.025] * 2, color=colour, lw=3, transform=ax.transAxes, clip_on=False)
-        ax.text(0.1, y, textwrap.fill(picture.title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
-    if (n_more := len(pictures) - len(VINE_COLOURS)) > 0:
+        ax.text(0.1, y, textwrap.fill(title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
+    if (n_more := len(titles) - len(VINE_COLOURS)) > 0:
         ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=MUTED)
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Trial
@@ -38,10 +40,6 @@ from vinetrack.planning.prediction import (
     swept_m3,
 )
 from vinetrack.planning.predictive_inputs import PredictiveInputs, hoop_stress_Pa
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 FILMS = "--films-um"
 
@@ -217,15 +215,30 @@ def design_reservoir(
         inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
         lines = [*basis.heading, *_reservoir_lines(trial, inputs, loss, at_fraction)]
         if math.isfinite(supply_s) and inputs is not None:
-            lines += _supplied_lines(inputs, loss, supply_s)
+            volumes = {law: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
+            needed = ", ".join(
+                f"{format_volume(volume) if volume > 0 else 'none'} ({law.split(',')[0]})"
+                for law, volume in volumes.items()
+            )
+            lines.append(f"with a supply that refills the chamber in {1e3 * supply_s:g} ms, at the medians: {needed}")
     if math.isfinite(supply_s) and inputs is None:
         lines.append("! --supply-s needs --thickness-um: how fast the vine takes up gas depends on its wall")
     if figure is not None:
-        write_figure(_reservoir_picture(trial, loss), figure)
+        swept = swept_m3(trial)
+        drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
+        losses = {
+            law: np.array([gauge_loss(trial, volume_m3, gamma) for volume_m3 in drawn_m3.tolist()])
+            for law, gamma in GAMMAS.items()
+        }
+        write_figure(draw_reservoir(drawn_m3, losses, loss, swept, trial.chamber_m3), figure)
         lines.append(f"Figure: {figure}")
     entries = [
-        {"chamber": chamber.name, "volume_l": 1e3 * chamber.volume_m3, "loss_of_gauge_pressure": chamber.losses}
-        for chamber in chambers(trial, loss)
+        {
+            "chamber": name,
+            "volume_l": 1e3 * volume_m3,
+            "loss_of_gauge_pressure": {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()},
+        }
+        for name, volume_m3 in chambers(trial, loss).items()
     ]
     return lines, {"warnings": basis.heading, "chambers": entries}
 
@@ -241,11 +254,11 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     yield ""
     laws = [law.split(",")[0] for law in GAMMAS]
     rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
-    for chamber in chambers(trial, loss):
-        cells = [chamber.name, format_volume(chamber.volume_m3)]
-        cells += [f"{100 * share:.1f}" for share in chamber.losses.values()]
+    for name, volume_m3 in chambers(trial, loss).items():
+        cells = [name, format_volume(volume_m3)]
+        cells += [f"{100 * gauge_loss(trial, volume_m3, gamma):.1f}" for gamma in GAMMAS.values()]
         if inputs is not None:
-            finals = [final_with(inputs, chamber.volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
+            finals = [final_with(inputs, volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
             cells += [display_value(final, "m/s") for final in finals]
         rows.append(cells)
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
@@ -255,22 +268,3 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
         place = "" if trial.payload_kg > 0 else f" at y/L = {at_fraction:g}"
         yield f"speed: final speed at the medians{place}; {display_value(steady, 'm/s')} m/s at constant pressure"
     yield "slow: γ = 1, isothermal; fast: γ = 1.4, adiabatic, as within milliseconds"
-
-
-def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
-    volumes = {law.split(",")[0]: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
-    needed = ", ".join(f"{format_volume(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
-    return [f"with a supply that refills the chamber in {1e3 * supply_s:g} ms, at the medians: {needed}"]
-
-
-def _reservoir_picture(trial: Trial, loss: float) -> Figure:
-    import numpy as np
-
-    swept, pressure_Pa, ambient_Pa = swept_m3(trial), trial.pressure_Pa, trial.ambient_pressure_Pa
-    volumes = swept * np.geomspace(3.0, 300.0, 200)
-    losses = {
-        name: np.array([gauge_loss(pressure_Pa, swept, float(volume), gamma, ambient_Pa) for volume in volumes])
-        for name, gamma in GAMMAS.items()
-    }
-    requested = [chamber for chamber in chambers(trial, loss) if chamber.name == "asked about"]
-    return draw_reservoir(volumes, losses, loss, swept, requested[0].volume_m3 if requested else None)

@@ -20,7 +20,7 @@ from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.experiment.schema import option
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
-from vinetrack.figures.prediction_figures import PredictionPicture, draw_predictions
+from vinetrack.figures.prediction_figures import draw_predictions
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_data import FitError
 from vinetrack.pipeline.effects_stage import effects_of
@@ -289,7 +289,8 @@ def predict_conditions(
     lines = [*basis.heading, *(_condition_lines(entries[0]) if len(entries) == 1 else _table_lines(entries))]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
-        write_figure(draw_predictions([_picture(entry.prediction) for entry in entries], at_fraction), figure)
+        titles = [describe_trial(entry.prediction.inputs.trial) for entry in entries]
+        write_figure(draw_predictions([entry.prediction for entry in entries], titles, at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
         write_csv(csv, pd.concat([entry.prediction.curve for entry in entries], ignore_index=True))
@@ -382,16 +383,6 @@ def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
     for text in hazards:
         conditions = [entry.prediction.inputs.trial.condition for entry in entries if text in entry.hazards]
         yield f"! {'all conditions' if len(conditions) == len(entries) else ', '.join(conditions)}: {text}"
-
-
-def _picture(prediction: VinePrediction) -> PredictionPicture:
-    return PredictionPicture(
-        title=describe_trial(prediction.inputs.trial),
-        curve=prediction.curve,
-        final_name=prediction.final.name,
-        shares=[(share.name, share.low, share.high) for share in prediction.shares],
-        final=(prediction.final.low, prediction.final.median, prediction.final.high),
-    )
 
 
 def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:

@@ -645,48 +645,30 @@ def swept_m3(trial: Trial) -> float:
     return trial.area_m2 * trial.length_m
 
 
-def gauge_loss(pressure_Pa: float, swept: float, chamber_m3: float, gamma: float, ambient_Pa: float) -> float:
-    """Return the fraction of the gauge pressure lost after the volume `swept` is filled from a closed chamber."""
-    left_Pa = (pressure_Pa + ambient_Pa) * (chamber_m3 / (chamber_m3 + swept)) ** gamma - ambient_Pa
+def gauge_loss(trial: Trial, chamber_m3: float, gamma: float) -> float:
+    """Return the fraction of the gauge pressure that a closed chamber loses while a vine grows."""
+    pressure_Pa, ambient_Pa = trial.pressure_Pa, trial.ambient_pressure_Pa
+    left_Pa = (pressure_Pa + ambient_Pa) * (chamber_m3 / (chamber_m3 + swept_m3(trial))) ** gamma - ambient_Pa
     return 1 - left_Pa / pressure_Pa
 
 
-def chamber_for(pressure_Pa: float, swept: float, loss: float, gamma: float, ambient_Pa: float) -> float:
+def chamber_for(trial: Trial, loss: float, gamma: float) -> float:
     """Return the volume of the closed chamber, m³, that loses exactly this fraction of its gauge pressure."""
+    pressure_Pa, ambient_Pa = trial.pressure_Pa, trial.ambient_pressure_Pa
     q = (((1 - loss) * pressure_Pa + ambient_Pa) / (pressure_Pa + ambient_Pa)) ** (1 / gamma)
-    return swept * q / (1 - q)
+    return swept_m3(trial) * q / (1 - q)
 
 
-@dataclass(frozen=True)
-class Chamber:
-    """One chamber and the loss of pressure in it: `losses` by gas law, as a fraction of the gauge pressure."""
-
-    name: str
-    volume_m3: float
-    losses: dict[str, float]
-
-
-def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
-    """Return the chambers to compare: the stated one, those that keep the pressure, and the one by gauge pressure."""
-    volume = swept_m3(trial)
-
-    def chamber(name: str, volume_m3: float) -> Chamber:
-        losses = {
-            law: gauge_loss(trial.pressure_Pa, volume, volume_m3, gamma, trial.ambient_pressure_Pa)
-            for law, gamma in GAMMAS.items()
-        }
-        return Chamber(name, volume_m3, losses)
-
-    asked = [chamber("asked about", trial.chamber_m3)] if math.isfinite(trial.chamber_m3) else []
-    needed = [
-        chamber(
-            f"needed if {law.split(',')[0]}",
-            chamber_for(trial.pressure_Pa, volume, loss, gamma, trial.ambient_pressure_Pa),
-        )
-        for law, gamma in GAMMAS.items()
-    ]
-    # Boyle's law with gauge instead of absolute pressure, V₁/V₂ = 1 − ε, gives too small a chamber.
-    return (*asked, *needed, chamber("by gauge pressure (wrong)", volume * (1 - loss) / loss))
+def chambers(trial: Trial, loss: float) -> dict[str, float]:
+    """Return the volumes of the chambers to compare, m³: the stated one, those that keep the pressure, and the one by
+    gauge pressure.
+    """
+    return {
+        **({"asked about": trial.chamber_m3} if math.isfinite(trial.chamber_m3) else {}),
+        **{f"needed if {law.split(',')[0]}": chamber_for(trial, loss, gamma) for law, gamma in GAMMAS.items()},
+        # Boyle's law with gauge instead of absolute pressure, V₁/V₂ = 1 − ε, gives too small a chamber.
+        "by gauge pressure (wrong)": swept_m3(trial) * (1 - loss) / loss,
+    }
 
 
 def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gamma: float) -> float:
@@ -706,9 +688,7 @@ def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma:
     def excess_loss(log_volume: float) -> float:
         return supplied_loss(inputs, math.exp(log_volume), tau_s, gamma) - loss
 
-    closed = chamber_for(
-        inputs.trial.pressure_Pa, swept_m3(inputs.trial), loss, gamma, inputs.trial.ambient_pressure_Pa
-    )
+    closed = chamber_for(inputs.trial, loss, gamma)
     low, high = math.log(closed / 1e4), math.log(closed * 1.01)
     if excess_loss(low) <= 0:
         return 0.0
