@@ -51,7 +51,7 @@ from vinetrack.planning.discriminating_design import (
     worth,
 )
 from vinetrack.planning.predictive_inputs import prior_ratio
-from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES, DesignProblem, mean_separation, simulated_rises
+from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES, DesignProblem, simulated_rises
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
@@ -125,7 +125,9 @@ class _Option:
 
     @property
     def separations(self) -> Floats:
-        return mean_separation(self.rises)
+        """Root of the mean rise over the draws, shape (n, n); 0 where a wrong hypothesis fits better."""
+        count = np.maximum(np.isfinite(self.rises).sum(axis=0), 1)
+        return np.asarray(np.sqrt(np.maximum(np.nansum(self.rises, axis=0) / count, 0.0)))
 
     @property
     def worth(self) -> float:

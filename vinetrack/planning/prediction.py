@@ -455,15 +455,11 @@ def _slack(prediction: VinePrediction) -> Iterator[str]:
 def _rules(prediction: VinePrediction) -> Iterator[str]:
     """Warnings of the audit along the median motion, except the one about the tail, which `_slack` gives."""
     inputs = prediction.inputs
-    (moved,), _ = grown(inputs.model, *_medians(inputs))
+    (moved,), _ = grown(inputs.model, [inputs.trial])
     keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
     motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
     violations = audit(inputs.model, [motion]).violations
     yield from (violation.words for violation in violations if violation.rule != "tension")
-
-
-def _medians(inputs: PredictiveInputs) -> tuple[list[Trial], Floats]:
-    return inputs.laid_out(inputs.draw(1, 0, only=()))
 
 
 def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
@@ -494,8 +490,7 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
 
 def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
     """Return the final speed at the medians under this model, m/s, see `final_speeds`."""
-    trials, _ = _medians(inputs)
-    return float(final_speeds(model, trials, at_fraction, host=host)[0])
+    return float(final_speeds(model, [inputs.trial], at_fraction, host=host)[0])
 
 
 # ------------------------------------------------------------------------------
@@ -507,8 +502,6 @@ def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: 
 # optimised
 # by a grid search at the medians of the predictive inputs. How certain the choice of film is follows from their
 # distributions: every draw has its own fastest film.
-
-GRID = (17, 9)  # Numbers of diameters and lengths in each round (chosen)
 
 
 @dataclass(frozen=True)
@@ -590,9 +583,10 @@ def _best(
     limits = list(spans)
     others = np.empty((0, 2))
     inputs: PredictiveInputs | None = None
+    # 17, 9: numbers of diameters and lengths in each round (chosen)
     # 3: rounds of the search, each a finer grid around the optimum of the one before (chosen)
     for round_number in range(3):
-        axes = [np.unique(np.geomspace(*span, count)) for span, count in zip(spans, GRID, strict=True)]
+        axes = [np.unique(np.geomspace(*span, count)) for span, count in zip(spans, (17, 9), strict=True)]
         vine_inputs = [predictive_inputs(room.trial(D, film_m, L), stated, fit) for D in axes[0] for L in axes[1]]
         rows = np.array([inputs.model.parameters_of(inputs.trial) for inputs in vine_inputs])
         trials = [inputs.trial for inputs in vine_inputs]

@@ -136,17 +136,14 @@ class PartlyLinear(Predictor):
             theta, trial_effects[self.n_old :], trial_effects_only=trial_effects_only, past_end=past_end
         )
 
-    def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted positions of all trials, m. Shapes: theta (n_free,); trial_effects (n_trials,
-        N_TRIAL_EFFECTS) → (n_points,).
+    def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
+        """Measured minus predicted positions of all trials, m, for several sets of trial effects. Shapes: theta
+        (n_free,); effect_sets (n_trials, N_TRIAL_EFFECTS) → (n_points,).
         """
-        return self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
-
-    def residuals_of_each(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
-        """`residuals` for several sets of trial effects. Shapes: theta (n_free,); ways (n_trials, N_TRIAL_EFFECTS) →
-        (n_points,).
-        """
-        return [self.residuals(theta, trial_effects) for trial_effects in ways]
+        return [
+            self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
+            for trial_effects in effect_sets
+        ]
 
     def residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted positions of the old trials, m, to first order. Shapes: theta (n_free,);
@@ -195,22 +192,11 @@ def simulated_rises(
     return rises
 
 
-def mean_separation(rises: Floats) -> Floats:
-    """Return the square root of the mean rise of −2 ln L over the draws; 0 where a wrong hypothesis fits better.
-    Shapes: rises (n_draws, n, n) → (n, n).
-    """
-    is_known = np.isfinite(rises)
-    mean = np.where(is_known, rises, 0.0).sum(axis=0) / np.maximum(is_known.sum(axis=0), 1)
-    return np.asarray(np.sqrt(np.maximum(mean, 0.0)))
-
-
 def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
     """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
     Returns free parameters, scaled, within their bounds. Shape (n_free,).
     """
-    # Standard deviations at which draws of the true parameters are clipped, since the linearised fit is not valid
-    # beyond
-    furthest_draw = 2.0
+    furthest_draw = 2.0  # Standard deviations at which draws are clipped: the linearised fit holds no further (chosen)
     old = hypothesis.fit.predictor.layout.start.size
     values, vectors = np.linalg.eigh(hypothesis.scatter_levels[0].information[:old, :old])
     is_determined = values > 1e-9 * values[-1]
