@@ -86,12 +86,11 @@ class EffectPower:
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> EffectPower:
         """Read what `to_json` wrote."""
+        names = ("zero", "least", "largest", "named_alone")
+        values: dict[str, Any] = {name: or_nan(entry.get(JSON_NAMES.get(name, name))) for name in names}
+        values |= {key: str(entry.get(key) or "") for key in ("effect", "kind", "parameter", "symbol", "unit")}
         return cls(
-            **{key: str(entry.get(key) or "") for key in ("effect", "kind", "parameter", "symbol", "unit")},
-            **{
-                name: or_nan(entry.get(JSON_NAMES.get(name, name)))
-                for name in ("zero", "least", "largest", "named_alone")
-            },
+            **values,
             sizes=tuple(math.inf if size is None else float(size) for size in entry.get("sizes") or ()),
             taken_for={str(name): or_nan(value) for name, value in (entry.get("taken_for") or {}).items()},
             other_values=tuple(entry.get("other_values") or ()),
