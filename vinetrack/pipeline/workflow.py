@@ -274,14 +274,14 @@ class WorkflowPlan:
 
 
 def input_files(experiment: Experiment) -> list[Path]:
-    """The files of an experiment, whether they are there or not: what is stated, then what was measured."""
+    """The files of an experiment, whether they are there or not."""
     folder, settings = experiment.folder, experiment.settings
     effects = [folder / path for path in settings.effects]
     beside = [file for path in effects for file in sorted(path.parent.glob("*.py"))]  # which an effect may import
     target = getattr(settings.calibration, "image", None)
     targets = [] if target is None else [folder / target]
     measured = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace)]
-    files = [*(folder / name for name in SHARED_FILES), *effects, *beside, *targets, *filter(None, measured)]
+    files = [*(folder / name for name in SHARED_FILES), *filter(None, measured), *targets, *effects, *beside]
     return list(dict.fromkeys(files))
 
 
