@@ -150,7 +150,7 @@ def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked: tuple
                '{"figures": {"formats": ["png"]}}']  # fmt: skip
     ends = time.monotonic() + 120
     with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)}) as first:
-        while not list((tmp_path / ".kept").glob("*.npz")) and time.monotonic() < ends:
+        while not list((tmp_path / ".kept").glob("[!.]*.npz")) and time.monotonic() < ends:
             time.sleep(0.005)
         first.send_signal(signal.SIGKILL)
     kept = {path: path.stat().st_ino for path in (tmp_path / ".kept").glob("[!.]*.npz")}
