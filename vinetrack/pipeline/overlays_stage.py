@@ -81,13 +81,11 @@ def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str
         return []
     trials = read_result(results.trials)
     tracked = set(trials.loc[~trials["status"].isin(("failed", "left_out")), "trial"])
-    filmed = [trial for trial in experiment.trials if trial.video is not None and trial.name in tracked]
+    filmed = {trial.name: trial.condition for trial in experiment.trials if trial.video and trial.name in tracked}
     if of == "all":
-        return [trial.name for trial in filmed]
-    first: dict[str, str] = {}
-    for trial in filmed:
-        first.setdefault(trial.condition, trial.name)
-    return list(first.values())
+        return list(filmed)
+    first = {condition: name for name, condition in reversed(filmed.items())}
+    return [name for name, condition in filmed.items() if first[condition] == name]
 
 
 def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> str:

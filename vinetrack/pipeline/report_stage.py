@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.result import Diagnosis
-    from vinetrack.effects import Effect
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import FigureSettings
     from vinetrack.figures.diagnosis_figures import DiagnosisTables
@@ -156,6 +155,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
     trials, diagnosis = read_result(results.trials), read_diagnosis(results)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
+    inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
     names = set(read_json(results.figure_list)["figures"])
     drawings = [one for name, one in campaign_figures().items() if name in names]
     paper: list[ReportSection] = []
@@ -167,7 +167,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         trials=trials,
         windows=read_result(results.steady),
         damping=read_json(results.damping),
-        provenance=_provenance(experiment, settings),
+        provenance=describe_run(experiment.folder, inputs, dict(settings), experiment.settings.model),
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
         figures=_figures(tables, drawings, diagnosis),
         trial_figures={name: picture for name in drawn if (picture := _picture(partial(results.trial_figure, name)))},
@@ -192,12 +192,17 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
 
 def _diagnosis_section(results: Results, diagnosis: Diagnosis, experiment: Experiment) -> DiagnosisResult:
     """Return the content of the report's section on the diagnosis."""
+    from vinetrack.effects import EffectError, catalogue, own_effects
     from vinetrack.report.section import DiagnosisResult
 
+    known = dict(catalogue())
+    with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
+        known |= own_effects([experiment.folder / path for path in experiment.settings.effects])
     paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
     moved, laws = (table if path.exists() and len(table := read_result(path)) else None for path in paths)
     reported = [*diagnosis.effects, *diagnosis.answer_set]
-    effects = _effects([*reported, *(row.effect for ranked in diagnosis.rounds for row in ranked.ranking)], experiment)
+    named = dict.fromkeys([*reported, *(row.effect for ranked in diagnosis.rounds for row in ranked.ranking)])
+    effects = {name: known[name] for name in named if name in known}
     return DiagnosisResult(
         diagnosis,
         diagnosis.ladder,
@@ -206,26 +211,6 @@ def _diagnosis_section(results: Results, diagnosis: Diagnosis, experiment: Exper
         {name: effects[name].summary for name in reported if name in effects},
         {f"{name}.{p.name}": (p.symbol, p.unit) for name, effect in effects.items() for p in effect.parameters},
     )
-
-
-def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
-    """Return effects by name, without those whose file no longer exists."""
-    from vinetrack.effects import EffectError, find_effect, own_effects
-
-    try:
-        user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
-    except EffectError:
-        user_effects = {}
-    effects = {}
-    for name in dict.fromkeys(names):
-        with contextlib.suppress(EffectError):
-            effects[name] = find_effect(name, user_effects)
-    return effects
-
-
-def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
-    inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
-    return describe_run(experiment.folder, inputs, dict(settings), experiment.settings.model)
 
 
 def _picture(path: Callable[[str], Path]) -> str | bytes:
