@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from commanded import succeed
 from lsoda_vine import small_campaign
 
+from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.pipeline.model_stage import fit_model
@@ -35,20 +37,17 @@ TRAJECTORY_HEADER = "trial,time_s,lead_position_m,model_position_m,replicates_me
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
 
 
-def write_experiment(folder: Path, settings: str = "") -> Path:
-    """Two vines, four pressures, two replicates, and one broken track."""
+def write_experiment(folder: Path, pairs: Iterable[tuple[Trial, Track]], angles_deg: Sequence[int] = ()) -> Path:
+    """The tracks of trials, and their sheet."""
     (folder / "tracks").mkdir(parents=True)
-    rows = [SHEET]
-    for trial, track in small_campaign(seed=21)[0]:
+    rows = []
+    for trial, track in pairs:
         table = pd.DataFrame({"time_s": track.time_s, "position_m": track.lead_position_m})
         table.to_csv(folder / "tracks" / f"{trial.name}.csv", index=False)
-        size = f"{1e3 * trial.diameter_m:g},{1e6 * trial.thickness_m:g},{1e3 * trial.length_m:g}"
-        rows.append(f"{trial.name},tracks/{trial.name}.csv,{size},{trial.pressure_Pa / 1e3:g},3\n")
-    (folder / "tracks" / "torn.csv").write_text("time_s,position_m\n0,0\n")
-    rows.append("torn,tracks/torn.csv,24,200,280,12,3\n")
-    (folder / "trials.csv").write_text("".join(rows))
-    if settings:
-        (folder / "experiment.yaml").write_text(settings)
+        sizes = (1e3 * trial.diameter_m, 1e6 * trial.thickness_m, 1e3 * trial.length_m, trial.pressure_Pa / 1e3)
+        rows.append([trial.name, f"tracks/{trial.name}.csv", *(f"{size:g}" for size in sizes), "3"])
+    sheet = pd.DataFrame(rows, columns=SHEET.strip().split(","))
+    (sheet.assign(growth_angle_deg=angles_deg) if angles_deg else sheet).to_csv(folder / "trials.csv", index=False)
     return folder
 
 
@@ -60,9 +59,11 @@ def analysed(experiment: Path, results: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Experiment and results folder."""
+    """Experiment and results folder: two vines, four pressures, two replicates, and one broken track."""
     folder = tmp_path_factory.mktemp("campaign")
-    experiment = write_experiment(folder / "vines")
+    pairs = small_campaign(seed=21)[0]
+    torn = replace(pairs[0][0], name="torn"), plain_track(np.zeros(1), np.zeros(1))
+    experiment = write_experiment(folder / "vines", [*pairs, torn])
     results = analysed(experiment, folder / "results")
     fit_model(Job(read_experiment(experiment), results, run_settings({})))
     return experiment, results
@@ -187,7 +188,6 @@ def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> 
 # A recording whose axis is not that of the others fails when the trials are gathered, and enters no fit.
 
 
-SHEET_AXES = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
 LEVEL, DOOR, DOWN = ((10.0, 50.0), (300.0, 52.0)), ((40.0, 90.0), (200.0, 30.0)), ((60.0, 5.0), (62.0, 200.0))
 
 
@@ -195,16 +195,9 @@ LEVEL, DOOR, DOWN = ((10.0, 50.0), (300.0, 52.0)), ((40.0, 90.0), (200.0, 30.0))
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Five trials filmed level and two filmed straight down, analysed; the axes are those of `write_axes`."""
     folder = tmp_path_factory.mktemp("askew")
-    experiment, results = folder / "vines", folder / "results"
-    (experiment / "tracks").mkdir(parents=True)
-    rows = [SHEET_AXES]
-    for k, (trial, track) in enumerate(small_campaign(seed=23)[0][:7]):
-        columns = np.column_stack([track.time_s, track.lead_position_m])
-        path = experiment / "tracks" / f"t{k}.csv"
-        np.savetxt(path, columns, delimiter=",", header="time_s,position_m", comments="")
-        sizes = f"{1e3 * trial.diameter_m:g},{1e6 * trial.thickness_m:g},{1e3 * trial.length_m:g}"
-        rows.append(f"t{k},tracks/t{k}.csv,{sizes},{trial.pressure_Pa / 1e3:g},3,{90 if k < 5 else 0}\n")
-    (experiment / "trials.csv").write_text("".join(rows))
+    pairs = [(replace(trial, name=f"t{k}"), track) for k, (trial, track) in enumerate(small_campaign(seed=23)[0][:7])]
+    experiment = write_experiment(folder / "vines", pairs, [90] * 5 + [0] * 2)
+    results = folder / "results"
     succeed("trials", experiment, results)
     return experiment, results
 
