@@ -15,7 +15,8 @@ from plain_scene import Plan, Scene, plain_scene, write_images, write_video
 
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
+from vinetrack.figures import overlay
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge, draw_strip
 from vinetrack.pipeline.overlays_stage import (
     MARGIN_FRAMES,
     chosen_trials,
@@ -28,6 +29,7 @@ from vinetrack.pipeline.overlays_stage import (
 )
 from vinetrack.pipeline.stages import Job
 from vinetrack.results.folder_layout import Results, read_result
+from vinetrack.video.track import Tracking
 from vinetrack.video.write import write_clip
 
 # `vinetrack track`: one recording to a table, a strip and a clip; every obvious mistake is one sentence.
@@ -52,7 +54,11 @@ def refused(*arguments: object) -> str:
 
 
 @pytest.mark.slow
-def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, clip: Path, tmp_path: Path) -> None:
+def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(
+    scene: Scene, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Tracking] = []
+    monkeypatch.setattr(overlay, "draw_strip", lambda *given: drawn.append(given[1]) or draw_strip(*given))
     done = run("track", clip, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     assert f"{len(scene.frames)} frames of 640 × 160 px, 8 bit" in done.stdout
@@ -63,6 +69,7 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, cli
     ]  # fmt: skip
     assert len(table) == len(scene.frames)
     assert table["time_s"].isna().all()
+    assert np.isnan(drawn[0].track.time_s).all()  # the strip counts frames where there are no seconds
     off = (table["x_px"] - (scene.edge_px + 30.0))[scene.moving]
     assert float(off.abs().median()) < 0.5
     assert table["y_px"].sub(80.0).abs().max() < 1.5

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import INTERNAL_ERROR, UserError
-from vinetrack.core.records import PictureAxis, Trial, hand_corrected, with_flag
+from vinetrack.core.records import UNUSABLE_FLAGS, PictureAxis, Trial, hand_corrected, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
@@ -293,7 +293,11 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
         measurement = measure_recording(trial, settings, folder)
     except RecordingError as error:
         raise UserError(str(error)) from None
-    table = _table(measurement, options.scaled, math.isfinite(rate))
+    if not math.isfinite(rate):
+        tracking = measurement.tracking
+        untimed = replace(tracking.track, time_s=np.full(len(tracking.track.time_s), math.nan))
+        measurement = replace(measurement, tracking=replace(tracking, track=untimed))
+    table = _table(measurement, options.scaled)
     written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled)
     tracking_facts = _tracking_facts(measurement, table, options, rate)
     for line in _tracking_lines(tracking_facts):
@@ -386,10 +390,8 @@ def _recording_lines(facts: dict[str, Any]) -> list[str]:
     return [f"{first}.", f"{second}."]
 
 
-def _table(measurement: Measurement, scaled: bool, timed: bool) -> pd.DataFrame:
-    """One row per frame: the edge along the axis and in the picture, with errors, and in metres if there is a scale.
-    Times are NaN if the capture rate is unknown.
-    """
+def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
+    """One row per frame: the edge along the axis and in the picture, with errors, and in metres if there is a scale."""
     import pandas as pd
 
     tracking = measurement.tracking
@@ -399,7 +401,7 @@ def _table(measurement: Measurement, scaled: bool, timed: bool) -> pd.DataFrame:
     assert systematic_m is not None
     columns = {
         "frame": np.arange(len(track.time_s)),
-        "time_s": track.time_s if timed else math.nan,
+        "time_s": track.time_s,
         "edge_px": track.edge_px,
         "edge_sigma_px": track.lead_position_sigma_m / measurement.m_per_px,
         "edge_systematic_px": systematic_m / measurement.m_per_px,
@@ -427,7 +429,7 @@ def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: 
     write_csv(written["table"], table)
     m_per_px = measurement.m_per_px if scaled else math.nan
     write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
-    shown, time_s = frames_to_show(table), table["time_s"].to_numpy(dtype=float)
+    shown, time_s = frames_to_show(table), tracking.track.time_s
     tube_px = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else tracking.axis.width_px
     edges = [Edge("tracked edge", TRACKED, tracking.track.edge_px + tracking.shake_px)]
     since_s = time_s - time_s[min(shown.start + MARGIN_FRAMES, len(time_s) - 1)]
@@ -442,7 +444,10 @@ def _tracking_facts(
     from vinetrack.video.curved_axis import axis_entry
 
     tracking = measurement.tracking
-    edge_px, usable = tracking.track.edge_px, tracking.track.usable
+    edge_px = tracking.track.edge_px
+    usable = np.isfinite(edge_px)
+    for flag in UNUSABLE_FLAGS:
+        usable &= ~with_flag(tracking.track.flag, flag)
     moving = usable & ~with_flag(tracking.track.flag, "before_release")
     frame = np.flatnonzero(usable)
     scale = measurement.m_per_px if options.scaled else math.nan
