@@ -247,22 +247,13 @@ def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
     of_track = {"trial", "time_s", *POSITION_COLUMNS, *ERROR_COLUMNS, "flag", "edge_px", "frame"}
     for column in part.columns:
         first = part[column].iloc[0]
-        if column in of_track or _is_blank(first):
+        if column in of_track or pd.isna(first) or first == "":
             continue
-        if column != "pressure_kPa" and not _is_constant(part[column]):
+        if column != "pressure_kPa" and len(part[column].unique()) > 1:
             message, remedy = f"changes within the trial {name}", "give it one value in all rows of the trial"
             raise ExperimentError([Problem(message=message, file="the frame", column=str(column), remedy=remedy)])
         cells[str(column)] = f"{first:.15g}" if isinstance(first, float | np.floating) else str(first)
     return cells
-
-
-def _is_blank(value: Any) -> bool:
-    return value is None or value == "" or (isinstance(value, float | np.floating) and math.isnan(value))
-
-
-def _is_constant(column: pd.Series) -> bool:
-    first = column.iloc[0]
-    return bool(column.isna().all() if _is_blank(first) else (column == first).all())
 
 
 def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
@@ -290,7 +281,7 @@ def _track(trial: Trial, part: pd.DataFrame, position: str) -> Track:
     unknown = np.full(len(part), math.nan)
     sigma_m, systematic_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(len(part), "", dtype=str)
-    traced = "pressure_kPa" in part and not _is_constant(part["pressure_kPa"])
+    traced = "pressure_kPa" in part and len(part["pressure_kPa"].unique()) > 1
     track = Track(
         time_s=part["time_s"].to_numpy(dtype=float),
         lead_position_m=part[position].to_numpy(dtype=float),
