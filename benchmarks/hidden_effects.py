@@ -1,4 +1,4 @@
-"""Whether a hidden effect is found: many campaigns of another simulator, beside PySINDy and a plain BIC choice.
+"""Whether a hidden effect is found: many campaigns of another simulator, beside a plain BIC choice.
 
     python benchmarks/hidden_effects.py [--kinds all] [--campaigns 5] [--first-seed 10000] [--rows rows.csv]
     python benchmarks/hidden_effects.py --verify
@@ -14,8 +14,7 @@ How visible a truth was is measured by the package's own fit with the truth in t
 σ = √(2 Δ ln L). Detection is listed by it; the bar asks for what lies above 8 σ.
 
 Baselines on the same campaigns (`--methods`): `bic`, every candidate fitted alone, lowest BIC wins, with scatter and
-correlation estimated; `bic_plain`, the same without either; `sindy`, sparse regression on differentiated positions
-(`benchmarks/hidden/sindy.py`; needs `pip install pysindy`). `left_out` is the package again, with the errors on
+correlation estimated; `bic_plain`, the same without either. `left_out` is the package again, with the errors on
 left-out conditions once what it found is added, in parts of what the true model gets.
 
 With `--rows` every answer is kept as it comes; begun again, what is there is not asked again. Seeds 0–899 tune,
@@ -134,12 +133,6 @@ def main() -> None:
         print(differences().to_string(index=False))
         return
     methods = given.methods.split(",")
-    if "sindy" in methods:
-        from hidden.sindy import available
-
-        if not available():
-            print("PySINDy is not installed (pip install pysindy): its column stays blank")
-            methods.remove("sindy")
     seeds = range(given.first_seed, given.first_seed + given.campaigns)
     tasks = [(method, kind, seed) for seed in seeds for kind in kinds(given.kinds) for method in methods]
     report(gather(tasks, given.rows, given.processes))

@@ -202,20 +202,6 @@ def _rest_noise_m(campaign: Hidden) -> float:
     return median(position_noise(track.time_s, track.lead_position_m)[0] for _, track in campaign.pairs)
 
 
-def ask_sindy(kind: str, seed: int) -> Row:
-    """PySINDy on differentiated positions."""
-    from hidden.sindy import chosen
-
-    campaign = make(kind, seed)
-    row = {"method": "sindy", **identity(campaign)}
-    begun, work = time.perf_counter(), time.process_time()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        names = chosen(campaign.pairs)
-    verdict = "adequate" if not names else "artefact" if set(names) <= set(MEASUREMENT) else "missing"
-    return row | {**_spent(begun, work), "verdict": verdict, "answer": "|".join(names), "effects": "+".join(names)}
-
-
 def ask_left_out(kind: str, seed: int) -> Row:
     """Error on left-out conditions with everything added that was found, against that of the true model."""
     from vinetrack.diagnosis.ladder import ladder
@@ -247,5 +233,4 @@ METHODS = {
     "left_out": ask_left_out,
     "bic": ask_bic,
     "bic_plain": ask_bic_plain,
-    "sindy": ask_sindy,
 }
