@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from by_hand import LOADED
 
 from vinetrack.core.records import Bend, Kinematics, Trial
 from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, measured_motion
@@ -19,20 +20,7 @@ BASE = base_model().with_values({"eversion_damping.B": 6.44})
 
 
 def trial(**others: object) -> Trial:
-    fields: dict[str, object] = {
-        "name": "t",
-        "vine": "v",
-        "condition": "c",
-        "diameter_m": 24e-3,
-        "thickness_m": 200e-6,
-        "length_m": 0.28,
-        "pressure_Pa": 28e3,
-        "yield_pressure_Pa": 3e3,
-        "payload_kg": 35.6e-3,
-        "chamber_m3": 3.7e-3,
-        "inlet_m": 6e-3,
-    }
-    return Trial(**{**fields, **others})  # type: ignore[arg-type]
+    return LOADED.trial(condition="c", **others)
 
 
 def steady(of: Trial, speed_m_s: float = 2.0, share: float = 0.95, pressure: np.ndarray | None = None) -> AuditedMotion:

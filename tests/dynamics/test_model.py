@@ -13,7 +13,6 @@ from by_hand import BARE, LOADED, N
 from own_effect import NAME, write_effect
 
 from vinetrack import effects
-from vinetrack.core.records import Trial
 from vinetrack.dynamics import kernel as batch
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.kernel import kernel
@@ -74,22 +73,10 @@ def test_effects_of_size_zero_and_replaced_ones_do_not_act() -> None:
     assert by_name["pressure_drive"] == [True, True]
 
 
-TRIAL = Trial(
-    name="t",
-    diameter_m=0.024,
-    thickness_m=200e-6,
-    length_m=0.28,
-    pressure_Pa=28e3,
-    yield_pressure_Pa=3e3,
-    payload_kg=0.0356,
-    chamber_m3=1.5e-3,
-)
-
-
 def test_terms_along_a_motion_by_hand() -> None:
     """At y = 0.1 m and ẏ = 2 m/s, with B 6.44 and n 0.37, everything worked out on paper."""
     model = base_model().with_values({"eversion_damping.B": 6.44})
-    terms = evaluate(model, TRIAL, np.array([0.05]), np.array([0.1]), np.array([2.0]))
+    terms = evaluate(model, LOADED.trial(), np.array([0.05]), np.array([0.1]), np.array([2.0]))
     film = 1200 * math.pi * 0.024 * 200e-6
     mass = film * (0.28 - 0.1) + 0.0356
     area = math.pi * 0.012**2

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from by_hand import LOADED as HANGING
+from by_hand import N
 from scipy.integrate import solve_ivp
 from vine_reference import G, masses, reference
 
@@ -17,21 +20,15 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.dynamics.simulate import SimulationError, simulate, simulate_many
 from vinetrack.effects import catalogue
-from vinetrack.laboratory.tracks import CAPTURE_FPS, PAPER_B, PAPER_N, paper_damping, paper_payload
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.laboratory.tracks import CAPTURE_FPS, PAPER_B, PAPER_N
 
-VINE = Trial(
-    name="vine",
-    diameter_m=0.024,
-    thickness_m=200e-6,
-    length_m=0.28,
-    pressure_Pa=14e3,
-    yield_pressure_Pa=3e3,
-)
-LOADED = replace(VINE, name="loaded", payload_kg=0.0356)
+LOADED = HANGING.trial(pressure_Pa=14e3)
+VINE = replace(LOADED, payload_kg=0.0)
 WEIGHTLESS = {"thickness_m": 1e-9, "film_density_kg_m3": 1e-9}
 """A film so light that a payload is all that moves; what gas is in the body still counts as a floor, below 0.1 g."""
 
-PROTOCOL = [*paper_damping(1), *paper_payload(1)]
+PROTOCOL = Path(__file__).parents[2] / "data" / "paper"
 
 
 def with_damping(B: float, n: float = PAPER_N, model: Model | None = None) -> Model:
@@ -87,9 +84,11 @@ def test_linear_damping_relaxes_exponentially() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("trial", PROTOCOL[::5], ids=lambda trial: trial.name)
-def test_the_protocol_from_rest_to_a_millionth(trial: Trial) -> None:
-    check_against(trial, PAPER_B[round(trial.diameter_m / 6e-3)])
+@pytest.mark.parametrize("name", [*(f"R{scale}_" for scale in PAPER_B), "fig4_", "fig5_"])
+def test_the_protocol_from_rest_to_a_millionth(name: str) -> None:
+    conditions = [trial for trial in read_experiment(PROTOCOL).trials if re.fullmatch(f"{name}.*_1", trial.name)]
+    for trial in conditions[::5]:
+        check_against(trial, PAPER_B[round(trial.diameter_m / 6e-3)])
 
 
 @pytest.mark.parametrize("n", [0.2, 0.6, 1.0])
@@ -196,9 +195,7 @@ def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path
 
 # ---- a tail that cannot push ----
 
-A = math.pi * 24e-3**2 / 4
-LAMBDA = 1200 * math.pi * 24e-3 * 200e-6
-L, PAYLOAD, P_Y, B, N = 0.28, 35.6e-3, 3e3, 6.44, 0.37
+A, LAMBDA, L, PAYLOAD, P_Y, B = HANGING.A, HANGING.lam, HANGING.L, HANGING.payload, HANGING.P_y, HANGING.B
 MU = 0.5
 
 MODEL = base_model().with_values({"eversion_damping.B": B, "eversion_damping.n": N})
@@ -212,18 +209,7 @@ REFILLED = WITH_MORE.with_values({"supply_refill.tau": 0.5, "supply_refill.gamma
 
 
 def trial(P: float, **others: object) -> Trial:
-    fields: dict[str, object] = {
-        "name": "t",
-        "vine": "v",
-        "diameter_m": 24e-3,
-        "thickness_m": 200e-6,
-        "length_m": L,
-        "pressure_Pa": P,
-        "yield_pressure_Pa": P_Y,
-        "payload_kg": PAYLOAD,
-        "tail_slack": "free",
-    }
-    return Trial(**{**fields, **others})  # type: ignore[arg-type]
+    return HANGING.trial(**{"pressure_Pa": P, "tail_slack": "free", **others})
 
 
 @dataclass

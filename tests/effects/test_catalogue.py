@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,11 @@ from vinetrack.effects import (
     BASE_EFFECTS,
     Effect,
     State,
-    TrialInputs,
     catalogue,
     find_effect,
     load_effect,
 )
+from vinetrack.effects._own import _RIG, _STATE
 
 FOLDER = Path(effects.__file__).parent
 FILES = sorted(path for path in FOLDER.glob("*.py") if not path.stem.startswith("_"))
@@ -28,51 +29,9 @@ HOOKED = [(effect, hook) for effect in ALL for hook in effect.functions]
 each_effect = pytest.mark.parametrize("effect", ALL, ids=lambda effect: effect.name)
 each_hook = pytest.mark.parametrize(("effect", "hook"), HOOKED, ids=[f"{e.name}-{h}" for e, h in HOOKED])
 
-STATE = State(
-    time=0.03,
-    lead_position=0.11,
-    lead_velocity=2.5,
-    tail_position=0.22,
-    tail_velocity=5.0,
-    set_pressure=28e3,
-    pressure=26e3,
-    yield_pressure=3e3,
-    area=4.5e-4,
-    linear_density=0.018,
-    moving_mass=0.04,
-    damping_gain=1.1,
-    bend_angle=0.7,
-    tail_tension=1.3,
-    observed=0.108,
-)
-RIG = TrialInputs(
-    **{
-        **dict.fromkeys(TrialInputs._fields, 0.0),
-        "set_pressure": 28e3,
-        "yield_pressure": 3e3,
-        "diameter": 0.024,
-        "thickness": 2e-4,
-        "length": 0.28,
-        "area": 4.5e-4,
-        "linear_density": 0.018,
-        "mass_loss": 0.009,
-        "payload_mass": 0.0356,
-        "cos_angle": 1.0,
-        "travel_ratio": 2.0,
-        "ambient_pressure": 101_325.0,
-        "chamber_volume": 1.5e-3,
-        "inlet_area": 1e-4,
-        "least_mass": 1e-4,
-    }
-)
 
-
-def defaults(effect: Effect) -> list[float]:
-    return [parameter.default for parameter in effect.parameters]
-
-
-def ask(effect: Effect, hook: str, state: State = STATE, values: list[float] | None = None):
-    return effect.functions[hook](state, RIG, *(defaults(effect) if values is None else values))
+def ask(effect: Effect, hook: str, state: State) -> Any:
+    return effect.functions[hook](state, _RIG, *(parameter.default for parameter in effect.parameters))
 
 
 def test_the_folder_is_the_catalogue_with_the_base_first() -> None:
@@ -123,11 +82,11 @@ def test_parameters_have_symbol_unit_meaning_and_bounds_that_hold_the_default(ef
 @each_hook
 def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect: Effect, hook: str) -> None:
     factors = np.array([0.5, 1.0, 1.7])
-    rows = State(*(np.asarray(value * factors) for value in STATE))
+    rows = State(*(np.asarray(value * factors) for value in _STATE))
     found = np.broadcast_to(np.asarray(ask(effect, hook, rows)), factors.shape)
-    singly = [float(ask(effect, hook, State(*(float(value * f) for value in STATE)))) for f in factors]
+    singly = [float(ask(effect, hook, State(*(float(value * f) for value in _STATE)))) for f in factors]
     np.testing.assert_allclose(found, singly, rtol=1e-13)
-    rest = STATE._replace(time=0.0, lead_position=0.0, lead_velocity=0.0, tail_position=0.0, tail_velocity=0.0)
+    rest = _STATE._replace(time=0.0, lead_position=0.0, lead_velocity=0.0, tail_position=0.0, tail_velocity=0.0)
     assert np.isfinite(float(ask(effect, hook, rest)))
 
 

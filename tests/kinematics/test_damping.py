@@ -41,7 +41,6 @@ from vinetrack.laboratory.tracks import (
     PAPER_B,
     PAPER_N,
     GroundTruth,
-    damping_pressures_kPa,
     damping_values,
     grow,
     isometric_vine,
@@ -369,8 +368,8 @@ def running_down(seed: int) -> list[tuple[Trial, Track]]:
     """Two small vines on a chamber of 0.25 L: at the lowest pressure a third of it is lost along the way."""
     trials = [
         replace(trial, chamber_m3=2.5e-4)
-        for scale in (1, 2)
-        for trial in of_vine(isometric_vine(scale), damping_pressures_kPa(scale, 6), 3, prefix=f"R{scale}_")
+        for scale, pressures_kPa in ((1, (15.1, 22.8, 30.5, 38.3, 46, 53.7)), (2, (12.7, 18.5, 24.3, 30.1, 35.9, 41.7)))
+        for trial in of_vine(isometric_vine(scale), pressures_kPa, 3, prefix=f"R{scale}_")
     ]
     trials = list(with_names(trials))
     nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=seed)

@@ -16,15 +16,12 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory import __main__ as command
 from vinetrack.laboratory.filming import make_filming, recording_experiment
 from vinetrack.laboratory.tracks import (
-    PAPER_B,
     GroundTruth,
     VirtualTrial,
     campaign,
-    damping_pressures_kPa,
     damping_values,
     grow,
     isometric_vine,
-    paper_damping,
     read_ground_truth,
     write_experiment,
     write_tracks,
@@ -47,32 +44,6 @@ EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
 
 def same(one: VirtualTrial, other: VirtualTrial) -> bool:
     return np.array_equal(one.track.lead_position_m, other.track.lead_position_m) and one.release_s == other.release_s
-
-
-# ---- campaigns ----
-
-
-def test_the_damping_protocol_is_that_of_the_paper() -> None:
-    trials = paper_damping()
-    assert len(trials) == 4 * 10 * 4
-    assert len({trial.name for trial in trials}) == 160
-    assert len({trial.vine for trial in trials}) == 4
-    assert len({trial.condition for trial in trials}) == 40
-    assert {trial.payload_kg for trial in trials} == {0.0}
-    largest = [trial for trial in trials if trial.diameter_m == pytest.approx(0.024)]
-    assert {trial.thickness_m for trial in largest} == {200e-6}
-    assert {round(trial.length_m, 9) for trial in largest} == {0.28}
-
-
-@pytest.mark.parametrize("scale", PAPER_B)
-def test_pressures_span_a_quarter_metre_a_second_to_where_plateaus_end(scale: int) -> None:
-    pressures_kPa = damping_pressures_kPa(scale)
-    assert pressures_kPa.shape == (10,)
-    assert (np.diff(pressures_kPa) > 0).all()
-    force = (pressures_kPa - 3.0) * 1e3 * math.pi * (6e-3 * scale) ** 2 / 4
-    speed = (force / PAPER_B[scale]) ** (1 / 0.37)
-    assert speed[0] == pytest.approx(0.25, rel=0.05)
-    assert 3 < speed[-1] < 20
 
 
 # ---- seeds ----

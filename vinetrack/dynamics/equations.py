@@ -19,6 +19,7 @@ from numba import njit, types
 from numba.core.imputils import lower_constant, lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr, models, register_model, typeof_impl
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 
@@ -40,6 +41,23 @@ class TrialArrays(NamedTuple):
     trace_time: Floats  #: times of a measured pressure since release, s, shape (n_samples,); empty without one
     trace_pressure: Floats  #: gauge pressure there, Pa
     bends: Floats  #: rows of start, arc and radius, m, shape (n_bends, 3)
+
+
+class BatchArrays(NamedTuple):
+    """Many trials one behind the other: what `TrialArrays` holds of each, and what its integration needs besides."""
+
+    starts: NDArray[np.int64]  #: trial i has the rows `starts[i]:starts[i + 1]` of times and results
+    times: Floats  #: true times since release, s, shape (n_times,)
+    on: NDArray[np.bool_]  #: shape (n_trials, n_effects)
+    inputs: Floats
+    thetas: Floats
+    trace_starts: NDArray[np.int64]
+    trace_time: Floats
+    trace_pressure: Floats
+    bend_starts: NDArray[np.int64]
+    bends: Floats
+    breakpoints: Floats  #: tail travel at which a force breaks, increasing, m, shape (n_trials, n_breakpoints)
+    stops: Floats  #: tail travel at the end of growth, m, shape (n_trials,); infinite if there is none
 
 
 RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4  # Status of a trajectory

@@ -13,7 +13,6 @@ moving (`_cut_at_breakpoint`, `radau_step`, `_judge_step`, `_next_step_size`) or
 
 from __future__ import annotations
 
-import inspect
 from typing import NamedTuple
 
 import numpy as np
@@ -71,8 +70,14 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 end_time = end_time if status == RUNNING else point.time
                 return status, end_time, end_speed, n_steps, slack_time
             phase = at_rest if point.v <= 0 else moving
-            point, speed_scale, h = _resume_taut(equations, trial, point, speed_scale)
-            previous_stages = NO_STAGES
+            time, x, v, _acceleration, chamber = point
+            acceleration, _rate = _rates(equations, time, x, v, chamber, trial)
+            point, speed_scale, previous_stages = (
+                Point(time, x, v, acceleration, chamber),
+                max(speed_scale, v),
+                NO_STAGES,
+            )
+            h = 1e-2 * max(v, 1e-3 * speed_scale) / max(abs(acceleration), 1e-9)
         if phase == at_rest:
             if _rest_acceleration(equations, point.time, point.x, point.chamber, trial) <= 0:
                 start, chamber = _wait_for_drive(equations, trial, point, last_time)
@@ -90,9 +95,11 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
         while next_breakpoint < breakpoints.size and point.x >= breakpoints[next_breakpoint]:
             next_breakpoint += 1
         breakpoint_x = breakpoints[next_breakpoint] if next_breakpoint < breakpoints.size else stop
-        full_h = _cut_at_breakpoint(h, point, min(breakpoint_x, stop))
+        full_h = h = _cut_at_breakpoint(h, point, min(breakpoint_x, stop))
+        # No step across a sample of a measured pressure is accepted.
         sample = next_slope_change(sample, point.time, trial)
-        h = _cut_at_sample(full_h, point.time, sample, trial)
+        if sample < trial.trace_time.size and point.time + h > trial.trace_time[sample]:
+            h = trial.trace_time[sample] - point.time
         converged, error, end, stages = radau_step(
             equations, trial, point, starting_values(point, h, previous_stages), speed_scale, rtol
         )
@@ -132,7 +139,9 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
         if row == count:
             return RUNNING, end_time, end.v, n_steps, slack_time
         if phase == slack:
-            point = _point_within_step(fraction, h, point, end)
+            x, v, a = quintic(fraction, h, point, end)
+            chamber = point.chamber + fraction * (end.chamber - point.chamber)
+            point = Point(point.time + fraction * h, x, v, a, chamber)
             continue
         # A drive that rises from zero may take the speed far beyond the estimate at the start.
         point, previous_stages, speed_scale = end, stages, max(speed_scale, end.v)
@@ -140,57 +149,33 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
 
 
 @merged
-def integrate_trials(
-    equations,
-    starts,
-    times,
-    on,
-    inputs,
-    thetas,
-    trace_starts,
-    trace_time,
-    trace_pressure,
-    bend_starts,
-    bends,
-    breakpoints,
-    stops,
-    rtol,
-    out,
-    ends,
-    work,
-    means,
-):
-    """Integrate many trials, and apply the readout of the camera: `_integrate`, `read_by_rows`, `average_over`."""
-    for i in range(starts.size - 1):
-        trace = slice(trace_starts[i], trace_starts[i + 1])
+def integrate_trials(equations, batch, first, last, rtol, out, ends, work, means):
+    """Integrate the trials from `first` to `last` − 1 of a `BatchArrays`, and apply the camera's readout: `_integrate`,
+    `read_by_rows`, `average_over`. Shapes: out (n_times, 4); ends (n_trials, 5).
+    """
+    for i in range(first, last):
+        trace = slice(batch.trace_starts[i], batch.trace_starts[i + 1])
+        bends = batch.bends[batch.bend_starts[i] : batch.bend_starts[i + 1]]
         trial = TrialArrays(
-            on[i],
-            inputs[i],
-            thetas[i],
-            trace_time[trace],
-            trace_pressure[trace],
-            bends[bend_starts[i] : bend_starts[i + 1]],
+            batch.on[i], batch.inputs[i], batch.thetas[i], batch.trace_time[trace], batch.trace_pressure[trace], bends
         )
-        rows = slice(starts[i], starts[i + 1])
+        rows = slice(batch.starts[i], batch.starts[i + 1])
+        times = batch.times[rows]
         status, end_time, end_speed, n_steps, slack_time = _integrate(
-            equations, trial, times[rows], breakpoints[i], stops[i], rtol, out[rows], work
+            equations, trial, times, batch.breakpoints[i], batch.stops[i], rtol, out[rows], work
         )
-        end = Point(end_time if status == ENDED else np.inf, stops[i], end_speed, 0.0, 0.0)
+        end = Point(end_time if status == ENDED else np.inf, batch.stops[i], end_speed, 0.0, 0.0)
         row_delay = equations.row_delay(trial)
         if row_delay != 0:
-            read_by_rows(times[rows], out[rows], inputs[i, RATIO], end, row_delay)
+            read_by_rows(times, out[rows], trial.inputs[RATIO], end, row_delay)
         averaging_time_squared = equations.averaged_over(trial)
         if averaging_time_squared > 0:
-            average_over(times[rows], out[rows], means, inputs[i, RATIO], end, averaging_time_squared)
+            average_over(times, out[rows], means, trial.inputs[RATIO], end, averaging_time_squared)
         ends[i, 0] = status
         ends[i, 1] = end_time
         ends[i, 2] = end_speed
         ends[i, 3] = n_steps
         ends[i, 4] = slack_time
-
-
-# Arguments of `integrate_trials` after the equations, in order
-BATCH = tuple(inspect.signature(getattr(integrate_trials, "py_func", integrate_trials)).parameters)[1:]
 
 
 @compiled
@@ -242,13 +227,6 @@ def _write_moving(equations, trial, times, row, fraction, h, start, end, out):
 
 
 @inlined
-def _point_within_step(fraction, h, start, end):
-    """The vine at a fraction of a step."""
-    x, v, a = quintic(fraction, h, start, end)
-    return Point(start.time + fraction * h, x, v, a, start.chamber + fraction * (end.chamber - start.chamber))
-
-
-@inlined
 def _fraction_at(x_wanted, h, start, end):
     """Fraction of a step at which x reaches a position, by bisection."""
     low, high = 0.0, 1.0
@@ -268,14 +246,6 @@ def _cut_at_breakpoint(h, point, x_limit):
     distance = x_limit - point.x
     if point.v > 0 and h * point.v > 1.05 * distance:
         return 1.02 * distance / point.v
-    return h
-
-
-@inlined
-def _cut_at_sample(h, time, sample, trial):
-    """The step size, reduced to end at the next sample of a measured pressure, as no step across it is accepted."""
-    if sample < trial.trace_time.size and time + h > trial.trace_time[sample]:
-        return trial.trace_time[sample] - time
     return h
 
 
@@ -315,15 +285,6 @@ def _start_from_rest(equations, trial, point, until, stop):
     travel = min(stop - point.x, 0.5 * acceleration * (until - point.time) ** 2 + 1e-9)
     scale = _typical_speed(equations, trial, point.time, point.x, point.chamber, acceleration, travel)
     return Point(point.time, point.x, 0.0, acceleration, point.chamber), scale, 1e-4 * scale / acceleration
-
-
-@inlined
-def _resume_taut(equations, trial, point, scale):
-    """After a slack phase: the point with its acceleration, the speed to be expected, and the first step size."""
-    time, x, v, _acceleration, chamber = point
-    acceleration, _rate = _rates(equations, time, x, v, chamber, trial)
-    scale = max(scale, v)
-    return Point(time, x, v, acceleration, chamber), scale, 1e-2 * max(v, 1e-3 * scale) / max(abs(acceleration), 1e-9)
 
 
 @compiled
@@ -630,15 +591,9 @@ def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
             state = _slack_at(fraction, h, s, end, k)
             return status, row, Point(time + fraction * h, r * state.y, max(state.v, 0.0), 0.0, state.chamber), u_end
         time += h
-        s = _resting_on_tip(end, stop / r + end.y, u_end / r)
+        s, tip = end, stop / r + end.y
+        if s.x > tip:  # a payload that has reached the tip rests there
+            s = SlackState(tip, min(s.v, u_end / r), s.y, s.chamber)
         u = _slack_rates(equations, trial, time, s, u_end, u_end > 0, k[0])
         h *= min(5.0, 0.9 * (allowed / max(error, 1e-6 * allowed)) ** 0.2)
     return TOO_HARD, row, Point(time, s.x, s.v, 0.0, s.chamber), u
-
-
-@compiled
-def _resting_on_tip(s, tip, tip_velocity):
-    """The state with a payload that has reached the tip resting there."""
-    if s.x > tip:
-        return SlackState(tip, min(s.v, tip_velocity), s.y, s.chamber)
-    return s

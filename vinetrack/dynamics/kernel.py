@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from vinetrack.core import units
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import available_cores, thread_pool
-from vinetrack.dynamics.integrator import BATCH
+from vinetrack.dynamics.equations import BatchArrays
 from vinetrack.dynamics.model import Model, effects_on, hosted, shared_host
 from vinetrack.effects import Effect, State, TrialInputs, effect_sources
 
@@ -144,7 +144,7 @@ def {name}({arguments}):
             function("free_fall", "time, y, ydot, x, v, chamber, trial", "", terms, "return tail / mass"),
         ]
         fields += ", slack_fraction, slack_at_rest, follow_slack, tip_tension, free_fall"
-    batch, loaded = ", ".join(BATCH), "\n".join(loads.values())
+    loaded = "\n".join(loads.values())
     return f"""\"""Machine-made: a sum of effects, for the integrator of vinetrack.dynamics.\"""
 
 from numba import njit
@@ -160,8 +160,8 @@ EQUATIONS = Equations(__name__, {fields})
 
 # Only the outermost function is called from Python; what it calls is compiled into it, and kept with it.
 @njit(nogil=True, error_model="numpy", _nrt=False, no_cfunc_wrapper=True, cache=True)
-def integrate_many({batch}):
-    integrate_trials(EQUATIONS, {batch})
+def integrate_many(batch, first, last, rtol, out, ends, work, means):
+    integrate_trials(EQUATIONS, batch, first, last, rtol, out, ends, work, means)
 """
 
 
@@ -232,62 +232,38 @@ Trace = tuple[Floats, Floats]  # Times since release, s, and gauge pressures, Pa
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials laid out for the compiled kernel: prepared once, run as often as needed. Trial i has rows
-    `starts[i]:starts[i + 1]` of the result; `stamps`, shape (n_times,), are its times since release on the camera's
-    clock, `times` the true ones.
+    """Trials laid out for the compiled kernel: prepared once, run as often as needed. `stamps`, shape (n_times,), are
+    times since release on the camera's clock, `arrays.times` the true ones.
     """
 
     integrate_many: Callable[..., None]
     stamps: Floats
-    starts: NDArray[np.int64]
-    times: Floats
-    on: NDArray[np.bool_]
-    inputs: Floats
-    thetas: Floats
-    trace_starts: NDArray[np.int64]
-    trace_time: Floats
-    trace_pressure: Floats
-    bend_starts: NDArray[np.int64]
-    bends: Floats
-    breakpoints: Floats
-    stops: Floats
+    arrays: BatchArrays
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """Start of each trial's rows, and the end of the last."""
+        return self.arrays.starts
 
     def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
-        """Integrate every trial. Returns out, ends. Shape (n_times, 4)."""
+        """Integrate every trial. Returns out, ends. Shapes (n_times, 4), (n_trials, 5)."""
         count = self.starts.size - 1
-        out, ends = np.empty((self.times.size, 4)), np.empty((count, 5))
+        out, ends = np.empty((self.stamps.size, 4)), np.empty((count, 5))
         # For fewer than 64 trials another thread costs more than it saves.
         threads = threads or max(1, min(available_cores(), count // 64))
+        longest = int(np.diff(self.starts).max(initial=0))
+
+        def integrate(first: int, last: int) -> None:
+            work, means = np.empty((7, 4)), np.empty(longest)
+            self.integrate_many(self.arrays, first, last, relative_tolerance, out, ends, work, means)
+
         edges = np.linspace(0, count, threads + 1).astype(int).tolist()
-        shared = relative_tolerance, out, ends
-        (begin, end), *others = itertools.pairwise(edges)
-        shares = [thread_pool(threads).submit(self._part, a, b, *shared) for a, b in others]
-        self._part(begin, end, *shared)
+        own, *others = itertools.pairwise(edges)
+        shares = [thread_pool(threads).submit(integrate, *part) for part in others]
+        integrate(*own)
         for share in shares:
             share.result()
         return out, ends
-
-    def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
-        """Integrate trials a to b, each into its own rows of `out` and `ends`."""
-        self.integrate_many(
-            self.starts[a : b + 1],
-            self.times,
-            self.on[a:b],
-            self.inputs[a:b],
-            self.thetas[a:b],
-            self.trace_starts[a : b + 1],
-            self.trace_time,
-            self.trace_pressure,
-            self.bend_starts[a : b + 1],
-            self.bends,
-            self.breakpoints[a:b],
-            self.stops[a:b],
-            relative_tolerance,
-            out,
-            ends[a:b],
-            np.empty((7, 4)),
-            np.empty(int(np.diff(self.starts[a : b + 1]).max(initial=0))),
-        )
 
 
 def lay_out(
@@ -319,9 +295,7 @@ def lay_out(
     times = _true_times(model, inputs, thetas, on, stamps, starts)
     traces = _true_traces(model, inputs, thetas, on, traces) if traces is not None else [None] * count
     given = [trace for trace in traces if trace is not None]
-    return Batch(
-        integrate_many=kernel(model.effects, tail_free).integrate_many,
-        stamps=stamps,
+    arrays = BatchArrays(
         starts=starts,
         times=times,
         on=on,
@@ -335,6 +309,7 @@ def lay_out(
         breakpoints=breakpoints,
         stops=stops,
     )
+    return Batch(kernel(model.effects, tail_free).integrate_many, stamps, arrays)
 
 
 def starts_of(parts: Sequence[Sized]) -> NDArray[np.int64]:

@@ -168,7 +168,7 @@ class Motions:
             averaged[:, OBSERVED] = rows[average.place, OBSERVED] @ average.weights
             out.append(averaged)
             stamps.append(self.batch.stamps[first:last][middle])
-            times.append(self.batch.times[first:last][middle])
+            times.append(self.batch.arrays.times[first:last][middle])
         batch = replace(self.batch, stamps=np.concatenate(stamps), times=np.concatenate(times), starts=starts_of(times))
         return replace(self, batch=batch, out=np.concatenate(out))
 

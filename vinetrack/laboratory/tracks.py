@@ -23,7 +23,8 @@ from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.audit import pressure_along
 from vinetrack.dynamics.model import Model, Value, make_model
 from vinetrack.dynamics.simulate import simulate_many
-from vinetrack.experiment.schema import with_names
+from vinetrack.experiment.schema import COLUMNS
+from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
 from vinetrack.tracks.position_noise import ar1_noise
 
 BASE = BASE_EFFECTS
@@ -150,31 +151,23 @@ def write_tracks(grown: Sequence[VirtualTrial], folder: Path) -> None:
 def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str = "") -> None:
     """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth."""
     write_tracks(grown, folder / "tracks")
-    trials = [one.stated for one in grown]
-    sheet = {
-        "trial": [trial.name for trial in trials],
-        "track": [f"tracks/{trial.name}.csv" for trial in trials],
-        "capture_fps": [trial.capture_fps for trial in trials],
-        "diameter_mm": [round(trial.diameter_m * 1e3, 6) for trial in trials],
-        "thickness_um": [round(trial.thickness_m * 1e6, 6) for trial in trials],
-        "length_mm": [round(trial.length_m * 1e3, 6) for trial in trials],
-        "pressure_kPa": [round(trial.pressure_Pa / 1e3, 6) for trial in trials],
-        "yield_pressure_kPa": [round(trial.yield_pressure_Pa / 1e3, 6) for trial in trials],
-        "payload_g": [round(trial.payload_kg * 1e3, 6) for trial in trials],
-    }
-    write_csv(folder / "trials.csv", pd.DataFrame(sheet))
+    columns = ("capture_fps", *REQUIRED_COLUMNS, "payload_g")
+    sheet = [
+        {"trial": one.stated.name, "track": f"tracks/{one.stated.name}.csv"}
+        | {name: round(COLUMNS[name].of_trial(one.stated), 6) for name in columns}
+        for one in grown
+    ]
+    write_csv(folder / SHEET, pd.DataFrame(sheet))
     if settings:
         write_text(folder / "experiment.yaml", settings)
 
 
 # ------------------------------------------------------------------------------
-# Campaigns: vines, pressures, payloads and number of replicates. Numbers that the paper does not give (lengths other
-# than 280 and 400 mm, the pressures themselves, payloads other than 35.6 g) are stated here.
+# Campaigns: vines, pressures, payloads and number of replicates. The published ones are in `data/paper`.
 
 CAPTURE_FPS = published.CAPTURE_FPS
 PAPER_B = published.DAMPING_B
 PAPER_N = published.EXPONENT
-PAYLOADS_G = (10.0, 20.0, published.PAYLOAD_G, 50.0)
 
 
 @dataclass(frozen=True)
@@ -216,48 +209,6 @@ def campaign(
         for pressure_kPa in pressures_kPa
         for k in range(replicates)
     ]
-
-
-def damping_pressures_kPa(scale: int, count: int = 10) -> Floats:
-    """Return pressures of the damping protocol for one scale, kPa, shape (count,), rounded to 0.1: the paper raises the
-    pressure as long as speeds get steady within the length of the vine.
-    """
-    vine, B = isometric_vine(scale).trial("", 1.0), PAPER_B[scale]
-    film_kg = vine.linear_density_kg_m * vine.length_m
-    slowest = 0.25
-    # x/x_relax = 2L / (v τ) with τ = m / (½ n B v^(n−1)), solved for v at 3.2.
-    fastest = (vine.length_m * PAPER_N * B / (3.2 * film_kg)) ** (1 / (2 - PAPER_N))
-    drive_Pa = B * np.array([slowest, fastest]) ** PAPER_N / vine.area_m2
-    lowest, highest = (vine.yield_pressure_Pa + drive_Pa).tolist()
-    return np.asarray(np.round(np.linspace(lowest, highest, count) / 1e3, 1))
-
-
-def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
-    """The protocol of the damping fit: R = 1…4, `count` pressures, `replicates` trials, no payload."""
-    trials = [
-        trial
-        for scale in PAPER_B
-        for trial in campaign(
-            isometric_vine(scale), damping_pressures_kPa(scale, count), replicates, prefix=f"R{scale}_"
-        )
-    ]
-    return list(with_names(trials))
-
-
-def paper_payload(replicates: int = 4) -> list[Trial]:
-    """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads."""
-    payload = published.PAYLOAD_G
-    trials = campaign(isometric_vine(4), published.POSITION_RMS_CM, replicates, payload_g=payload, prefix="fig4_")
-    thinner = replace(isometric_vine(4), thickness_um=published.FINAL_SPEED_THICKNESS_UM)
-    for payload_g in PAYLOADS_G:
-        trials += campaign(
-            thinner,
-            published.FINAL_SPEED_RMS_M_S,
-            replicates,
-            payload_g=payload_g,
-            prefix=f"fig5_{payload_g:g}g_".replace(".", "p"),
-        )
-    return list(with_names(trials))
 
 
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
