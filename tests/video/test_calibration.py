@@ -8,9 +8,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from plain_scene import write_video
 
 from vinetrack.experiment.settings import Charuco, Checkerboard, TwoPoints
-from vinetrack.laboratory.filming import render_calibration_clip, render_recording, render_target
+from vinetrack.laboratory.filming import render_recording, render_target
 from vinetrack.laboratory.scene import Camera, Target, Tube, preset
 from vinetrack.video.calibration import (
     CalibrationError,
@@ -176,9 +177,10 @@ def test_a_small_target_states_a_larger_error():
 
 @pytest.mark.slow
 def test_moved_target_shows_the_plane_first_and_the_lens_throughout(tmp_path):
-    moves = ({}, *({"centre_m": (x, 0.0), "tilt_y_deg": tilt} for x, tilt in ((0.03, 5), (-0.04, -10), (0.06, 3))))
-    scene = replace(DEMO, camera=CAMERA)
-    render_calibration_clip(BOARD, scene, 4, tmp_path / "board.avi", seed=2002, moves=moves)
+    moved = [picture(seed=2002)]
+    for k, (x_m, tilt_deg) in enumerate(((0.03, 5), (-0.04, -10), (0.06, 3))):
+        moved.append(picture(replace(BOARD, centre_m=(x_m, 0.0)), replace(CAMERA, tilt_y_deg=tilt_deg), seed=2003 + k))
+    write_video(tmp_path / "board.avi", np.stack(moved))
     found = calibrate(charuco(image="board.avi"), tmp_path, 960, 320)
     error, stated = scale_error(found)
     assert abs(error) < min(1e-3, 3 * stated)

@@ -16,25 +16,27 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-HOOKS = (
-    "true_time",
-    "trace_time",
-    "film_gain",
-    "gauge",
-    "yield_gauge",
-    "area",
-    "chamber_rate",
-    "pressure",
-    "damping_gain",
-    "added_mass",
-    "tip_force",
-    "tail_force",
-    "rest_force",
-    "observed_position",
-    "row_delay",
-    "averaged_over",
-)
-"""Quantities that an effect may change, in the order in which the model evaluates them: see `Effect`."""
+HOOKS: Mapping[str, str | float] = {
+    "true_time": "time",
+    "trace_time": "time",
+    "film_gain": 1.0,
+    "gauge": "pressure",
+    "yield_gauge": "yield_pressure",
+    "area": "area",
+    "chamber_rate": 0.0,
+    "pressure": "pressure",
+    "damping_gain": "damping_gain",
+    "added_mass": 0.0,
+    "tip_force": 0.0,
+    "tail_force": 0.0,
+    "rest_force": 0.0,
+    "observed_position": "observed",
+    "row_delay": 0.0,
+    "averaged_over": 0.0,
+}
+"""Quantities that an effect may change, in the order in which the model evaluates them (see `Effect`), each with what
+its function returns where the effect vanishes: a field of the state, or a number.
+"""
 
 KINDS = ("base", "physical", "measurement")
 

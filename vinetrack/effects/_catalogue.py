@@ -109,9 +109,9 @@ def _load_module(path: Path) -> ModuleType:
     try:
         # The text itself is executed: cached bytecode could be that of an older version saved within the same second.
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
-    except Exception as error:
+    except Exception:
         del sys.modules[name]
-        raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
+        raise
     finally:
         if before is not None:  # compiled forms refer to the functions of the file that was loaded first
             sys.modules[name] = before
@@ -161,26 +161,8 @@ def effect_sources(path: Path) -> list[Path]:
 
 
 def load_effect(path: Path | str) -> Effect:
-    """Read one effect from its file; its name is the file's.
-
-    Parameters
-    ----------
-    path : a Python file like those of the catalogue.
-
-    Returns
-    -------
-    the effect.
-
-    Raises
-    ------
-    EffectError
-        If the file does not follow the contract of `Effect`; the message names what is missing.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.load_effect(vt.effects.air_drag.path).name
-    'air_drag'
+    """Read one effect from its file, whose name it has; an EffectError says where the file does not follow the contract
+    of `Effect`.
     """
     path = Path(path)
     try:
@@ -196,7 +178,7 @@ def load_effect(path: Path | str) -> Effect:
         faults = list(_faults(effect))
     except EffectError:
         raise
-    except (TypeError, ValueError, AttributeError) as error:
+    except Exception as error:
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
     if faults:
         raise EffectError(f"{path}: " + "; ".join(faults) + ".")
@@ -271,42 +253,15 @@ def _parameter_faults(parameter: Parameter) -> Iterable[str]:
 
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
-    """Return every effect of vinetrack by name: base effects first, then alphabetical.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.catalogue()["air_drag"].kind
-    'physical'
-    """
+    """Return every effect of vinetrack by name: base effects first, then alphabetical."""
     paths = {path.stem: path for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")}
     names = [*BASE_EFFECTS, *sorted(set(paths) - set(BASE_EFFECTS))]
     return MappingProxyType({name: load_effect(paths[name]) for name in names})
 
 
 def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> Effect:
-    """Return the effect of this name, from the user's own effects or else from the catalogue.
-
-    Parameters
-    ----------
-    name : of an effect.
-    user_effects : effects by name, from `own_effects`.
-
-    Returns
-    -------
-    the effect.
-
-    Raises
-    ------
-    EffectError
-        If there is none; the message suggests the nearest name.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.find_effect("air_drg")
-    Traceback (most recent call last):
-    vinetrack.effects._catalogue.EffectError: ...
+    """Return the effect of this name, from the user's own effects or else from the catalogue; an EffectError suggests
+    the nearest name.
     """
     known = {**catalogue(), **(user_effects or {})}
     if name in known:

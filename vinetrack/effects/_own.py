@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from vinetrack.effects._base import Effect, State, TrialInputs, Worked
+from vinetrack.effects._base import HOOKS, Effect, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import EffectError, load_effect
 
 # A vine in motion, in which every effect can act
@@ -24,48 +24,10 @@ _RIG = TrialInputs(
     tail_on_reel=0.0, bend_count=1.0, bend_total=1.0, as_printed=0.0, tail_free=0.0,
 )  # fmt: skip
 
-# Values that functions must return in the state above where their effect vanishes
-_UNCHANGED = {
-    "true_time": _STATE.time,
-    "trace_time": _STATE.time,
-    "film_gain": 1.0,
-    "gauge": _STATE.pressure,
-    "yield_gauge": _STATE.yield_pressure,
-    "area": _STATE.area,
-    "chamber_rate": 0.0,
-    "pressure": _STATE.pressure,
-    "damping_gain": _STATE.damping_gain,
-    "added_mass": 0.0,
-    "tip_force": 0.0,
-    "tail_force": 0.0,
-    "rest_force": 0.0,
-    "observed_position": _STATE.observed,
-    "row_delay": 0.0,
-    "averaged_over": 0.0,
-}
-
 
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
-    """Read and check a user's effects.
-
-    Parameters
-    ----------
-    paths : files, one for each effect.
-
-    Returns
-    -------
-    effects by name.
-
-    Raises
-    ------
-    EffectError
-        If a file is not an effect, two have the same name, or one fails its checks; one sentence.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> dict(vt.effects.own_effects([]))
-    {}
+    """Read and check a user's effects; returns them by name. An EffectError says in one sentence where a file is not an
+    effect, two have the same name, or one fails its checks.
     """
     effects: dict[str, Effect] = {}
     for path in map(Path, paths):
@@ -90,9 +52,10 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
     if effect.parameters:
         for hook, function in effect.functions.items():
             value = float(function(_STATE, _RIG, *effect.zero))
-            if not math.isclose(value, _UNCHANGED[hook], rel_tol=1e-9, abs_tol=1e-12):
+            unchanged = getattr(_STATE, field) if isinstance(field := HOOKS[hook], str) else field
+            if not math.isclose(value, unchanged, rel_tol=1e-9, abs_tol=1e-12):
                 zero = ", ".join(f"{p.name} = {p.zero:g}" for p in effect.parameters)
-                yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({_UNCHANGED[hook]:g})"
+                yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({unchanged:g})"
 
 
 def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:

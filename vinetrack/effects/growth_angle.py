@@ -46,16 +46,9 @@ def tail_force(s, rig, f):
 WORKED = (
     Worked(
         "tail_force",
-        0.34924,
-        "35.6 g × 9.81 × (1 − 0): stated level, hangs",
+        0.069847,
+        "35.6 g × 9.81 × (0.8 − 0.6): stated 53° from straight down, 37° in truth",
         state={"moving_mass": 35.6e-3},
-        rig={"cos_angle": 0.0},
-    ),
-    Worked(
-        "tail_force",
-        -0.34924,
-        "35.6 g × 9.81 × (0 − 1): stated straight down, level",
-        state={"moving_mass": 35.6e-3},
-        rig={"cos_angle": 1.0},
+        rig={"cos_angle": 0.6},
     ),
 )

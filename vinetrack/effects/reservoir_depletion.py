@@ -49,14 +49,6 @@ def pressure(s, rig, gamma):
 WORKED = (
     Worked(
         "pressure",
-        23.72e3,
-        "129325 × 3.7/(3.7 + 0.12667) − 101325: 15 % below 28 kPa",
-        state={"pressure": 28e3, "area": 4.5239e-4, "lead_position": 0.28},
-        rig={"chamber_volume": 3.7e-3, "ambient_pressure": 101_325.0},
-        parameters={"gamma": 1.0},
-    ),
-    Worked(
-        "pressure",
         2.013e3,
         "108325 × (3.7/3.82667)^1.4 − 101325: 71 % below 7 kPa",
         state={"pressure": 7e3, "area": 4.5239e-4, "lead_position": 0.28},

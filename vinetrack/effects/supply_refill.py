@@ -58,12 +58,4 @@ WORKED = (
         state={"pressure": 28e3, "set_pressure": 30e3, "area": 4.5239e-4, "lead_position": 0.1, "lead_velocity": 2.0},
         rig={"chamber_volume": 3.7e-3, "ambient_pressure": 101_325.0},
     ),
-    Worked(
-        "chamber_rate",
-        -31.24e3,
-        "shut, τ_s = 10⁴ s, and slow, γ = 1: 0.2 − 129325 × 9.0478e-4/3.745239e-3 = 0.2 − 31242",
-        state={"pressure": 28e3, "set_pressure": 30e3, "area": 4.5239e-4, "lead_position": 0.1, "lead_velocity": 2.0},
-        rig={"chamber_volume": 3.7e-3, "ambient_pressure": 101_325.0},
-        parameters={"tau": 1e4, "gamma": 1.0},
-    ),
 )

@@ -55,12 +55,4 @@ WORKED = (
         state={"observed": 0.1, "lead_position": 0.1, "tail_tension": 5.655, "pressure": 28e3, "area": 4.5239e-4},
         rig={"diameter": 24e-3, "thickness": 200e-6, "length": 0.28, "travel_ratio": 2.0},
     ),
-    Worked(
-        "observed_position",
-        0.1021,
-        "at release: nothing has everted yet, the tail's strain alone",
-        rel=1e-5,
-        state={"observed": 0.1, "lead_position": 0.0, "tail_tension": 5.655, "pressure": 28e3, "area": 4.5239e-4},
-        rig={"diameter": 24e-3, "thickness": 200e-6, "length": 0.28, "travel_ratio": 2.0},
-    ),
 )

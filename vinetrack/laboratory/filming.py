@@ -8,7 +8,7 @@ target. Files are H.264 as in cameras, FFV1 without loss, or a folder of PNG pic
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -43,43 +43,36 @@ def render_recording(
     exposure_s: float | None = None,
     seed: int = 0,
 ) -> Truth:
-    """Film `motion` in `scene` and write the recording to `out_path`: with an ending a film with the scene's codec,
-    without one a folder of numbered PNG pictures.
+    """Film `motion` in `scene` and write the recording to `out_path`, completely or not at all: with an ending a film
+    with the scene's codec, without one a folder of numbered PNG pictures.
     """
     renderer = FrameRenderer(
         scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=exposure_s, seed=seed
     )
-    write_recording(renderer.frame, n_frames, scene, Path(out_path))
+    out_path.parent.mkdir(parents=True, exist_ok=True)
+    draft = out_path.with_name("part-" + out_path.name)
+    (_write_video if out_path.suffix else _write_pictures)(renderer, draft)
+    if out_path.is_dir():
+        shutil.rmtree(out_path)
+    draft.replace(out_path)
     return renderer.truth(np.arange(n_frames))
 
 
-def write_recording(frame: Callable[..., Frame], n_frames: int, scene: Scene, path: Path) -> None:
-    """Write `n_frames` frames of `frame(index, low=…, span=…)`, completely or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name("part-" + path.name)
-    if path.suffix:
-        _write_video(frame, n_frames, scene, draft)
-    else:
-        _write_pictures(frame, n_frames, draft)
-    if path.is_dir():
-        shutil.rmtree(path)
-    draft.replace(path)
-
-
-def _write_pictures(frame: Callable[..., Frame], n_frames: int, folder: Path) -> None:
+def _write_pictures(renderer: FrameRenderer, folder: Path) -> None:
     import cv2
 
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    for index in range(n_frames):
+    for index in range(renderer.n_frames):
         path = folder / f"frame_{index:06d}.png"
-        if not cv2.imwrite(str(path), frame(index), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        if not cv2.imwrite(str(path), renderer.frame(index), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise OSError(f"{path}: the picture could not be written; is the disk full?")
 
 
-def _write_video(frame: Callable[..., Frame], n_frames: int, scene: Scene, path: Path) -> None:
+def _write_video(renderer: FrameRenderer, path: Path) -> None:
     import av
 
+    scene = renderer.scene
     encoding, depth = scene.encoding, scene.sensor.bit_depth
     is_h264 = encoding.codec == "h264"
     pixel_format = ("yuv420p" if depth == 8 else None) if is_h264 else GREY_FORMATS.get(depth)
@@ -97,9 +90,9 @@ def _write_video(frame: Callable[..., Frame], n_frames: int, scene: Scene, path:
             stream.options = {"preset": "superfast", "bf": "0", "sc_threshold": "0", **_rate(scene)}
             stream.gop_size = encoding.gop
             stream.codec_context.color_range = 1  # levels of 16…235
-        for index in range(n_frames):
+        for index in range(renderer.n_frames):
             picture = av.VideoFrame(scene.camera.width_px, scene.camera.height_px, pixel_format)
-            for plane, values in zip(picture.planes, (frame(index, **levels), *chroma), strict=False):
+            for plane, values in zip(picture.planes, (renderer.frame(index, **levels), *chroma), strict=False):
                 _fill(plane, values)
             picture.pts = index
             container.mux(stream.encode(picture))
@@ -128,7 +121,7 @@ def _fill(plane: Any, values: Frame) -> None:
 
 
 # ------------------------------------------------------------------------------
-# Pictures and clips of a calibration target.
+# Pictures of a calibration target.
 
 
 def render_target(target: Target, scene: Scene, *, seed: int = 0, ramp: float = 0.25) -> Frame:
@@ -136,46 +129,14 @@ def render_target(target: Target, scene: Scene, *, seed: int = 0, ramp: float = 
     `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by `ramp` across
     the picture. Shape (height, width).
     """
-    empty = _empty(scene, seed)
-    return empty.expose(_with_target(empty, target, scene.camera, ramp), 0)
-
-
-def render_calibration_clip(
-    target: Target,
-    scene: Scene,
-    n_frames: int,
-    out_path: Path,
-    *,
-    seed: int = 0,
-    moves: Sequence[dict[str, Any]] = (),
-) -> None:
-    """Write a clip (or, by the path's ending, a folder of pictures) of a target. `moves` lists, for each frame, what
-    changes: fields of `Target` such as `{"centre_m": (0.01, 0)}` or of `Camera` such as `{"tilt_x_deg": 10}`.
-    """
-    empty = _empty(scene, seed)
-    lights = [_with_target(empty, target, scene.camera)] if not moves else []
-    for changes in moves:
-        on_target = {key: value for key, value in changes.items() if hasattr(target, key)}
-        on_camera = {key: value for key, value in changes.items() if key not in on_target}
-        lights.append(_with_target(empty, replace(target, **on_target), replace(scene.camera, **on_camera)))
-
-    def frame(index: int, **levels: float) -> Frame:
-        return empty.expose(lights[min(index, len(lights) - 1)], index, **levels)
-
-    write_recording(frame, n_frames, empty.scene, Path(out_path))
-
-
-def _empty(scene: Scene, seed: int) -> FrameRenderer:
-    """The scene without launcher, door, ruler and clutter, at rest."""
     backdrop = replace(scene.backdrop, launcher=False, ruler=False, clutter=False)
-    scene = replace(scene, backdrop=backdrop, door=None)
-    return FrameRenderer(scene, np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3, seed=seed)
-
-
-def _with_target(empty: FrameRenderer, target: Target, camera: Camera, ramp: float = 0.25) -> NDArray[np.float32]:
-    light = lay_target(empty.backdrop(), target, plane_seen(camera), empty.scene.psf_px)
+    empty = FrameRenderer(
+        replace(scene, backdrop=backdrop, door=None), np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3,
+        seed=seed,
+    )  # fmt: skip
+    light = lay_target(empty.still, target, plane_seen(scene.camera), scene.psf_px)
     slope = 1 + ramp * (np.linspace(0, 1, light.shape[1], dtype=np.float32)[None, :] - 0.5)
-    return np.asarray(light * slope, dtype=np.float32)
+    return empty.expose(np.asarray(light * slope, dtype=np.float32), 0)
 
 
 # ------------------------------------------------------------------------------
@@ -196,15 +157,8 @@ class Filming:
 
 def make_filming(content: dict[str, Any]) -> Filming:
     """Read how trials are filmed from a YAML mapping."""
-    target = dict(content.get("target", {}))
-    if "squares" in target:
-        target["squares"] = tuple(target["squares"])
-    return Filming(
-        scene=content.get("scene", "demo"),
-        camera=Camera(**content.get("camera", {})),
-        exposure_fraction=content.get("exposure_fraction", 0.1),
-        target=Target(**target),
-    )
+    target = {key: tuple(value) if key == "squares" else value for key, value in content.get("target", {}).items()}
+    return Filming(**content | {"camera": Camera(**content.get("camera", {})), "target": Target(**target)})
 
 
 def scene_of(stated: Trial, filming: Filming) -> Scene:

@@ -865,9 +865,7 @@ class Truth:
     tip_x_px: Floats
     tip_y_px: Floats
     in_frame: NDArray[np.bool_]
-    m_per_px: float
     release_s: float
-    capture_fps: float
     exposure_s: float
 
 
@@ -922,10 +920,11 @@ class FrameRenderer:
             across, down = np.meshgrid(np.arange(x0, x1 + 1), np.arange(y0, y1 + 1))
             offset_px = np.stack([across, down], axis=-1) - np.array(self.scene.camera.centre_px)
             self._canvas = lay_target(self._canvas, target, offset_px * self.scene.camera.m_per_px, psf_px)
-        self._still = np.empty(maps.plane_x.shape, dtype=np.float32)
-        sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self._still)
+        #: radiance of the static scene, shape (height, width)
+        self.still = np.empty(maps.plane_x.shape, dtype=np.float32)
+        sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self.still)
         if target is not None and not self.scene.shake_px:
-            self._still = lay_target(self._still, target, plane_seen(self.scene.camera), psf_px)
+            self.still = lay_target(self.still, target, plane_seen(self.scene.camera), psf_px)
 
     def _prepare_sensor(self) -> None:
         """Prepare the gain of every pixel (vignetting, fixed pattern), and normal deviates."""
@@ -946,7 +945,7 @@ class FrameRenderer:
     def radiance(self, frame: int) -> Image:
         """Return the radiance at the sensor, before lamps, gain and noise. Shape (height, width)."""
         shake = self.scene_motion.shake_px(float(self.scene_motion.mid_exposure_s(frame)))
-        light = self._still.copy()
+        light = self.still.copy()
         if shake != (0.0, 0.0):
             sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, *shake, light)
         if self._door is not None:
@@ -954,10 +953,6 @@ class FrameRenderer:
         ux, uy = self.scene.direction
         self._subject.lay(light, frame, (shake[0] * ux + shake[1] * uy, shake[1] * ux - shake[0] * uy))
         return light
-
-    def backdrop(self) -> Image:
-        """Radiance of the static scene, shape (height, width)."""
-        return self._still.copy()
 
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
         """Render the grey levels of one frame. Shape (height, width)."""
@@ -992,8 +987,6 @@ class FrameRenderer:
             tip_x_px=tip[:, 0],
             tip_y_px=tip[:, 1],
             in_frame=np.all((tip >= -0.5) & (tip <= np.array([camera.width_px, camera.height_px]) - 0.5), axis=1),
-            m_per_px=camera.m_per_px,
             release_s=self.scene_motion.release_s,
-            capture_fps=self.capture_fps,
             exposure_s=self.exposure_s,
         )
