@@ -6,57 +6,40 @@ those arcs; every pixel knows its nearest place. `bent_scene` draws frames in me
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from plain_scene import texture
+from plain_scene import Plan, Scene, developed, moving, texture, travel
 from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
-class BentPlan:
-    """What is in the picture. Lengths in px, speeds in px a frame, brightness in grey levels of 255.
-
-    `pieces` are (length, turn in degrees, positive from x towards y) one behind the other from `from_px`, where the
-    tube points to `angle_deg`: straight where the turn is 0, else an arc of a circle.
+class BentPlan(Plan):
+    """What is in the picture, as in a plain one: `pieces` are (length, turn in degrees, positive from x towards y) one
+    behind the other from `from_px`, where the tube points to `angle_deg`: straight where the turn is 0, else an arc of
+    a circle.
     """
 
-    pieces: tuple[tuple[float, float], ...]
-    seed: int = 0
+    pieces: tuple[tuple[float, float], ...] = ()
     width: int = 640
     height: int = 640
     from_px: tuple[float, float] = (40.0, 80.0)
-    angle_deg: float = 0.0
-    start_px: float = 60.0
     rest_frames: int = 10
-    end_frames: int = 8
     speed: float = 14.0
-    rise_frames: float = 8.0
     exposure: float = 0.3
     radius: float = 20.0
     tip_depth: float = 8.0
-    background: float = 70.0
-    background_sd: float = 8.0
     film: float = 165.0
-    opacity: float = 0.75
-    wall_sd: float = 10.0
     tail_sd: float = 8.0
-    psf: float = 0.9
     noise: float = 2.5
-    shake: float = 0.0
 
 
 @dataclass(frozen=True)
-class BentScene:
-    """Frames, shape (n, height, width), uint8; true arc length of the tip at mid-exposure, shape (n,), px from the
-    curve's beginning, which frames move, and the curve: places (x, y) and their arc length, px.
+class BentScene(Scene):
+    """As a plain scene, the true edge as arc length from the curve's beginning; and the curve: places (x, y) and their
+    arc length, px.
     """
 
-    plan: BentPlan
-    frames: np.ndarray
-    edge_px: np.ndarray
-    moving: np.ndarray
     curve_px: np.ndarray
     arc_px: np.ndarray
 
@@ -97,14 +80,8 @@ def bent_scene(plan: BentPlan) -> BentScene:
     """Draw the plan: a textured tube with a rounded tip, blurred along its way by the exposure, over a still ground."""
     rng = np.random.default_rng(plan.seed)
     curve, arc = curve_of(plan)
-    end = float(arc[-1]) - 20.0
-
-    def travel(time: np.ndarray) -> np.ndarray:
-        t = np.clip(time - plan.rest_frames, 0.0, None)
-        run = plan.speed * (t - plan.rise_frames * (1 - np.exp(-t / plan.rise_frames)))
-        return np.minimum(plan.start_px + run, end)
-
-    n = int(np.argmax(travel(np.arange(5000.0)) >= end)) + plan.end_frames
+    plan = replace(plan, end_px=float(arc[-1]) - 20.0)
+    n = int(np.argmax(travel(plan, np.arange(5000.0)) >= plan.end_px)) + plan.end_frames
     h, w = plan.height, plan.width
     yy, xx = np.mgrid[0:h, 0:w].astype(np.float32)
     pixels = np.column_stack([xx.ravel(), yy.ravel()])
@@ -128,7 +105,7 @@ def bent_scene(plan: BentPlan) -> BentScene:
     phase = rng.uniform(0, 2 * np.pi, 2)
     frames = np.empty((n, h, w), np.uint8)
     for i in range(n):
-        places = travel(i + plan.exposure * (np.arange(12) + 0.5) / 12)
+        places = travel(plan, i + plan.exposure * (np.arange(12) + 0.5) / 12)
         shown = np.flatnonzero(s < places[-1] + 0.5)
         bulge_here, s_here, rows_here, within_here = (part[shown] for part in (bulge, s, rows, within))
         cover, inner = np.zeros(len(shown)), np.zeros(len(shown))
@@ -138,13 +115,6 @@ def bent_scene(plan: BentPlan) -> BentScene:
         picture = back.copy()
         here = tube[0][shown], tube[1][shown]
         picture[here] += cover * inside[shown] * (film[shown] + inner - back[here])
-        picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
-        if plan.shake:
-            dx, dy = plan.shake * np.sin(0.55 * i + phase[0]), plan.shake * np.sin(0.37 * i + phase[1])
-            move = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
-            picture = cv2.warpAffine(picture, move, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        grain = rng.standard_normal((h, w)).astype(np.float32) * plan.noise * np.sqrt(np.clip(picture, 1, None) / 100)
-        frames[i] = np.clip(np.rint(picture + grain), 0, 255).astype(np.uint8)
-    edge = travel(np.arange(n) + plan.exposure / 2)
-    moving = (travel(np.arange(n) + plan.exposure) > plan.start_px) & (travel(np.arange(n, dtype=float)) < end)
-    return BentScene(plan, frames, edge, moving, curve, arc)
+        frames[i] = developed(plan, picture, i, phase, rng)
+    edge = travel(plan, np.arange(n) + plan.exposure / 2)
+    return BentScene(plan, frames, edge, moving(plan, n), curve, arc)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from vinetrack.core.records import Track, Trial
-from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import BASE, GroundTruth, campaign, damping_values, grow, isometric_vine
+import grown as campaigns
+from grown import Pairs, pairs_of
 
-Pairs = list[tuple[Trial, Track]]
+from vinetrack.core.records import Trial
+from vinetrack.experiment.schema import with_names
+from vinetrack.laboratory.tracks import campaign, isometric_vine
 
 
 def sheet(payload_g: float = 0.0) -> list[Trial]:
@@ -24,16 +25,6 @@ def grown(
 ) -> Pairs:
     """Trials as a sheet and tracks state them, with effects whose values are given at work behind them."""
     trials = trials if trials is not None else sheet(payload_g)
-    values = dict(values or {})
-    effects = tuple(dict.fromkeys(name.split(".")[0] for name in values))
-    nature = GroundTruth(
-        effects=(*BASE, *effects),
-        values={**damping_values(trials), **values},
-        damping_scatter=0.02,
-        pressure_scatter=0.005,
-        yield_error_kPa=0.1,
-        noise_m=1e-4,
-        noise_correlation=0.3,
-        seed=seed,
-    )
-    return [(one.stated, one.track) for one in grow(trials, nature)]
+    effects = tuple(dict.fromkeys(name.split(".")[0] for name in values or {}))
+    scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005, "yield_error_kPa": 0.1, "noise_correlation": 0.3}
+    return pairs_of(campaigns.grown(trials, seed, effects, values, **scatter))

@@ -9,8 +9,9 @@ from functools import lru_cache
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.schema import with_names
+from vinetrack.tracks.position_noise import ar1_noise
 
 FPS = 1000.0
 B_TRUE = {24.0: 6.4, 18.0: 4.5}
@@ -70,16 +71,12 @@ def grown_position(
 
 def as_track(time_s: np.ndarray, position_m: np.ndarray, pressure_Pa: np.ndarray | None = None) -> Track:
     """A bare track of these positions."""
-    blank = np.full(time_s.size, math.nan)
-    return Track(time_s, position_m, blank, np.full(time_s.size, "", dtype="<U32"), blank, pressure_Pa)
+    return plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
 
 
 def ar1(count: int, rho: float, draw: np.random.Generator) -> np.ndarray:
     """Stationary noise of standard deviation 1."""
-    out = draw.standard_normal(count)
-    for k in range(1, count):
-        out[k] = rho * out[k - 1] + math.sqrt(1 - rho**2) * out[k]
-    return out
+    return ar1_noise(count, 1.0, rho, draw)
 
 
 def filmed(

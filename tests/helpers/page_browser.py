@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 from bokeh.document import Document
+from chrome import until
 
 from vinetrack.pages.campaign import BackgroundFit
 from vinetrack.pages.page import Page
@@ -36,11 +36,7 @@ class Browser:
                 callback.callback()
 
     def until(self, asked: Callable[[], bool], seconds: float = 240) -> None:
-        end = time.monotonic() + seconds
-        while not asked():
-            assert time.monotonic() < end
-            self.turn()
-            time.sleep(0.01)
+        until(lambda: asked() or self.turn(), "the page", seconds)
 
     def click(self, name: str) -> None:
         from bokeh.events import ButtonClick

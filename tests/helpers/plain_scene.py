@@ -6,7 +6,7 @@ A truth of another hand than the laboratory's: no import of `vinetrack`, another
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
@@ -60,7 +60,6 @@ class Scene:
     frames: np.ndarray
     edge_px: np.ndarray
     moving: np.ndarray
-    extra: dict = field(default_factory=dict)
 
 
 def texture(rng: np.random.Generator, shape: tuple[int, int], scale: float, sd: float) -> np.ndarray:
@@ -111,6 +110,26 @@ def _tube(
     return added
 
 
+def moving(plan: Plan, n_frames: int) -> np.ndarray:
+    """Which frames show a tube that moves while they are exposed."""
+    later = travel(plan, np.arange(n_frames) + plan.exposure)
+    return (later > plan.start_px) & (travel(plan, np.arange(n_frames, dtype=float)) < plan.end_px)
+
+
+def developed(plan: Plan, picture: np.ndarray, frame: int, phase: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A picture as the camera keeps it: blurred, shaken, in flickering light, with grain."""
+    picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
+    if plan.shake:
+        dx, dy = plan.shake * np.sin(0.55 * frame + phase[0]), plan.shake * np.sin(0.37 * frame + phase[1])
+        move, size = np.array([[1, 0, dx], [0, 1, dy]], np.float32), picture.shape[::-1]
+        picture = cv2.warpAffine(picture, move, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    if plan.flicker:
+        picture = picture * (1 + plan.flicker * np.sin(0.9 * frame + phase[2]))
+    white = rng.standard_normal(picture.shape).astype(np.float32)
+    grain = white * plan.noise * np.sqrt(np.clip(picture, 1, None) / 100)
+    return np.clip(np.rint(picture + grain), 0, 255).astype(np.uint8)
+
+
 def plain_scene(plan: Plan) -> Scene:
     """Draw the plan."""
     rng = np.random.default_rng(plan.seed)
@@ -144,17 +163,8 @@ def plain_scene(plan: Plan) -> Scene:
         if plan.payload and edge[i] > 0.75 * plan.end_px:
             ahead = edge[i] + 3.0 * (edge[i] - 0.75 * plan.end_px)
             picture = np.where((np.abs(along - ahead) < 12) & (np.abs(across) < 10), 230.0, picture)
-        picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
-        if plan.shake:
-            dx, dy = plan.shake * np.sin(0.55 * i + phase[1]), plan.shake * np.sin(0.37 * i + phase[2])
-            move = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
-            picture = cv2.warpAffine(picture, move, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        picture = picture * (1 + plan.flicker * np.sin(0.9 * i + phase[3]))
-        grain = rng.standard_normal((h, w)).astype(np.float32) * plan.noise * np.sqrt(np.clip(picture, 1, None) / 100)
-        frames[i] = np.clip(np.rint(picture + grain), 0, 255).astype(np.uint8)
-    later = travel(plan, np.arange(n_frames) + plan.exposure)
-    moving = (later > plan.start_px) & (travel(plan, np.arange(n_frames, dtype=float)) < plan.end_px)
-    return Scene(plan, frames, edge, moving)
+        frames[i] = developed(plan, picture, i, phase[1:], rng)
+    return Scene(plan, frames, edge, moving(plan, n_frames))
 
 
 def write_video(

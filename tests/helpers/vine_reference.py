@@ -1,4 +1,4 @@
-"""A vine followed by SciPy in another formulation than the package's: truth for tests and benchmarks of the integrator.
+"""A vine followed by SciPy in another formulation than the package's: truth for tests of the integrator.
 
 m ẍ = ½(P − P_y)A + m g cosθ − ½B ẋⁿ is written in u = ẋⁿ and a made-up time s with dt = m/(n k) u^(1/n − 1) ds, k = ½B:
 

@@ -1,4 +1,4 @@
-"""Truth for the tests and benchmarks of `motion`: everting vines integrated by SciPy, and noise of known statistics.
+"""Truth for the tests of `motion`: everting vines integrated by SciPy, and noise of known statistics.
 
 m(x) ẍ = ½(P − P_y)A + m g − ½B ẋⁿ with m = λL + m_pay − (λ/2)x, integrated by Radau (rtol 1e-10): none of the
 package's own integrators or effects take part.
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from vinetrack.core.records import Track
+from vinetrack.core.records import Track, plain_track
 
 G = 9.81
 N_EXPONENT = 0.37
@@ -94,14 +94,7 @@ class Recording:
 
 def make_track(time_s: Floats, lead_position_m: Floats) -> Track:
     """A plain track without flags."""
-    n = time_s.size
-    return Track(
-        time_s=np.asarray(time_s, dtype=float),
-        lead_position_m=np.asarray(lead_position_m, dtype=float),
-        lead_position_sigma_m=np.full(n, np.nan),
-        flag=np.full(n, "", dtype="<U80"),
-        edge_px=np.full(n, np.nan),
-    )
+    return plain_track(np.asarray(time_s, dtype=float), np.asarray(lead_position_m, dtype=float))
 
 
 def ar1(n: int, sd: float, rho: float, rng: np.random.Generator) -> Floats:
