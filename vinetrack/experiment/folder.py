@@ -186,7 +186,10 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
         problems.append(Problem("no_folder", message, file=str(folder), remedy=EXPECTED_FOLDER))
         return None
     if not os.path.lexists(folder / SHEET):
-        problems.append(Problem("missing", "is missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
+        remedy = EXPECTED_FOLDER
+        if close := closest_entry(folder / SHEET):
+            remedy = f"rename {close} to {SHEET}" if close.endswith(".csv") else f"save {close} as {SHEET}"
+        problems.append(Problem("missing", "is missing", file=SHEET, remedy=remedy))
         return None
     try:
         table, found = read_sheet(folder / SHEET)
@@ -200,13 +203,6 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
         message, remedy = "has neither a column video nor a column track", "add the one that applies"
         problems.append(Problem("no_recording", message, file=SHEET, remedy=remedy))
     return table
-
-
-def _missing_sheet_remedy(folder: Path) -> str:
-    """Remedy for a missing sheet: rename a file with a similar name, else what a folder should contain."""
-    if close := closest_entry(folder / SHEET):
-        return f"rename {close} to {SHEET}" if close.endswith(".csv") else f"save {close} as {SHEET}"
-    return EXPECTED_FOLDER
 
 
 def _absent_column(name: str) -> Problem:

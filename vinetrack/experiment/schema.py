@@ -143,7 +143,9 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
             case "text" | "path":
                 return text
             case "yes_no":
-                return _read_truth(text)
+                if text.lower() not in TRUTH_WORDS:
+                    raise CellError("is neither yes nor no", code="not_yes_or_no")
+                return TRUTH_WORDS[text.lower()]
             case "window":
                 return _read_window(text, decimal)
             case "bends":
@@ -211,12 +213,6 @@ def _likely_unit(column: Column, value: float) -> str:
         if (factor > 1) == (value < column.high) and max(column.low, 1e-9) <= meant <= column.high:
             return f"looks like {unit}: {value:g} {unit} is {meant:g} {column.unit}"
     return ""
-
-
-def _read_truth(text: str) -> bool:
-    if text.lower() not in TRUTH_WORDS:
-        raise CellError("is neither yes nor no", code="not_yes_or_no")
-    return TRUTH_WORDS[text.lower()]
 
 
 def _read_window(text: str, decimal: str) -> tuple[float, float]:
