@@ -16,9 +16,6 @@ from vinetrack.laboratory.filming import render_recording, render_target
 from vinetrack.laboratory.render import FrameRenderer
 from vinetrack.laboratory.scene import Ball, Camera, Door, Encoding, Light, Scene, Sensor, Target, Tube, preset
 
-# The pictures show what the truth says: measured in them by area, centroid and correlation, never by a tracker.
-
-
 FPS = 1000.0
 CLEAN = preset("clean")
 SMALL = Camera(width_px=480, height_px=128)
@@ -102,20 +99,25 @@ def test_accelerating_tip_lies_off_mid_exposure_only_by_the_known_second_order()
     assert measured - truth.tip_x_px[0] == pytest.approx(ahead_px, abs=0.005)
 
 
+def projected(plane_m: np.ndarray, camera: Camera) -> np.ndarray:
+    """Where OpenCV sees points of the plane, px, shape (n, 2)."""
+    about_x, _ = cv2.Rodrigues(np.radians([camera.tilt_x_deg, 0, 0]))
+    about_y, _ = cv2.Rodrigues(np.radians([0, camera.tilt_y_deg, 0]))
+    turn, _ = cv2.Rodrigues(about_y @ about_x)
+    away_m = np.array([0, 0, camera.focal_px * camera.m_per_px])
+    spatial_m = np.column_stack([plane_m, np.zeros(len(plane_m))])
+    seen, _ = cv2.projectPoints(spatial_m, turn, away_m, camera.matrix, np.array([camera.k1, camera.k2, 0, 0, 0]))
+    return seen[:, 0]
+
+
 def test_distorted_and_tilted_tip_is_where_opencv_projects_it():
     camera = Camera(focal_px=900, k1=-0.3, k2=0.1, tilt_x_deg=6, tilt_y_deg=-9)
     scene = replace(CLEAN, camera=camera, growth_angle_deg=20)
     truth = renderer(scene).truth(np.arange(60))
     ux, uy = scene.direction
     offset_px = np.array(scene.origin) + truth.lead_px[:, None] * np.array([ux, uy]) - camera.centre_px
-    plane_m = np.column_stack([offset_px, np.zeros(60)]) * camera.m_per_px
-    about_x, _ = cv2.Rodrigues(np.radians([camera.tilt_x_deg, 0, 0]))
-    about_y, _ = cv2.Rodrigues(np.radians([0, camera.tilt_y_deg, 0]))
-    turn, _ = cv2.Rodrigues(about_y @ about_x)
-    away_m = np.array([0, 0, camera.focal_px * camera.m_per_px])
-    lens = np.array([camera.k1, camera.k2, 0, 0, 0])
-    expected, _ = cv2.projectPoints(plane_m, turn, away_m, camera.matrix, lens)
-    assert np.column_stack([truth.tip_x_px, truth.tip_y_px]) == pytest.approx(expected[:, 0], abs=1e-6)
+    expected = projected(offset_px * camera.m_per_px, camera)
+    assert np.column_stack([truth.tip_x_px, truth.tip_y_px]) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -279,16 +281,6 @@ SCENE = replace(preset("demo"), camera=CAMERA, sensor=Sensor(noise=False, fixed_
 CHECKER = Target(kind="checkerboard", squares=(11, 4), square_m=0.025, angle_deg=2.0, centre_m=(0.004, -0.003))
 
 
-def corners_by_opencv(target: Target, camera: Camera) -> np.ndarray:
-    about_x, _ = cv2.Rodrigues(np.radians([camera.tilt_x_deg, 0, 0]))
-    about_y, _ = cv2.Rodrigues(np.radians([0, camera.tilt_y_deg, 0]))
-    turn, _ = cv2.Rodrigues(about_y @ about_x)
-    away_m = np.array([0, 0, camera.focal_px * camera.m_per_px])
-    plane_m = np.column_stack([target.corners_m(), np.zeros(len(target.corners_m()))])
-    seen, _ = cv2.projectPoints(plane_m, turn, away_m, camera.matrix, np.array([camera.k1, camera.k2, 0, 0, 0]))
-    return seen[:, 0]
-
-
 def crossings(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Where two blurred edges cross, by least squares in a window of ±9 px; written apart from the package's own."""
     found = []
@@ -310,7 +302,7 @@ def crossings(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_corners_of_a_checkerboard_are_where_opencv_projects_them():
-    expected = corners_by_opencv(CHECKER, CAMERA)
+    expected = projected(CHECKER.corners_m(), CAMERA)
     measured = crossings(render_target(CHECKER, SCENE), expected + 0.3)
     assert np.abs(measured - expected).max() < 0.03
     assert np.abs((measured - expected).mean(axis=0)).max() < 0.01
@@ -345,7 +337,7 @@ def test_target_in_a_trials_recording_hangs_where_it_is_told(shake_px):
     renderer = FrameRenderer(scene, np.zeros_like, n_frames=3, capture_fps=1000.0)
     moved = renderer.scene_motion.shake_px(float(renderer.scene_motion.mid_exposure_s(2)))
     where_m = np.array(target.centre_m) + np.array(moved) * CAMERA.m_per_px
-    expected = corners_by_opencv(replace(target, centre_m=tuple(where_m)), CAMERA)
+    expected = projected(replace(target, centre_m=tuple(where_m)).corners_m(), CAMERA)
     measured = crossings(renderer.frame(2), expected)
     free = expected[:, 1] > 110  # clear of the tube
     assert (max(np.abs(moved)) > 0.1) == (shake_px > 0)

@@ -9,13 +9,12 @@ a reservoir whose pressure changes by more than 5 %, compression in the tail.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
 
 from vinetrack.core.records import Floats, Kinematics, Trial
 from vinetrack.dynamics.kernel import Trace
@@ -295,14 +294,14 @@ def measured_motion(
     return AuditedMotion(trial, time_s, position_m, np.maximum(k.lead_velocity_m_s[moving], 0.0), pressure)
 
 
-def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effect] | None = None) -> Audit:
+def audit(model: Model, motions: Sequence[AuditedMotion]) -> Audit:
     """Compute what `model` neglects along each motion."""
-    candidates = list(catalogue().values()) if effects is None else list(effects)
+    physical = [effect for effect in catalogue().values() if effect.kind != "measurement"]
     rows: list[dict[str, Any]] = []
     violations: list[RuleViolation] = []
     for motion in (motion.thinned() for motion in motions):
         terms = motion.terms(model)
-        neglected = [e for e in candidates if e.kind != "measurement" and not _in_model(e, model, motion)]
+        neglected = [effect for effect in physical if not _in_model(effect, model, motion)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
         tension = _tension_row(motion, terms)
         rows += [*left_out, tension]
@@ -325,11 +324,15 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
         terms = motion.terms(model + effect)
     except EffectError as error:
         return motion.row(effect.name, size=size, note=str(error))
-    if not set(effect.functions) - {"observed_position", "row_delay", "averaged_over"}:
-        shift = _shift_m(effect, motion, without)
+    if set(effect.functions) == {"observed_position"}:
+        # It changes nothing but the reported position.
+        state = without.state._replace(tail_tension=np.maximum(without.tension_N, 0.0))  # type: ignore[arg-type]
+        sizes = (parameter.default for parameter in effect.parameters)
+        seen = effect.functions["observed_position"](state, trial_inputs(motion.trial), *sizes)
+        shift = np.asarray(seen, dtype=float) - motion.lead_position_m
         i = int(np.argmax(np.abs(shift)))
         return motion.row(effect.name, i, size=size, shift_m=float(shift[i]))
-    if not set(effect.functions) - {"rest_force"}:
+    if set(effect.functions) == {"rest_force"}:
         return motion.row(effect.name, size=size, note="acts on a vine at rest only")
     force = _total_N(terms) - _total_N(without) - (terms.inertia_kg - without.inertia_kg) * without.acceleration_m_s2
     drive = motion.drive_N()
@@ -341,30 +344,6 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
 def _total_N(terms: Terms) -> Floats:
     """Total force on the tail, N."""
     return terms.tension_N + sum(terms.tail_N.values(), np.zeros_like(terms.tension_N))
-
-
-def _shift_m(effect: Effect, motion: AuditedMotion, terms: Terms) -> Floats:
-    """Displacement by an effect that only changes the reported position, relative to release. Shape (n,)."""
-    rig = trial_inputs(motion.trial)
-    state = terms.state._replace(tail_tension=np.maximum(terms.tension_N, 0.0))  # type: ignore[arg-type]
-    hook = next(name for name in ("row_delay", "averaged_over", "observed_position") if name in effect.functions)
-    value = effect.functions[hook](state, rig, *(parameter.default for parameter in effect.parameters))
-    seen = value
-    if hook == "row_delay":
-        seen = np.interp(motion.time_s + value * motion.lead_position_m, motion.time_s, motion.lead_position_m)
-    elif hook == "averaged_over":
-        seen = _time_average(motion, math.sqrt(value))
-    return np.asarray(seen, dtype=float) - motion.lead_position_m
-
-
-def _time_average(motion: AuditedMotion, over_s: float) -> Floats:
-    """Positions averaged over a time, m; the edge is at rest before the first and after the last."""
-    area = cumulative_trapezoid(motion.lead_position_m, motion.time_s, initial=0.0)
-    time_s = np.concatenate([[motion.time_s[0] - over_s], motion.time_s, [motion.time_s[-1] + over_s]])
-    ends = over_s * motion.lead_position_m[[0, -1]]
-    area = np.concatenate([[-ends[0]], area, [area[-1] + ends[1]]])
-    halves = [np.interp(motion.time_s + side * over_s / 2, time_s, area) for side in (1, -1)]
-    return np.asarray((halves[0] - halves[1]) / over_s)
 
 
 def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:

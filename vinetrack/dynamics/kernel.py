@@ -245,12 +245,12 @@ class Batch:
         """Start of each trial's rows, and the end of the last."""
         return self.arrays.starts
 
-    def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
+    def run(self, relative_tolerance: float = RELATIVE_TOLERANCE) -> tuple[Floats, Floats]:
         """Integrate every trial. Returns out, ends. Shapes (n_times, 4), (n_trials, 5)."""
         count = self.starts.size - 1
         out, ends = np.empty((self.stamps.size, 4)), np.empty((count, 5))
         # For fewer than 64 trials another thread costs more than it saves.
-        threads = threads or max(1, min(available_cores(), count // 64))
+        threads = max(1, min(available_cores(), count // 64))
         longest = int(np.diff(self.starts).max(initial=0))
 
         def integrate(first: int, last: int) -> None:

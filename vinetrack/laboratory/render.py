@@ -55,13 +55,13 @@ def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
     return (ramp * pool * (1 + look.texture * (blotches + grain))).astype(np.float32)
 
 
-def _paste(canvas: Image, patch: Image, mask: Image, matrix: NDArray[np.float64]) -> Image:
-    """Lay `patch` over `canvas` through the affine `matrix` (patch to canvas) where `mask` is 1."""
+def _paste(canvas: Image, patch: Image, matrix: NDArray[np.float64]) -> Image:
+    """Lay `patch` over `canvas` through the affine `matrix` (patch to canvas)."""
     import cv2
 
     size = (canvas.shape[1], canvas.shape[0])
-    weight = cv2.warpAffine(mask, matrix, size, flags=cv2.INTER_LINEAR)
-    laid = cv2.warpAffine(patch * mask, matrix, size, flags=cv2.INTER_LINEAR)
+    weight = cv2.warpAffine(np.ones_like(patch), matrix, size, flags=cv2.INTER_LINEAR)
+    laid = cv2.warpAffine(patch, matrix, size, flags=cv2.INTER_LINEAR)
     return np.asarray(canvas * (1 - weight) + laid, dtype=np.float32)
 
 
@@ -161,11 +161,11 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
         length, width = int(along.max()) + 40, 34
         patch = _ruler_patch(length, width, 1e-3 / scene.camera.m_per_px, rng)
         matrix = _axis_matrix(scene, corner, 0.0, round(1.9 * radius + 14))
-        canvas = _paste(canvas, patch, np.ones_like(patch), matrix)
+        canvas = _paste(canvas, patch, matrix)
     if scene.backdrop.launcher:
         patch = _launcher_patch(radius, rng, 400)
         matrix = _axis_matrix(scene, corner, -399.0, -patch.shape[0] / 2)
-        canvas = _paste(canvas, patch, np.ones_like(patch), matrix)
+        canvas = _paste(canvas, patch, matrix)
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), scene.psf_px), dtype=np.float32).clip(0, 1.5)
 
 
