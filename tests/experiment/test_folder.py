@@ -50,11 +50,9 @@ def known(trial: Trial) -> dict[str, object]:
 
 
 def test_optional_columns_in_si_units(folder: Path) -> None:
-    columns = (
-        "capture_fps,exposure_us,growth_angle_deg,chamber_l,inlet_mm,bends,film_density_kg_m3,mm_per_px,steady,"
-        "pressure_sigma_kPa,yield_pressure_sigma_kPa"
-    )
-    trial = one(folder, columns, "1000,100,90,3.7,6,100:30:20;200:50:25,1180,0.37,0.05:0.2,0.5,0.1").trials[0]
+    cells = {"capture_fps": "1000", "exposure_us": "100", "growth_angle_deg": "90", "chamber_l": "3.7", "inlet_mm": "6"}
+    cells |= {"bends": "100:30:20;200:50:25", "film_density_kg_m3": "1180", "mm_per_px": "0.37", "steady": "0.05:0.2"}
+    (trial,) = one(folder, **cells, pressure_sigma_kPa="0.5", yield_pressure_sigma_kPa="0.1").trials
     assert trial.capture_fps == 1000
     assert trial.exposure_s == pytest.approx(1e-4)
     assert trial.growth_angle_rad == pytest.approx(math.pi / 2)
@@ -131,12 +129,10 @@ FAULTS = {
 
 @pytest.mark.parametrize(("column", "cell"), [(column, cell) for column, cells in FAULTS.items() for cell in cells])
 def test_a_broken_cell_is_named_with_file_line_trial_and_column(folder: Path, column: str, cell: str) -> None:
-    row = dict(zip(HEADER.split(","), ["a", "a.csv", "24", "200", "280", "28", "3", "35.6"], strict=True))
-    row[column] = cell
-    experiment = read_experiment(write(folder, ",".join(row) + "\n\n" + ",".join(row.values()) + "\n"))
+    experiment = one(folder, **{column: cell})
     (problem,) = experiment.problems
-    assert (problem.severity, problem.file, problem.line) == ("error", "trials.csv", 3)
-    assert problem.trial == ("a" if column != "trial" else "line-3")
+    assert (problem.severity, problem.file, problem.line) == ("error", "trials.csv", 2)
+    assert problem.trial == ("a" if column != "trial" else "line-2")
     assert problem.column in (column, "track", "")
     assert len(format_problems(experiment.problems)[0]) < 400
     assert experiment.trials == ()
@@ -157,9 +153,7 @@ def test_a_broken_cell_is_named_with_file_line_trial_and_column(folder: Path, co
     ],
 )
 def test_a_legal_oddity_is_a_warning(folder: Path, column: str, cell: str) -> None:
-    row = dict(zip(HEADER.split(","), ["a", "a.csv", "24", "200", "280", "28", "3", "35.6"], strict=True))
-    row |= dict(zip(column.split(","), cell.split(","), strict=True))
-    experiment = read_experiment(write(folder, ",".join(row) + "\n" + ",".join(row.values()) + "\n"))
+    experiment = one(folder, **dict(zip(column.split(","), cell.split(","), strict=True)))
     (problem,) = experiment.problems
     assert problem.severity == "warning"
     assert problem.column.endswith(column.split(",")[0])  # a pressure below the yield pressure is said of that
@@ -167,8 +161,7 @@ def test_a_legal_oddity_is_a_warning(folder: Path, column: str, cell: str) -> No
 
 
 def test_a_yield_pressure_of_zero_with_its_error_is_believed(folder: Path) -> None:
-    sheet = f"{HEADER},yield_pressure_sigma_kPa\na,a.csv,24,200,280,28,0,35.6,2\n"
-    assert read_experiment(write(folder, sheet)).problems == ()
+    assert one(folder, yield_pressure_kPa="0", yield_pressure_sigma_kPa="2").problems == ()
 
 
 def test_a_video_needs_its_rate_of_capture(folder: Path) -> None:
@@ -190,9 +183,8 @@ def test_dng_frames_carry_their_own_rate(folder: Path) -> None:
 @pytest.mark.parametrize("shared", [True, False])
 def test_a_rate_of_playback_is_suspected(folder: Path, shared: bool) -> None:
     """30 fps is legal, but nobody films a vine at it."""
-    row = "a,a.mp4,24,200,280,28,3,," + ("" if shared else "30")
-    sheet = f"{HEADER.replace('track', 'video')},capture_fps\n{row}\n"
-    experiment = read_experiment(write(folder, sheet, "capture_fps: 30\n" if shared else ""))
+    settings, cell = ("capture_fps: 30\n", "") if shared else ("", "30")
+    experiment = one(folder, settings, track=None, video="a.mp4", capture_fps=cell)
     assert [trial.capture_fps for trial in experiment.trials] == [30]
     (problem,) = experiment.problems
     assert (problem.severity, problem.file) == ("warning", "experiment.yaml" if shared else "trials.csv")
@@ -210,16 +202,14 @@ def test_a_falling_ball_needs_a_diameter_only(folder: Path) -> None:
 def test_a_blank_pressure_comes_from_the_track(folder: Path) -> None:
     lines = [line + f",{27.94 - i / 10}" for i, line in enumerate(TRACK.splitlines()[1:])]
     (folder / "a.csv").write_text("time_s,position_m,pressure_kPa\n" + "\n".join(lines))
-    sheet = GOOD.replace("28,3", ",3")
-    trial = read_experiment(write(folder, sheet)).trials[0]
+    trial = read_experiment(write(folder, GOOD.replace("28,3", ",3"))).trials[0]
     assert trial.pressure_Pa == pytest.approx(27.9e3)
     assert trial.pressure_sigma_Pa == pytest.approx(279)
 
 
 def test_a_blank_pressure_comes_from_the_trace(folder: Path) -> None:
     (folder / "p.csv").write_text("time_s,pressure_kPa\n0,13.96\n0.1,13\n")
-    sheet = f"{HEADER},pressure_trace\na,a.csv,24,200,280,,3,,p.csv\n"
-    trial = read_experiment(write(folder, sheet)).trials[0]
+    (trial,) = one(folder, pressure_kPa="", pressure_trace="p.csv").trials
     assert trial.pressure_Pa == pytest.approx(14.0e3)
     assert trial.pressure_trace == folder / "p.csv"
 
@@ -228,10 +218,9 @@ def test_a_blank_pressure_comes_from_the_trace(folder: Path) -> None:
     "trace", [None, "time_s,pressure_kPa\n0,-3\n", "time_s,pressure_kPa\n", "time_s,pressure_psi\n0,3\n"]
 )
 def test_a_blank_pressure_without_a_measured_one_fails_the_trial(folder: Path, trace: str | None) -> None:
-    sheet = f"{HEADER},pressure_trace\na,a.csv,24,200,280,,3,,{'p.csv' if trace else ''}\n"
     if trace:
         (folder / "p.csv").write_text(trace)
-    assert list(read_experiment(write(folder, sheet)).failed) == ["a"]
+    assert list(one(folder, pressure_kPa="", pressure_trace="p.csv" if trace else "").failed) == ["a"]
 
 
 def test_the_yield_pressure_belongs_to_the_vine(folder: Path) -> None:
@@ -373,8 +362,7 @@ def test_check_finds_a_missing_calibration_picture(folder: Path) -> None:
 
 
 def test_a_cell_cannot_forge_lines_of_the_report(folder: Path) -> None:
-    sheet = f'{HEADER}\na,a.csv,24,200,280,"2\nerror: all is lost",3,\n'
-    (line,) = format_problems(read_experiment(write(folder, sheet)).problems)
+    (line,) = format_problems(one(folder, pressure_kPa="2\nerror: all is lost").problems)
     assert "\n" not in line
 
 

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hand_sheet import HEADER as SHEET_HEADER
-from hand_sheet import TRACK
-from hand_sheet import write as write_order
+from hand_sheet import HEADER, TRACK, one, write
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
@@ -29,18 +27,15 @@ from vinetrack.tracks.importers import TrackError, load_track, read_track
 # Corrections by hand are read, refused in words, and reach the trial.
 
 
-SHEET = "trial,video,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,capture_fps\n"
-ROWS = "a,a.mp4,,12,100,140,24,3,1000\nb,,b.csv,12,100,140,24,3,\n"
-
-
-def write(folder: Path, text: str) -> Path:
-    (folder / "trials.csv").write_text(SHEET + ROWS)
+def corrected(folder: Path, text: str) -> Path:
+    row = "a.mp4,12,100,140,24,3,"
+    (folder / "trials.csv").write_text(f"{HEADER.replace('track', 'video')},capture_fps\na,{row},1000\n")
     (folder / "corrections.csv").write_text(text)
     return folder
 
 
 def test_corrections_reach_their_trial(tmp_path: Path) -> None:
-    write(tmp_path, "trial,frame,action,edge_px\na,12,move,310.5\na,3,drop,\na,40,confirm,\n")
+    corrected(tmp_path, "trial,frame,action,edge_px\na,12,move,310.5\na,3,drop,\na,40,confirm,\n")
     trial = read_experiment(tmp_path).trial("a")
     assert [(one.frame, one.action) for one in trial.corrections] == [(3, "drop"), (12, "move"), (40, "confirm")]
     assert trial.corrections[1].edge_px == 310.5
@@ -58,7 +53,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     "line", ["a,3,remove,", "a,3.5,drop,", "a,-1,drop,", "a,3,move,", "a,three,drop,", "a,3,drop,\na,3,confirm,"]
 )
 def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path, line: str) -> None:
-    write(tmp_path, f"trial,frame,action,edge_px\n{line}\n")
+    corrected(tmp_path, f"trial,frame,action,edge_px\n{line}\n")
     with pytest.raises(ExperimentError) as stopped:
         read_experiment(tmp_path)
     assert "corrections.csv" in {problem.file for problem in stopped.value.problems}
@@ -131,24 +126,16 @@ def test_the_name_of_a_condition_shows_what_differs(field: str, value: Any, part
 
 
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")
-HEADER = "trial,track,diameter_mm,payload_g,travel_ratio,frames_used,axis,point_mass\n"
-
-
-def folder_with(tmp_path: Path, row: str) -> Path:
-    rows = "".join(f"{k / 100},{0.05 * k**2 / 100:.5f}\n" for k in range(30))
-    (tmp_path / "fall.csv").write_text("time_s,position_m\n" + rows)
-    (tmp_path / "trials.csv").write_text(HEADER + row + "\n")
-    return tmp_path
 
 
 def test_a_sheet_gives_one_trial_its_own(tmp_path: Path) -> None:
-    (trial,) = read_experiment(folder_with(tmp_path, 't1,fall.csv,40,2.7,1,5:20,"161,40:151.5,799:20",')).trials
+    (trial,) = one(tmp_path, frames_used="5:15", axis="161,40:151.5,799:20").trials
     assert trial.axis is not None
     assert (trial.axis.from_px, trial.axis.to_px) == ((161.0, 40.0), (151.5, 799.0))
     assert trial.axis.width_m == pytest.approx(0.02)
-    assert trial.frames_used == (5, 20)
+    assert trial.frames_used == (5, 15)
     track = load_track(trial)
-    assert np.flatnonzero(track.usable).tolist() == list(range(5, 21))
+    assert np.flatnonzero(track.usable).tolist() == list(range(5, 16))
     assert track.flag[0] == "rejected"
     assert track.flag[-1] == "after_end"
 
@@ -198,7 +185,7 @@ def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10
     folder.mkdir(exist_ok=True)
     (folder / "a.csv").write_text(TRACK)
     lines = [f"t{i},a.csv,24,200,280,{PRESSURES[i]},3,{cells[i]}" for i in rows or range(10)]
-    return write_order(folder, f"{SHEET_HEADER}{columns}\n" + "\n".join(lines) + "\n")
+    return write(folder, f"{HEADER}{columns}\n" + "\n".join(lines) + "\n")
 
 
 def said(folder: Path, column: str) -> list[str]:

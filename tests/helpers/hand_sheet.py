@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from pathlib import Path
 
 import pytest
@@ -29,9 +31,14 @@ def write(folder: Path, sheet: str, settings: str | None = None) -> Path:
     return folder
 
 
-def one(folder: Path, columns: str, cells: str, settings: str | None = None) -> Experiment:
-    """An experiment of the one trial `a` with further columns."""
-    return read_experiment(write(folder, f"{HEADER},{columns}\na,a.csv,24,200,280,28,3,35.6,{cells}\n", settings))
+def one(folder: Path, settings: str | None = None, **cells: str | None) -> Experiment:
+    """An experiment of the trial `a` alone, with these cells; a column that is None is not in the sheet."""
+    row = dict(zip(HEADER.split(","), GOOD.splitlines()[1].split(","), strict=True)) | cells
+    given = {name: cell for name, cell in row.items() if cell is not None}
+    text = io.StringIO()
+    csv.writer(text).writerows([given, given.values()])
+    (folder / "a.csv").write_text(TRACK)
+    return read_experiment(write(folder, text.getvalue(), settings))
 
 
 def stopped(folder: Path, strict: bool | None = None) -> tuple[Problem, ...]:
