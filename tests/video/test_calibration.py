@@ -180,7 +180,7 @@ def test_moved_target_shows_the_plane_first_and_the_lens_throughout(tmp_path):
     moved = [picture(seed=2002)]
     for k, (x_m, tilt_deg) in enumerate(((0.03, 5), (-0.04, -10), (0.06, 3))):
         moved.append(picture(replace(BOARD, centre_m=(x_m, 0.0)), replace(CAMERA, tilt_y_deg=tilt_deg), seed=2003 + k))
-    write_video(tmp_path / "board.avi", np.stack(moved))
+    write_video(tmp_path / "board.avi", np.stack(moved), codec="ffv1", pix_fmt="gray")
     found = calibrate(charuco(image="board.avi"), tmp_path, 960, 320)
     error, stated = scale_error(found)
     assert abs(error) < min(1e-3, 3 * stated)

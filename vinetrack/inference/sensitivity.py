@@ -169,7 +169,8 @@ class Motions:
             out.append(averaged)
             stamps.append(self.batch.stamps[first:last][middle])
             times.append(self.batch.arrays.times[first:last][middle])
-        batch = replace(self.batch, stamps=np.concatenate(stamps), times=np.concatenate(times), starts=starts_of(times))
+        arrays = self.batch.arrays._replace(times=np.concatenate(times), starts=starts_of(times))
+        batch = replace(self.batch, stamps=np.concatenate(stamps), arrays=arrays)
         return replace(self, batch=batch, out=np.concatenate(out))
 
     def rows(self, first: int, last: int) -> Floats:

@@ -157,8 +157,10 @@ class Filming:
 
 def make_filming(content: dict[str, Any]) -> Filming:
     """Read how trials are filmed from a YAML mapping."""
-    target = {key: tuple(value) if key == "squares" else value for key, value in content.get("target", {}).items()}
-    return Filming(**content | {"camera": Camera(**content.get("camera", {})), "target": Target(**target)})
+    target = dict(content.get("target", {}))
+    if "squares" in target:
+        target["squares"] = tuple(target["squares"])
+    return Filming(**{**content, "camera": Camera(**content.get("camera", {})), "target": Target(**target)})
 
 
 def scene_of(stated: Trial, filming: Filming) -> Scene:
