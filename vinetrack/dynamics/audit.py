@@ -19,7 +19,7 @@ import pandas as pd
 from vinetrack.core.records import Floats, Kinematics, Trial
 from vinetrack.dynamics.kernel import Trace
 from vinetrack.dynamics.model import Model, check_needs, effects_on, trial_inputs
-from vinetrack.effects import Effect, EffectError, State, TrialInputs, catalogue
+from vinetrack.effects import HOOKS, Effect, EffectError, State, TrialInputs, catalogue
 
 # ------------------------------------------------------------------------------
 # Forces, pressure and masses of a model along a known motion, effect by effect.
@@ -58,21 +58,25 @@ def evaluate(
     lead_velocity_m_s, measured_Pa (n,).
     """
     check_needs(model, trial)
-    rig = trial_inputs(trial)
-    hooks = _HookCaller(model, trial, measured=measured_Pa is not None)
+    hooks = _Hooks(model, trial, measured=measured_Pa is not None)
+    rig = hooks.rig
     state = _initial_state(
         trial, rig, *(np.asarray(a, dtype=float) for a in (time_s, lead_position_m, lead_velocity_m_s))
     )
     ones, nothing = np.ones_like(state.time), np.zeros_like(state.time)
-    film = np.prod([ones, *hooks.each("film_gain", state, rig).values()], axis=0)
+    film = np.prod([ones, *hooks.each("film_gain", state).values()], axis=0)
     film_mass = film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position)
     moving_mass = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
     state = state._replace(moving_mass=moving_mass, linear_density=rig.linear_density * film)
-    state = _with_pressure(hooks, state, rig, measured_Pa)
-    state = hooks.changed("damping_gain", state, rig, "damping_gain")
-    tip, tail = hooks.each("tip_force", state, rig), hooks.each("tail_force", state, rig)
+    state = hooks.changed("damping_gain", _with_pressure(hooks, state, measured_Pa))
+    tip, tail = hooks.each("tip_force", state), hooks.each("tail_force", state)
     tension = sum(tip.values(), nothing) / rig.travel_ratio
-    inertia = inertia_kg(film_mass, sum(hooks.each("added_mass", state, rig).values(), nothing), rig)
+    # Everything that moves with the tail. The floor of the film's mass is that of fold and gas: mass that effects add
+    # counts towards it. Mass that they remove is the payload's, not that of film, which goes to zero during growth;
+    # fold and gas remain.
+    added = sum(hooks.each("added_mass", state).values(), nothing)
+    with_film = np.maximum(film_mass + np.maximum(added, 0.0), rig.least_mass)
+    inertia = np.asarray(np.maximum(with_film + np.minimum(added, 0.0) + rig.payload_mass, rig.least_mass))
     return Terms(
         pressure_Pa=np.asarray(state.pressure),
         area_m2=np.asarray(state.area),
@@ -86,44 +90,32 @@ def evaluate(
     )
 
 
-def inertia_kg(film_mass: Floats, added_mass: Floats, rig: TrialInputs) -> Floats:
-    """Everything that moves with the tail. The floor of the film's mass is that of fold and gas: mass that effects add
-    to the tail counts towards it. Mass that they remove is that of the payload, not film, which goes to zero during
-    growth; fold and gas remain. Shapes: film_mass, added_mass (n,) → (n,).
-    """
-    tail = np.maximum(film_mass + np.maximum(added_mass, 0.0), rig.least_mass)
-    return np.asarray(np.maximum(tail + np.minimum(added_mass, 0.0) + rig.payload_mass, rig.least_mass))
-
-
-class _HookCaller:
-    """Calls the hooks of a model's effects with the parameters of one trial's vine."""
+class _Hooks:
+    """The functions of a model's effects, called with the inputs of one trial and the parameters of its vine."""
 
     def __init__(self, model: Model, trial: Trial, measured: bool) -> None:
+        self.rig = trial_inputs(trial)
         theta = model.parameters_of(trial)
-        self.arguments = {effect.name: theta[place].tolist() for effect, place in zip(model, model.places, strict=True)}
-        acting = [e for e, acts in zip(model, effects_on(model, theta[None, :])[0], strict=True) if acts]
+        on = effects_on(model, theta[None, :])[0]
         # A measured pressure includes everything that happens in the chamber.
-        self.effects = sorted((e for e in acting if not (e.in_trace and measured)), key=lambda effect: effect.order)
+        acts = [bool(on[i]) and not (effect.in_trace and measured) for i, effect in enumerate(model)]
+        self.calls = {
+            hook: [(model.names[i], function, theta[place].tolist()) for i, function, place in calls if acts[i]]
+            for hook, calls in model.hooks.items()
+        }
 
-    def has(self, hook: str) -> bool:
-        return any(hook in effect.functions for effect in self.effects)
-
-    def changed(self, hook: str, state: State, rig: TrialInputs, name: str) -> State:
-        """The state after all effects in turn, each of which changes the field `name`."""
-        for effect in self.effects:
-            if hook in effect.functions:
-                value: dict[str, Any] = {name: effect.functions[hook](state, rig, *self.arguments[effect.name])}
-                state = state._replace(**value)
+    def changed(self, hook: str, state: State) -> State:
+        """The state after all effects in turn, each of which changes the same field."""
+        for _, function, values in self.calls.get(hook, ()):
+            state = state._replace(**{str(HOOKS[hook]): function(state, self.rig, *values)})
         return state
 
-    def each(self, hook: str, state: State, rig: TrialInputs) -> dict[str, Floats]:
+    def each(self, hook: str, state: State) -> dict[str, Floats]:
         """The value of each effect by itself."""
-        found = {
-            effect.name: np.asarray(effect.functions[hook](state, rig, *self.arguments[effect.name]), dtype=float)
-            for effect in self.effects
-            if hook in effect.functions
+        return {
+            name: np.broadcast_to(np.asarray(function(state, self.rig, *values), dtype=float), np.shape(state.time))
+            for name, function, values in self.calls.get(hook, ())
         }
-        return {name: np.broadcast_to(value, np.shape(state.time)) for name, value in found.items()}
 
 
 def _initial_state(trial: Trial, rig: TrialInputs, time: Floats, position: Floats, velocity: Floats) -> State:
@@ -151,32 +143,31 @@ def _initial_state(trial: Trial, rig: TrialInputs, time: Floats, position: Float
     return State(**fields)
 
 
-def _with_pressure(hooks: _HookCaller, state: State, rig: TrialInputs, measured_Pa: Floats | None) -> State:
+def _with_pressure(hooks: _Hooks, state: State, measured_Pa: Floats | None) -> State:
     """Gauge, chamber, area and losses, in the order of the physics."""
-    state = hooks.changed("gauge", state, rig, "pressure")
-    state = state._replace(set_pressure=state.pressure)
-    state = hooks.changed("yield_gauge", state, rig, "yield_pressure")
+    state = hooks.changed("gauge", state)
+    state = hooks.changed("yield_gauge", state._replace(set_pressure=state.pressure))
     if measured_Pa is not None:
         measured: Any = np.asarray(measured_Pa, dtype=float)
-        state = hooks.changed("gauge", state._replace(pressure=measured), rig, "pressure")
-    elif hooks.has("chamber_rate"):
-        state = state._replace(pressure=_chamber_pressure(hooks, state, rig))
-    return _with_consistent_area(hooks, state, rig)
+        state = hooks.changed("gauge", state._replace(pressure=measured))
+    elif hooks.calls.get("chamber_rate"):
+        state = state._replace(pressure=_chamber_pressure(hooks, state))
+    return _with_consistent_area(hooks, state)
 
 
-def _with_consistent_area(hooks: _HookCaller, state: State, rig: TrialInputs) -> State:
+def _with_consistent_area(hooks: _Hooks, state: State) -> State:
     """Area and pressure at the tip that are consistent with each other, from the pressure in the chamber."""
     start, plain = state.pressure, state.area
     area = plain
     for turn in range(30):
-        previous_area, area = area, hooks.changed("area", state._replace(area=plain), rig, "area").area
+        previous_area, area = area, hooks.changed("area", state._replace(area=plain)).area
         if turn > 0 and np.all(np.abs(area - previous_area) <= 1e-10 * area):
             break
-        state = hooks.changed("pressure", state._replace(area=area, pressure=start), rig, "pressure")
+        state = hooks.changed("pressure", state._replace(area=area, pressure=start))
     return state._replace(area=area)
 
 
-def _chamber_pressure(hooks: _HookCaller, state: State, rig: TrialInputs) -> Any:
+def _chamber_pressure(hooks: _Hooks, state: State) -> Any:
     """Pressure of a chamber with an equation of its own. Exponential integration from point to point with the motion
     frozen half-way, exact to first order in the pressure: it is stable for a supply that is faster than the steps.
     """
@@ -185,9 +176,9 @@ def _chamber_pressure(hooks: _HookCaller, state: State, rig: TrialInputs) -> Any
     half_way = [0.5 * (values[1:] + values[:-1]) for values in fields]
 
     def rate(i: int, pressure: float) -> float:
-        state_here = State(*(float(values[i]) for values in half_way))._replace(pressure=pressure)
-        state_here = _with_consistent_area(hooks, state_here, rig)._replace(pressure=pressure)
-        return sum(float(value) for value in hooks.each("chamber_rate", state_here, rig).values())
+        here = State(*(float(values[i]) for values in half_way))._replace(pressure=pressure)
+        here = _with_consistent_area(hooks, here)._replace(pressure=pressure)
+        return sum(float(value) for value in hooks.each("chamber_rate", here).values())
 
     pressure = np.empty(shape)
     pressure[0] = float(fields[State._fields.index("set_pressure")][0])

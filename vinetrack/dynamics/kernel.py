@@ -101,7 +101,7 @@ def {name}({arguments}):
     {calls("damping_gain", "gain =")}
     {calls("tip_force", "tip +=")}
     {calls("tail_force", "tail +=")}"""
-    # Everything that moves with the tail (`vinetrack.dynamics.audit.inertia_kg`): mass that effects add has no weight
+    # Everything that moves with the tail (`vinetrack.dynamics.audit.evaluate`): mass that effects add has no weight
     # of its own, so it is added after the forces.
     added = f"""added = 0.0
     {calls("added_mass", "added +=")}
@@ -338,11 +338,8 @@ def _limits(
     end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
     everting_mass_kg = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
     mass_loss_kg_m = np.asarray(rig.mass_loss)
-    floor_x_m = np.where(
-        mass_loss_kg_m > 0,
-        np.maximum(everting_mass_kg, 0.0) / np.where(mass_loss_kg_m > 0, mass_loss_kg_m, 1.0),
-        math.inf,
-    )
+    never = np.full(len(inputs), math.inf)
+    floor_x_m = np.divide(np.maximum(everting_mass_kg, 0.0), mass_loss_kg_m, out=never, where=mass_loss_kg_m > 0)
     with_breakpoints = [
         i for i, effect in enumerate(model.effects) if effect.breakpoints is not None and on[:, i].any()
     ]
