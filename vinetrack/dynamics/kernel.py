@@ -292,18 +292,18 @@ def lay_out(
     else:
         on = effects_on(model, thetas)
     breakpoints, stops = _limits(model, inputs, thetas, on, bends)
-    times = _true_times(model, inputs, thetas, on, stamps, starts)
-    traces = _true_traces(model, inputs, thetas, on, traces) if traces is not None else [None] * count
-    given = [trace for trace in traces if trace is not None]
+    rows = [stamps[a:b] for a, b in itertools.pairwise(starts.tolist())]
+    samples = [np.empty(0) if trace is None else trace[0] for trace in traces] if traces else [np.empty(0)] * count
+    pressures = [trace[1] for trace in traces or () if trace is not None]
     arrays = BatchArrays(
         starts=starts,
-        times=times,
+        times=np.concatenate([np.empty(0), *_true_times(model, "true_time", inputs, thetas, on, rows)]),
         on=on,
         inputs=inputs,
         thetas=thetas,
-        trace_starts=starts_of([() if trace is None else trace[0] for trace in traces] if given else [()] * count),
-        trace_time=np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0),
-        trace_pressure=np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0),
+        trace_starts=starts_of(samples),
+        trace_time=np.concatenate([np.empty(0), *_true_times(model, "trace_time", inputs, thetas, on, samples)]),
+        trace_pressure=np.concatenate([np.empty(0), *pressures]),
         bend_starts=starts_of(bends),
         bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
         breakpoints=breakpoints,
@@ -364,28 +364,13 @@ def _limits(
 
 
 def _true_times(
-    model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Floats, starts: NDArray[np.int64]
-) -> Floats:
-    """True times of the camera's stamps, for all trials concatenated, shape (n_times,)."""
-    true_times = stamps
-    for effect, function, place in model.hooks["true_time"]:
-        true_times = true_times.copy()
-        for i in np.flatnonzero(on[:, effect]):
-            of_trial = slice(starts[i], starts[i + 1])
-            state = _NOTHING._replace(time=true_times[of_trial])  # type: ignore[arg-type]
-            true_times[of_trial] = function(state, TrialInputs(*inputs[i]), *thetas[i, place])
-    return true_times
-
-
-def _true_traces(
-    model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
-) -> list[Trace | None]:
-    """Measured pressures of each trial at the true times of their samples."""
-    in_time = list(traces)
-    for effect, function, place in model.hooks["trace_time"]:
+    model: Model, hook: str, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Sequence[Floats]
+) -> list[Floats]:
+    """True times since release of each trial's stamps, by the effects on the clock that stamped them."""
+    true_times = list(stamps)
+    for effect, function, place in model.hooks[hook]:
         for i in np.flatnonzero(on[:, effect]).tolist():
-            if (trace := in_time[i]) is None:
-                continue
-            state = _NOTHING._replace(time=trace[0])  # type: ignore[arg-type]
-            in_time[i] = np.asarray(function(state, TrialInputs(*inputs[i]), *thetas[i, place]), dtype=float), trace[1]
-    return in_time
+            if len(true_times[i]):
+                state = _NOTHING._replace(time=true_times[i])  # type: ignore[arg-type]
+                true_times[i] = np.asarray(function(state, TrialInputs(*inputs[i]), *thetas[i, place]), dtype=float)
+    return true_times
