@@ -1,8 +1,22 @@
 """The interface of the integrator to one model and one trial: compiled functions and the arrays that they use.
 
-`vinetrack.dynamics.kernel` writes the functions of one model and collects them in an `Equations`, the first argument of
-the integrator. For numba the `Equations` of every model are a type of their own (`EquationsType`), so that the
-integrator is compiled for each model and the calls can be inlined.
+`vinetrack.dynamics.kernel` writes the functions of one model as a module, the first argument `equations` of the
+integrator. Numba has a type for each module, so that the integrator is compiled for each model and the calls can be
+inlined. Unless stated they take `(time, x, v, chamber, trial)`: x, v are position and speed of the tail, m and m/s,
+`chamber` is the gauge pressure of the chamber, Pa.
+
+rates               acceleration of the tail, m/s², and rate of change of the chamber's pressure, Pa/s
+rest_acceleration   of a vine at rest (no v), including the forces that hold it
+observed            position of the leading edge that the camera reports, m
+first_chamber       pressure of the chamber at release, of (trial) alone
+has_chamber         whether an effect gives the chamber an equation of its own, of no argument
+row_delay           how much later rows are read by the metre, s/m, of (trial) alone
+averaged_over       square of the time that positions are averaged over, s², of (trial) alone
+tip_tension         tension left for the tail, N, and rate of the chamber; one more argument, whether it rests
+free_fall           acceleration of a slack tail, m/s², of (time, y, ẏ, x, v, chamber, trial)
+
+The last two are there where tails may go slack. So are `slack_fraction`, `slack_at_rest` and `follow_slack` of
+`vinetrack.dynamics.integrator`; elsewhere they are `_never_slack`, `_not_slack_at_rest` and `_no_slack_phase` below.
 
 The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a coverage tool follows every line.
 """
@@ -10,15 +24,10 @@ The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
-from numba.core.imputils import lower_constant, lower_getattr_generic
-from numba.core.typing.templates import AttributeTemplate
-from numba.extending import infer_getattr, models, register_model, typeof_impl
+from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
@@ -76,65 +85,6 @@ def _not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
 @inlined
 def _no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
     return TAUT, row, start, 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Equations:
-    """The compiled functions of one model, called with `(time, x, v, chamber, trial)` unless stated. x, v are position
-    and speed of the tail, m and m/s; `chamber` is the gauge pressure of the chamber, Pa. The last five are of
-    `vinetrack.dynamics.integrator` and for them, where tails may go slack.
-    """
-
-    name: str  #: of the model, unique in a process: it distinguishes numba's types
-    rates: Callable  #: acceleration of the tail, m/s², and rate of change of the chamber's pressure, Pa/s
-    rest_acceleration: Callable  #: of a vine at rest (no v), including the forces that hold it
-    observed: Callable  #: position of the leading edge that the camera reports, m
-    first_chamber: Callable  #: pressure of the chamber at release, of (trial) alone
-    has_chamber: Callable  #: whether an effect gives the chamber an equation of its own, of no argument
-    row_delay: Callable  #: how much later rows are read by the metre, s/m, of (trial) alone
-    averaged_over: Callable  #: square of the time that positions are averaged over, s², of (trial) alone
-    slack_fraction: Callable = _never_slack
-    slack_at_rest: Callable = _not_slack_at_rest
-    follow_slack: Callable = _no_slack_phase
-    tip_tension: Callable | None = None  #: tension left for the tail, N, and rate of the chamber; one more argument
-    free_fall: Callable | None = None  #: acceleration of a slack tail, m/s², at (time, y, ẏ, x, v, chamber, trial)
-
-
-class EquationsType(types.Opaque):
-    """Numba's type for the `Equations` of one model: no data at run time; its attributes are compiled functions. A
-    tuple of functions would work too, but numba passes its functions by their memory addresses, and then cannot cache
-    the compiled form for the next process.
-    """
-
-    def __init__(self, equations: Equations) -> None:
-        self.equations = equations
-        super().__init__(f"Equations({equations.name})")
-
-
-register_model(EquationsType)(models.OpaqueModel)
-
-
-@typeof_impl.register(Equations)
-def _type_of_equations(value: Equations, _context: Any) -> EquationsType:
-    return EquationsType(value)
-
-
-@infer_getattr
-class _EquationsAttributes(AttributeTemplate):
-    key = EquationsType
-
-    def generic_resolve(self, value: EquationsType, attr: str) -> Any:  # type: ignore[override]
-        return types.Dispatcher(getattr(value.equations, attr))
-
-
-@lower_constant(EquationsType)
-def _lower_equations(context: Any, _builder: Any, _type: Any, _value: Any) -> Any:
-    return context.get_dummy_value()
-
-
-@lower_getattr_generic(EquationsType)
-def _lower_function(context: Any, _builder: Any, _type: Any, _value: Any, _attribute: str) -> Any:
-    return context.get_dummy_value()
 
 
 class Point(NamedTuple):

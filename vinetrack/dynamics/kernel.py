@@ -1,8 +1,8 @@
 """The sum of the effects of a model as one compiled function, generated as Python source.
 
 The effects are plain Python functions in separate files. This module writes a small module that calls them in the order
-of the physics and passes the result, an `Equations`, to the integrator. It is compiled once and cached under a hash of
-everything it depends on, so that other processes find the compiled form.
+of the physics and passes itself to the integrator. It is compiled once and cached under a hash of everything it depends
+on, so that other processes find the compiled form.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _STATE = (
 
 
 def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
-    """Source of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects."""
+    """Source of the module with the functions of this sum of effects: see `vinetrack.dynamics.equations`."""
     model = Model(tuple(effects))
     loads: dict[str, str] = {}
 
@@ -135,27 +135,32 @@ def {name}({arguments}):
     for hook in ("row_delay", "averaged_over"):
         summed = "total = 0.0", calls(hook, "total +="), "return total"
         functions.append(function(hook, "trial", released, *summed, at_release=True))
-    fields = "rates, rest_acceleration, observed, first_chamber, has_chamber, row_delay, averaged_over"
+    slack = """from vinetrack.dynamics.equations import _never_slack as slack_fraction
+from vinetrack.dynamics.equations import _no_slack_phase as follow_slack
+from vinetrack.dynamics.equations import _not_slack_at_rest as slack_at_rest"""
     if tail_free:
+        slack = "from vinetrack.dynamics.integrator import follow_slack, slack_at_rest, slack_fraction"
         resting = f"if resting:\n        {calls('rest_force', 'tip +=', 8) or 'pass'}"
         tension = "return tip / rig.travel_ratio, chamber_rate"
         functions += [
             function("tip_tension", "time, x, v, chamber, resting, trial", moving, terms, resting, chamber, tension),
             function("free_fall", "time, y, ydot, x, v, chamber, trial", "", terms, "return tail / mass"),
         ]
-        fields += ", slack_fraction, slack_at_rest, follow_slack, tip_tension, free_fall"
     loaded = "\n".join(loads.values())
     return f"""\"""Machine-made: a sum of effects, for the integrator of vinetrack.dynamics.\"""
 
+import sys
+
 from numba import njit
 
-from vinetrack.dynamics.equations import Equations, angle_passed, inlined, trace_at
-from vinetrack.dynamics.integrator import follow_slack, integrate_trials, slack_at_rest, slack_fraction
+from vinetrack.dynamics.equations import angle_passed, inlined, trace_at
+from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.effects import State, TrialInputs
+{slack}
 
 {loaded}
 {"".join(functions)}
-EQUATIONS = Equations(__name__, {fields})
+EQUATIONS = sys.modules[__name__]
 
 
 # Only the outermost function is called from Python; what it calls is compiled into it, and kept with it.
