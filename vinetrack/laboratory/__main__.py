@@ -37,7 +37,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
     given = parser.parse_args(arguments)
     experiment = read_experiment(given.experiment, strict=True)
-    path = given.nature or _truth_of(experiment)
+    named = Path(__file__).with_name(f"{experiment.name}.yaml")
+    path = given.nature or (named if named.exists() else DEMO)
     truth, content = read_ground_truth(path), yaml.safe_load(path.read_text(encoding="utf-8"))
     filming = make_filming(content.get("filming", {}))
     chosen = [trial for trial in experiment.trials if fnmatch.fnmatch(trial.name, given.only)]
@@ -51,11 +52,9 @@ def main(arguments: list[str] | None = None) -> None:
         chosen = list(experiment.trials)
     grown = grow(chosen, truth)
     filmed = [trial for trial in grown if trial.stated.video is not None]
-    measured = [trial for trial in grown if trial.stated.track is not None]
-    for folder in {trial.stated.track.parent for trial in measured if trial.stated.track is not None}:
-        write_tracks(
-            [trial for trial in measured if trial.stated.track and trial.stated.track.parent == folder], folder
-        )
+    for trial in grown:
+        if trial.stated.track is not None:
+            write_tracks([trial], trial.stated.track.parent)
     if filmed:
         n_frames = sum(trial.track.time_s.size for trial in filmed)
         print(
@@ -65,12 +64,6 @@ def main(arguments: list[str] | None = None) -> None:
         _film(experiment, filmed, filming, truth.seed, given.processes)
     n_frames = sum(trial.track.time_s.size for trial in grown)
     print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
-
-
-def _truth_of(experiment: Experiment) -> Path:
-    """File with the ground truth of an experiment of this name, or else of the demonstration."""
-    beside_this_file = Path(__file__).with_name(f"{experiment.name}.yaml")
-    return beside_this_file if beside_this_file.exists() else DEMO
 
 
 def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, seed: int, processes: int) -> None:
