@@ -72,11 +72,8 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             phase = at_rest if point.v <= 0 else moving
             time, x, v, _acceleration, chamber = point
             acceleration, _rate = _rates(equations, time, x, v, chamber, trial)
-            point, speed_scale, previous_stages = (
-                Point(time, x, v, acceleration, chamber),
-                max(speed_scale, v),
-                NO_STAGES,
-            )
+            point, previous_stages = Point(time, x, v, acceleration, chamber), NO_STAGES
+            speed_scale = max(speed_scale, v)
             h = 1e-2 * max(v, 1e-3 * speed_scale) / max(abs(acceleration), 1e-9)
         if phase == at_rest:
             if _rest_acceleration(equations, point.time, point.x, point.chamber, trial) <= 0:
