@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from by_hand import LOADED as HANGING
-from by_hand import N
+from by_hand import N, followed
 from scipy.integrate import solve_ivp
 from vine_reference import G, masses, reference
 
@@ -97,14 +97,10 @@ def test_other_exponents(n: float) -> None:
 
 
 def test_an_exponent_above_one_where_the_start_is_smooth() -> None:
-    mass, k = masses(LOADED), 6.44 / 2
-
-    def slope(_t: float, state: np.ndarray) -> tuple[float, float]:
-        moving = float(mass.moving(state[0]))
-        return state[1], (0.5 * 11e3 * LOADED.area_m2 - k * max(state[1], 0.0) ** 1.7) / moving + G
-
+    drive, mass = 0.5 * 11e3 * LOADED.area_m2, masses(LOADED)
+    travel = followed(lambda _t, x, v: (drive - 6.44 / 2 * v**1.7) / float(mass.moving(x)) + G, 2 * LOADED.length_m)
     times_s = np.linspace(0, 0.25, 40)
-    truth = solve_ivp(slope, (0, 0.25), [0.0, 0.0], "DOP853", rtol=1e-12, atol=1e-14, t_eval=times_s).y[0]
+    truth = travel(times_s)
     found = simulate(with_damping(6.44, 1.7), LOADED, times_s)
     assert truth[-1] < 2 * LOADED.length_m
     assert np.abs(2 * found.lead_position_m - truth).max() <= 1e-6 * truth[-1]

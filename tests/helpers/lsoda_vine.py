@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.schema import with_names
+from vinetrack.laboratory.tracks import Vine
 from vinetrack.tracks.position_noise import ar1_noise
 
 FPS = 1000.0
@@ -21,17 +23,8 @@ NOISE_M = 1e-4
 
 def vine_trial(name: str, pressure_kPa: float, diameter_mm: float = 24.0, **more: object) -> Trial:
     """A trial of an everting vine straight down, P_y 3 kPa, wall D/120, length 11.67 D."""
-    settings: dict[str, object] = {
-        "capture_fps": FPS,
-        "diameter_m": diameter_mm / 1e3,
-        "thickness_m": diameter_mm / 120e3,
-        "length_m": 0.28 * diameter_mm / 24,
-        "pressure_Pa": 1e3 * pressure_kPa,
-        "pressure_sigma_Pa": 10 * pressure_kPa,
-        "yield_pressure_Pa": 3e3,
-        "yield_pressure_sigma_Pa": 200.0,
-    }
-    return Trial(name=name, **{**settings, **more})  # type: ignore[arg-type]
+    vine = Vine(diameter_mm, diameter_mm / 0.12, 280 * diameter_mm / 24)
+    return replace(vine.trial(name, pressure_kPa, capture_fps=FPS), **more)  # type: ignore[arg-type]
 
 
 def grown_position(
