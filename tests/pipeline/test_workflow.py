@@ -20,8 +20,10 @@ from vinetrack.pipeline.workflow import (
     RunPaths,
     begin_run,
     check_before_run,
+    check_folder,
     command_for_results,
     make_plan,
+    path_problems,
     run_chain,
     run_lines,
     run_paths,
@@ -120,16 +122,12 @@ def test_a_track_with_a_brace_in_its_name_is_analysed_and_watched_by_its_time(tm
 
 
 def test_programs_of_this_python_come_first_without_an_environment_activated() -> None:
-    import sys
-
     path = shell_prefix().split("PATH=", 1)[1].split(":", 1)[0]
     assert shlex.split(path) == [str(Path(sys.executable).parent)]
 
 
 @pytest.mark.parametrize("name", ["a{b}", "<b>x"])
 def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path: Path, name: str) -> None:
-    from vinetrack.pipeline.workflow import check_folder
-
     (tmp_path / name).mkdir()
     (tmp_path / name / "trials.csv").write_text("trial\n")
     reasons = [problem.message for problem in check_folder(tmp_path / name).problems]
@@ -137,8 +135,6 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
 
 
 def test_a_folder_with_marks_blanks_and_quotes_is_no_pattern(tmp_path: Path) -> None:
-    from vinetrack.pipeline.workflow import path_problems
-
     assert path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
 
 
