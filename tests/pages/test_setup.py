@@ -80,6 +80,7 @@ def test_a_name_says(name: str, cells: dict[str, str]) -> None:
 def test_a_unit_that_all_names_share_is_kept_and_mixed_ones_are_converted() -> None:
     assert columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
     assert columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
+    assert columns_from_names(["30kPa.mp4", "4psi.mp4"]) == [{"pressure_kPa": "30"}, {"pressure_kPa": "27.579"}]
 
 
 def test_tables_are_offered_as_pressure_traces(tmp_path: Path) -> None:
@@ -125,6 +126,15 @@ def test_a_sheet_that_is_there_keeps_every_cell_and_gains_a_row(folder: Path) ->
     assert "old;a.mp4;24,5;keep me" in text
     assert "d12_30kPa_1;d12_30kPa_1.mp4;30" in text
     assert (folder / "experiment.yaml").read_text() == SETTINGS
+
+
+def test_a_scale_of_all_recordings_is_not_asked_for_again(folder: Path) -> None:
+    (folder / "experiment.yaml").write_text(f"{SETTINGS}mm_per_px: 0.3\n")
+    lines: list[str] = []
+    write_templates(folder, lines.append)
+    (blanks,) = [line for line in lines if line.startswith("To fill in")]
+    assert "capture_fps" in blanks
+    assert "calibration" not in blanks
 
 
 def test_files_that_changed_since_are_left_alone(folder: Path) -> None:

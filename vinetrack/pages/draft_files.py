@@ -19,6 +19,7 @@ from vinetrack.core.records import CONTAINERS, IMAGES, Correction
 from vinetrack.core.tables import (
     MIN_PICTURES,
     PROVENANCE,
+    Table,
     TableError,
     entries,
     is_calibration,
@@ -30,10 +31,37 @@ from vinetrack.core.tables import (
     with_value,
     write_text,
 )
-from vinetrack.core.units import UNITS, convert, other_units, split_unit
+from vinetrack.core.units import convert, other_units, split_unit
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import SHEET
+
+# ------------------------------------------------------------------------------
+# A quantity has one column in a table, in whichever unit.
+
+
+def quantity(name: str) -> str:
+    """The name of a column without its unit."""
+    return split_unit(name)[0]
+
+
+def column_of(name: str, columns: Iterable[str]) -> str:
+    """The column that holds the quantity of a name, whatever its unit; the name itself if there is none."""
+    return next((column for column in columns if quantity(column) == quantity(name)), name)
+
+
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
+
+
+def in_unit_of(column: str, name: str, cell: str, decimal: str = ".") -> str:
+    """A cell of the column `name` in the unit of another of the same quantity; numbers get the decimal mark."""
+    if not _NUMBER.fullmatch(cell):
+        return cell
+    number = cell.replace(",", ".")
+    if name != column:
+        number = f"{convert(float(number), split_unit(name)[1], split_unit(column)[1]):.6g}"
+    return number.replace(".", decimal)
+
 
 # ------------------------------------------------------------------------------
 # Editing of the trial sheet: cells as text, with those of an existing sheet preserved.
@@ -42,29 +70,11 @@ from vinetrack.experiment.sheet import SHEET
 FIRST_COLUMNS = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
 
 
-@dataclass(frozen=True)
-class SheetDraft:
-    """Rows of cells by column, as text; `delimiter` and `decimal` are those of the existing sheet."""
-
-    columns: tuple[str, ...]
-    rows: tuple[Mapping[str, str], ...]
-    delimiter: str = ","
-    decimal: str = "."
-
-    def text(self) -> str:
-        """Return the sheet as CSV text."""
-        out = io.StringIO()
-        writer = csv.writer(out, delimiter=self.delimiter, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows([row.get(column, "") for column in self.columns] for row in self.rows)
-        return out.getvalue()
-
-
-def read_draft(folder: Path) -> SheetDraft:
-    """Read the sheet of a folder as a draft; without rows if there is none."""
+def read_sheet(folder: Path) -> Table:
+    """Read the sheet of a folder; without rows if there is none."""
     path = folder / SHEET
     if not path.exists():
-        return SheetDraft(FIRST_COLUMNS, ())
+        return Table(FIRST_COLUMNS, (), (), (), ",", ".")
     try:
         table = read_table(path)
     except TableError as error:
@@ -74,40 +84,37 @@ def read_draft(folder: Path) -> SheetDraft:
         message = "has cells without a column, which would be lost"
         remedy = "name their columns in the first line, or remove them"
         raise ExperimentError([Problem(message=message, file=SHEET, line=loose[0] if loose else 1, remedy=remedy)])
-    return SheetDraft(table.columns, table.rows, table.delimiter, table.decimal)
+    return table
 
 
-def with_recordings(draft: SheetDraft, recordings: Sequence[str], shared: Mapping[str, object]) -> SheetDraft:
-    """Return the draft with a row added for each recording that has none, filled in from the recordings' names."""
-    named = {_path(row.get("video", "")) for row in draft.rows}
+def cells_of(sheet: Table) -> list[list[str]]:
+    """The header and the cells of a sheet."""
+    return [list(sheet.columns), *([row.get(column, "") for column in sheet.columns] for row in sheet.rows)]
+
+
+def with_recordings(sheet: Table, recordings: Sequence[str], shared: Mapping[str, object]) -> Table:
+    """Return the sheet with a row added for each recording that has none, filled in from the recordings' names."""
+    named = {_path(row.get("video", "")) for row in sheet.rows}
     new = [recording for recording in recordings if _path(recording) not in named]
     if not new:
-        return draft
-    names = trial_names(new, [row.get("trial", "") for row in draft.rows])
-    columns = list(draft.columns)
-    rows: list[Mapping[str, str]] = list(draft.rows)
-    present = {split_unit(column)[0]: column for column in columns}
+        return sheet
+    names = trial_names(new, [row.get("trial", "") for row in sheet.rows])
+    columns, rows = list(sheet.columns), list(sheet.rows)
     for recording, name, guess in zip(new, names, columns_from_names(new), strict=True):
         row = {"trial": name, "video": recording}
         for column, cell in guess.items():
-            quantity = split_unit(column)[0]
-            if str(shared.get(column, "")) == cell:
+            present = column_of(column, columns)
+            # Cells of an existing sheet keep their units.
+            if str(shared.get(column, "")) == cell or (present != column and sheet.rows):
                 continue
-            if present.get(quantity, column) != column and (draft.rows or quantity not in _first_quantities()):
-                continue
-            if present.get(quantity, column) != column:
-                columns[columns.index(present[quantity])] = column
+            if present != column:
+                columns[columns.index(present)] = column
             elif column not in columns:
                 columns.append(column)
-            present[quantity] = column
-            row[column] = cell.replace(".", draft.decimal or ".")
+            row[column] = cell.replace(".", sheet.decimal or ".")
         rows.append(row)
     missing = [column for column in ("trial", "video") if column not in columns]
-    return replace(draft, columns=(*missing, *columns), rows=tuple(rows))
-
-
-def _first_quantities() -> set[str]:
-    return {split_unit(column)[0] for column in FIRST_COLUMNS}
+    return replace(sheet, columns=(*missing, *columns), rows=tuple(rows))
 
 
 def _path(text: str) -> str:
@@ -165,42 +172,26 @@ def _comment(key: str) -> str:
 
 def shared_values(text: str) -> dict[str, Any]:
     """Return the columns that the settings set for all trials, under the names (and units) used there."""
-    quantities = {split_unit(name)[0] for name in SHARED}
+    quantities = set(map(quantity, SHARED))
     content = parse_yaml(text, SETTINGS).content
-    return {
-        key: value
-        for key, value in content.items()
-        if value is not None and (key in SHARED or split_unit(str(key))[0] in quantities)
-    }
+    return {key: value for key, value in content.items() if value is not None and quantity(str(key)) in quantities}
 
 
 def with_shared(text: str, values: Mapping[str, str]) -> str:
-    """Return the settings with columns set or cleared for all trials; other keys and all comments are kept."""
+    """Return the settings with columns set or cleared for all trials; other keys and all comments are kept. A key of
+    the same quantity in another unit is renamed, or goes, since it would be refused even if it were blank.
+    """
     content = parse_yaml(text, SETTINGS).content
     for key, cell in values.items():
-        for other in [name for name in content if name != key and _same_quantity(str(name), key)]:
-            text = _renamed(text, str(other), "" if key in content else key)
-            if key not in content:
-                content[key] = content[other]
-        value = _value(cell)
-        if value is None and content.get(key) is None:
-            continue
-        if value is not None and content.get(key) is not None and str(content[key]) == str(value):
-            continue
-        text = with_value(text, key, value, SETTINGS)
+        for other in [name for name in map(str, content) if name != key and quantity(name) == quantity(key)]:
+            if split_unit(other)[1]:
+                line = re.compile(rf"^{re.escape(other)}(\s*:)(.*\n?)", re.MULTILINE)
+                text = line.sub("" if key in content else rf"{key}\1\2", text, count=1)
+                content.setdefault(key, content[other])
+        value, present = _value(cell), content.get(key)
+        if value != present and (None in (value, present) or str(value) != str(present)):
+            text = with_value(text, key, value, SETTINGS)
     return text
-
-
-def _renamed(text: str, key: str, to: str) -> str:
-    """The settings with a top-level key under another name, or without its line: a blank key beside the same quantity
-    in another unit would be refused.
-    """
-    line = re.compile(rf"^{re.escape(key)}(\s*:)(.*\n?)", re.MULTILINE)
-    return line.sub(rf"{to}\1\2" if to else "", text, count=1)
-
-
-def _same_quantity(name: str, other: str) -> bool:
-    return split_unit(name)[0] == split_unit(other)[0] and bool(split_unit(name)[1])
 
 
 def _value(cell: str) -> Any:
@@ -215,6 +206,9 @@ def _value(cell: str) -> Any:
     return read if isinstance(read, int | float | bool | str) else cell
 
 
+# ------------------------------------------------------------------------------
+# A draft: sheet, settings and corrections not yet written.
+
 FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)  # The only files that are written
 
 
@@ -222,10 +216,16 @@ FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)  # The only files that are written
 class Draft:
     """A sheet, settings and corrections not yet written; `stamp` is the fingerprint of the files that were read."""
 
-    sheet: SheetDraft
+    sheet: Table
     settings: str
     stamp: str
     corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
+
+    def texts(self) -> dict[str, str]:
+        """The content of each of `FILES`."""
+        out = io.StringIO()
+        csv.writer(out, delimiter=self.sheet.delimiter, lineterminator="\n").writerows(cells_of(self.sheet))
+        return dict(zip(FILES, (out.getvalue(), self.settings, corrections_text(self.corrections)), strict=True))
 
 
 def open_draft(folder: Path) -> Draft:
@@ -236,7 +236,7 @@ def open_draft(folder: Path) -> Draft:
         raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
     settings = read_settings_text(folder)
     recordings = list_recordings(folder)
-    sheet = read_draft(folder)
+    sheet = read_sheet(folder)
     if not recordings and not sheet.rows:
         message = "holds no recording"
         remedy = "put films (mp4, mov, avi, mkv) or folders of pictures in it"
@@ -263,28 +263,16 @@ def write_draft(folder: Path, draft: Draft) -> list[str]:
         message = "has changed since it was read, and is left as it is"
         name = SHEET if (folder / SHEET).exists() else SETTINGS
         raise ExperimentError([Problem(message=message, file=name, remedy="reload the page, and enter it again")])
-    written = []
-    if not (folder / SHEET).exists() or not same_cells(read_draft(folder), draft.sheet):
-        write_text(folder / SHEET, draft.sheet.text())
-        written.append(SHEET)
-    if not (folder / SETTINGS).exists() or read_settings_text(folder) != draft.settings:
-        write_text(folder / SETTINGS, draft.settings)
-        written.append(SETTINGS)
-    if corrections_text(read_corrections(folder)[0]) != corrections_text(draft.corrections):
-        write_text(folder / CORRECTIONS_FILE, corrections_text(draft.corrections))
-        written.append(CORRECTIONS_FILE)
+    texts = draft.texts()
+    changed = {
+        SHEET: not (folder / SHEET).exists() or cells_of(read_sheet(folder)) != cells_of(draft.sheet),
+        SETTINGS: not (folder / SETTINGS).exists() or read_settings_text(folder) != texts[SETTINGS],
+        CORRECTIONS_FILE: corrections_text(read_corrections(folder)[0]) != texts[CORRECTIONS_FILE],
+    }
+    written = [name for name in FILES if changed[name]]
+    for name in written:
+        write_text(folder / name, texts[name])
     return written
-
-
-def same_cells(first: SheetDraft, other: SheetDraft) -> bool:
-    """Return whether two sheets have the same columns and cells, whatever their format."""
-    if first.columns != other.columns or len(first.rows) != len(other.rows):
-        return False
-    return all(
-        a.get(column, "") == b.get(column, "")
-        for a, b in zip(first.rows, other.rows, strict=True)
-        for column in first.columns
-    )
 
 
 @contextmanager
@@ -296,10 +284,8 @@ def draft_folder(folder: Path, draft: Draft) -> Iterator[Path]:
         for path in folder.iterdir():
             if path.name not in FILES:
                 (copy / path.name).symlink_to(os.path.realpath(path), target_is_directory=path.is_dir())
-        write_text(copy / SHEET, draft.sheet.text())
-        write_text(copy / SETTINGS, draft.settings)
-        if draft.corrections:
-            write_text(copy / CORRECTIONS_FILE, corrections_text(draft.corrections))
+        for name, text in draft.texts().items():
+            write_text(copy / name, text)
         yield copy
 
 
@@ -309,12 +295,7 @@ def draft_folder(folder: Path, draft: Draft) -> Iterator[Path]:
 # Whatever matches nothing is named and changes nothing, so that no number stands beside another film than its own.
 
 SHARED_ROW = "shared"  # The row of the table that applies to all trials
-NAME_WORDS = frozenset(
-    {"trial", "video", "clip", "film", "recording", "file", "file_name", "filename", "name", "movie"}
-)
-
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
 
 
 @dataclass
@@ -327,8 +308,7 @@ class Pasted:
 
 def read_block(text: str) -> list[list[str]]:
     """Split pasted text into rows of cells, at tabs, semicolons, commas or blanks, whichever it has first."""
-    lines = [line.strip("\r") for line in text.strip("\n\r").split("\n")]
-    lines = [line for line in lines if line.strip()]
+    lines = [line for line in text.splitlines() if line.strip()]
     if any("\t" in line for line in lines):
         delimiter = "\t"
     elif any(";" in line for line in lines):
@@ -357,146 +337,98 @@ def place_block(
     """Say which cells of a table with these columns (as shown, without the trial) and rows a pasted block changes.
     Without a header its columns follow the one pasted into, and without names its rows the row pasted into.
     """
-    block = read_block(text)
-    pasted = Pasted()
-    header = [_header_column(word, columns) for word in block[0]] if block else []
-    known = [name for name in header if name]
-    has_header = bool(known) and not any(_NUMBER.fullmatch(word) for word in block[0])
-    if has_header:
-        unknown = [word for word, name in zip(block[0], header, strict=True) if word and not name]
+    block, pasted = read_block(text), Pasted()
+    words, row_named = _header_words(columns), _rows_by_name(rows)
+    first = block[0] if block else []
+    header = [words.get(re.sub(r"[^a-z0-9%]+", "_", _in_ascii(word)).strip("_"), "") for word in first]
+    if any(header) and not any(_NUMBER.fullmatch(word) for word in first):
+        unknown = [word for word, name in zip(first, header, strict=True) if word and not name]
         pasted.notes += [f"No column is named “{word}”: left out." for word in unknown]
         block = block[1:]
-        name_place = next((i for i, name in enumerate(header) if name == "trial"), None)
+        name_place = header.index("trial") if "trial" in header else None
     else:
-        name_place = _place_of_names(block, rows)
-        start = columns.index(at_column) if at_column in columns else 0
-        places = [i for i in range(max(map(len, block), default=0)) if i != name_place]
+        # The column with most names of recordings
+        wide = max(map(len, block), default=0)
+        found = [sum(_plain(cells[i]) in row_named for cells in block if i < len(cells)) for i in range(wide)]
+        name_place = found.index(max(found)) if any(found) else None
         if at_column not in columns and name_place is None:
             pasted.notes.append("No cell of this block is the name of a recording or of a column: nothing was pasted.")
             return pasted
+        start = columns.index(at_column) if at_column in columns else 0
+        places = [i for i in range(wide) if i != name_place]
         targets = dict(zip(places, columns[start:], strict=False))
-        header = ["trial" if i == name_place else targets.get(i, "") for i in range(len(places) + 1)]
+        header = ["trial" if i == name_place else targets.get(i, "") for i in range(wide)]
         if len(places) > len(targets):
             pasted.notes.append(f"{len(places) - len(targets)} columns of this block lie beyond the table: left out.")
-    order: list[int | str] = [SHARED_ROW, *range(len(rows))]
-    begin = order.index(at_row)
-    for count, cells in enumerate(block):
+    following = iter([SHARED_ROW, *range(len(rows))][0 if at_row == SHARED_ROW else int(at_row) + 1 :])
+    for cells in block:
         if name_place is None:
-            row = order[begin + count] if begin + count < len(order) else None
+            row = next(following, None)
         else:
-            row = _row_named(cells[name_place] if name_place < len(cells) else "", rows)
+            row = row_named.get(_plain(cells[name_place])) if name_place < len(cells) else None
         if row is None:
             pasted.notes.append(f"No recording for “{' '.join(cells)}”: left out.")
             continue
         for name, cell in zip(header, cells, strict=False):
             if name and name != "trial":
-                column = _shown(name, columns)
-                pasted.cells.append((row, column, _in_unit(cell, name, column, decimal)))
+                column = column_of(name, columns)
+                pasted.cells.append((row, column, in_unit_of(column, name, cell, decimal)))
     return pasted
 
 
-def _header_column(word: str, columns: Sequence[str]) -> str:
-    """The column that a word of a header names, in its unit; `trial` for names of recordings, blank for none."""
-    plain = re.sub(r"[^a-z0-9%]+", "_", word.lower().replace("µ", "u").replace("μ", "u")).strip("_")
-    if plain in NAME_WORDS:
-        return "trial"
-    names = {name.lower(): name for name in (*columns, *COLUMNS)}
-    if plain in names:
-        return names[plain]
-    quantities = {split_unit(name)[0].lower(): name for name in (*COLUMNS, *columns)}
-    if plain in quantities:
-        return quantities[plain]
-    for unit in UNITS:
-        quantity = plain.removesuffix(f"_{unit.lower()}")
-        if quantity != plain and quantity in quantities:
-            own = split_unit(quantities[quantity])[1]
-            if own in UNITS and UNITS[own].si == UNITS[unit].si:
-                return f"{split_unit(quantities[quantity])[0]}_{unit}"
-    return ""
+def _header_words(columns: Sequence[str]) -> dict[str, str]:
+    """The column that a word of a header names, in its unit; `trial` for names of recordings. Without a unit a word
+    names the column of the table, if that has one.
+    """
+    words: dict[str, str] = {}
+    for name in (*COLUMNS, *columns):
+        words |= {written.lower(): written for written in (*other_units(name), name)} | {quantity(name).lower(): name}
+    names = "trial video clip film recording file file_name filename name movie"
+    return words | dict.fromkeys(names.split(), "trial")
 
 
-def _shown(name: str, columns: Sequence[str]) -> str:
-    """The column of the table that holds the quantity of a column."""
-    quantity = split_unit(name)[0]
-    return next((column for column in columns if split_unit(column)[0] == quantity), name)
-
-
-def _in_unit(cell: str, name: str, column: str, decimal: str) -> str:
-    """A cell in the unit of the table's column and with the decimal mark of the sheet."""
-    if not _NUMBER.fullmatch(cell):
-        return cell
-    number = cell.replace(",", ".")
-    if name != column:
-        number = f"{convert(float(number), split_unit(name)[1], split_unit(column)[1]):.6g}"
-    return number.replace(".", decimal)
-
-
-def _place_of_names(block: Sequence[Sequence[str]], rows: Sequence[Mapping[str, str]]) -> int | None:
-    """The column of a block without a header that has most names of recordings; None if none has any."""
-    wide = max(map(len, block), default=0)
-    found = [sum(i < len(cells) and _row_named(cells[i], rows) is not None for cells in block) for i in range(wide)]
-    return found.index(max(found)) if found and max(found) > 0 else None
-
-
-def _row_named(name: str, rows: Sequence[Mapping[str, str]]) -> int | None:
-    """The one row whose trial or recording has this name, with or without folder and ending."""
-    wanted = _plain(name)
-    matches = [
-        i
-        for i, row in enumerate(rows)
-        if wanted
-        and wanted
-        in {
-            _plain(text)
-            for given in (row.get("trial", ""), row.get("video", ""), row.get("track", ""))
-            for path in [PurePosixPath(given)]
-            for text in (given, path.name, path.stem, str(path.with_suffix("")) if given else "")
-        }
-    ]
-    return matches[0] if len(matches) == 1 else None
+def _rows_by_name(rows: Sequence[Mapping[str, str]]) -> dict[str, int]:
+    """The row of each name of a trial or recording, with or without folder and ending; none for a name of two."""
+    places: dict[str, set[int]] = {}
+    for i, row in enumerate(rows):
+        for given in filter(None, (row.get("trial"), row.get("video"), row.get("track"))):
+            path = PurePosixPath(given)
+            for text in (given, path.name, path.stem, str(path.parent / path.stem)):
+                places.setdefault(_plain(text), set()).add(i)
+    return {name: of_name.pop() for name, of_name in places.items() if name and len(of_name) == 1}
 
 
 def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9./-]+", "_", name.lower()).strip("_")
 
 
+def _in_ascii(word: str) -> str:
+    """A word in lower case, with a u for either of the two characters for micro."""
+    return word.lower().replace("µ", "u").replace("μ", "u")
+
+
 # ------------------------------------------------------------------------------
 # What a folder holds, and the columns that names of recordings give: `d12_24kPa_1` is a vine of 12 mm at 24 kPa.
 
-_NUMBER_IN_NAME = r"(?P<number>\d+(?:[.p]\d+)?)"
-# Column of a number with a unit, by the unit in lower case
-_COLUMN_BY_UNIT: dict[str, str] = {
-    "kpa": "pressure_kPa",
-    "psi": "pressure_psi",
-    "mbar": "pressure_mbar",
-    "bar": "pressure_bar",
-    "g": "payload_g",
-    "kg": "payload_kg",
-    "um": "thickness_um",
-    "µm": "thickness_um",
-    "fps": "capture_fps",
-    "deg": "growth_angle_deg",
-    "mm": "diameter_mm",
-    "cm": "length_cm",
-    "in": "diameter_in",
+# By quantity, the letters that may stand before its number, and the units that name it without them
+_IN_NAMES = {
+    "pressure": ("p", "kPa psi mbar bar"),
+    "payload": ("m", "g kg"),
+    "diameter": ("d dia diam", "mm in"),
+    "thickness": ("t", "um"),
+    "length": ("l len", "cm"),
+    "capture": ("", "fps"),
+    "growth_angle": ("", "deg"),
+    "day": ("day", ""),
+    "specimen": ("specimen tube", ""),
 }
+_LETTERS = {letter: name for name, (letters, _) in _IN_NAMES.items() for letter in letters.split()}
+_UNITS = {unit.lower(): name for name, (_, units) in _IN_NAMES.items() for unit in units.split()}
 
-# Column of a number after a letter or word; a unit after the number overrides that of the column
-_COLUMN_BY_LETTER = {
-    "d": "diameter_mm",
-    "dia": "diameter_mm",
-    "diam": "diameter_mm",
-    "t": "thickness_um",
-    "l": "length_mm",
-    "len": "length_mm",
-    "p": "pressure_kPa",
-    "m": "payload_g",
-    "day": "day",
-    "specimen": "specimen",
-    "tube": "specimen",
-}
-
-_WORD = re.compile(rf"(?P<letter>[a-z]*?){_NUMBER_IN_NAME}(?P<unit>[a-zµ]*)", re.IGNORECASE)
+_NUMBER_IN_NAME = r"\d+(?:[.p]\d+)?"
+_WORD = re.compile(rf"([a-z]*?)({_NUMBER_IN_NAME})([a-z]*)")
+# A number and its unit separated by a blank, `24 kPa`
+_SPACED_UNIT = re.compile(rf"(?<![a-z0-9])({_NUMBER_IN_NAME})[_\s]+({'|'.join(_UNITS)})(?![a-z0-9])")
 
 
 def list_pictures(folder: Path) -> list[str]:
@@ -514,7 +446,7 @@ def list_tables(folder: Path) -> list[str]:
     folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
     tables = [path for place in folders for path in entries(place) if path.suffix.lower() == ".csv"]
     names = (path.relative_to(folder).as_posix() for path in tables)
-    return sorted((name for name in names if name not in ("trials.csv", "corrections.csv")), key=natural_order)
+    return sorted((name for name in names if name not in FILES), key=natural_order)
 
 
 def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
@@ -539,84 +471,35 @@ def columns_from_names(recordings: Sequence[str]) -> list[dict[str, str]]:
     read: a bare number counts replicates. A quantity that all names give in the same other unit keeps it
     (`pressure_psi`); a mixture of units is converted to that of the sheet.
     """
-    rows = [_columns_from_name(recording) for recording in recordings]
-    units: dict[str, set[str]] = {}
-    for cells in rows:
-        for name in cells:
-            units.setdefault(split_unit(name)[0], set()).add(name)
-    out = []
-    for cells in rows:
-        row = {}
-        for name, cell in cells.items():
-            column = _sheet_column(name)
-            convert_unit = len(units[split_unit(name)[0]]) > 1 and name != column
-            row[column if convert_unit else name] = _converted(cell, name, column) if convert_unit else cell
-        out.append(row)
-    return out
+    found = [_cells_of_name(recording) for recording in recordings]
+    columns: dict[str, str] = {}
+    for cells in found:
+        for name, (column, _) in cells.items():
+            columns[name] = column if columns.get(name, column) == column else column_of(name, COLUMNS)
+    return [
+        {columns[name]: in_unit_of(columns[name], column, cell) for name, (column, cell) in cells.items()}
+        for cells in found
+    ]
 
 
-_UNITS = "|".join(sorted(_COLUMN_BY_UNIT, key=len, reverse=True))
-# A number and its unit separated by a blank, `24 kPa`
-_SPACED_UNIT = re.compile(rf"(?<![A-Za-z0-9])(\d+(?:[.p]\d+)?)[_\s]+({_UNITS})(?![A-Za-z0-9])", re.IGNORECASE)
-
-
-def _columns_from_name(recording: str) -> dict[str, str]:
-    """Cells of one name, by column, whose name may be in another unit."""
-    cells: dict[str, str] = {}
-    parts = [*PurePosixPath(recording).parts[:-1], _stem(recording)]
-    for part in parts:
-        of_part: dict[str, str] = {}
-        for word in re.split(r"[_\s,;+-]+", _SPACED_UNIT.sub(r"\1\2", part)):
-            match = _WORD.fullmatch(word)
-            column = _column_of(match, of_part) if match else ""
-            if match and column:
-                of_part[column] = match["number"].lower().replace("p", ".")
-        quantities = {split_unit(name)[0] for name in of_part}
-        cells = {name: cell for name, cell in cells.items() if split_unit(name)[0] not in quantities} | of_part
-    return {name: f"{float(cell):g}" if _is_number(name) else cell for name, cell in cells.items()}
-
-
-def _column_of(match: re.Match[str], earlier: dict[str, str]) -> str:
-    """The column of a word; blank if there is none."""
-    letter, unit = match["letter"].lower(), match["unit"].lower()
-    if letter in _COLUMN_BY_LETTER:
-        column = _COLUMN_BY_LETTER[letter]
-        quantity = split_unit(column)[0]
-        if not unit:
-            return column
-        same = [name for name in _COLUMN_BY_UNIT.values() if split_unit(name)[1].lower() == unit.replace("µ", "u")]
-        sizes = {"um", "mm", "cm", "in", "m"}
-        if unit.replace("µ", "u") in sizes and split_unit(column)[1] in sizes:
-            return f"{quantity}_{unit.replace('µ', 'u')}"
-        return next((name for name in same if split_unit(name)[0] == quantity), "")
-    if letter or not unit:
-        return ""
-    column = _COLUMN_BY_UNIT.get(unit, "")
-    # In names of vines such as 12mm-100um-140mm the second length is that of the vine.
-    if column == "diameter_mm" and column in earlier:
-        return "length_mm"
-    return column
-
-
-def _is_number(name: str) -> bool:
-    column = COLUMNS.get(_sheet_column(name))
-    return column is not None and column.kind == "number"
-
-
-def _sheet_column(name: str) -> str:
-    """The sheet's column of a quantity, whatever the unit in the name."""
-    quantity = split_unit(name)[0]
-    return name if name in COLUMNS else next(column for column in COLUMNS if split_unit(column)[0] == quantity)
-
-
-def _converted(cell: str, name: str, column: str) -> str:
-    return f"{convert(float(cell), split_unit(name)[1], split_unit(column)[1]):.6g}"
-
-
-def units_of(column: str) -> list[str]:
-    """Return the units in which a column may be written, its own first; none if it has no unit."""
-    others = other_units(column)
-    return [split_unit(column)[1], *others.values()] if others else []
+def _cells_of_name(recording: str) -> dict[str, tuple[str, str]]:
+    """The column, in whichever unit, and the cell of each quantity in a name; a file overrides its folders."""
+    cells: dict[str, tuple[str, str]] = {}
+    for part in (*PurePosixPath(recording).parts[:-1], _stem(recording)):
+        of_part: dict[str, tuple[str, str]] = {}
+        for word in re.split(r"[_\s,;+-]+", _SPACED_UNIT.sub(r"\1\2", _in_ascii(part))):
+            if match := _WORD.fullmatch(word):
+                letters, number, unit = match.groups()
+                name = _LETTERS.get(letters, "") if letters else _UNITS.get(unit, "")
+                # In names of vines such as 12mm-100um-140mm the second length is that of the vine.
+                name = "length" if name == "diameter" and not letters and name in of_part else name
+                own = column_of(name, COLUMNS)
+                column = next((other for other in (own, *other_units(own)) if other.lower() == f"{name}_{unit}"), "")
+                if name and (column or not unit):
+                    cell = number.replace("p", ".")
+                    of_part[name] = column or own, f"{float(cell):g}" if COLUMNS[own].kind == "number" else cell
+        cells |= of_part
+    return cells
 
 
 def _stem(recording: str) -> str:

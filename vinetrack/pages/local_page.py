@@ -33,11 +33,12 @@ def secret_path() -> str:
     return f"/{secrets.token_urlsafe(16)}"
 
 
-def allowed_hosts(port: int) -> frozenset[str]:
-    """Return the allowed values of a request's `Host` header; others indicate a page of another site (DNS
-    rebinding).
+def is_from_page(headers: Any, port: int) -> bool:
+    """Whether the `Host` and the `Origin` of a request are those of a server's own page; others indicate a page of
+    another site (DNS rebinding).
     """
-    return frozenset({f"{LOOPBACK}:{port}", f"localhost:{port}"})
+    hosts = (f"{LOOPBACK}:{port}", f"localhost:{port}")
+    return headers.get("Host") in hosts and headers.get("Origin") in (None, *(f"http://{host}" for host in hosts))
 
 
 def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Server:

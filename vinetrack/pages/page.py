@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import socket
 import sys
 import time
 from collections.abc import Callable
@@ -37,7 +36,7 @@ from vinetrack.pages.campaign import (
 )
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
 from vinetrack.pages.film_panel import FilmPanel
-from vinetrack.pages.local_page import LOOPBACK, allowed_hosts, secret_path, serve_on_free_port, serve_until_stopped
+from vinetrack.pages.local_page import LOOPBACK, is_from_page, secret_path, serve_on_free_port, serve_until_stopped
 from vinetrack.pages.plots import (
     TEMPLATES,
     THEME,
@@ -437,12 +436,6 @@ def start_server(background: BackgroundFit, port: int | None = None) -> Server:
 
 
 def _bind(background: BackgroundFit, port: int) -> Server:
-    # Find a free port first, because the allowed hosts include the port.
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind((LOOPBACK, port))
-        free_port = int(probe.getsockname()[1])
-    hosts = allowed_hosts(free_port)
     shown = [background]
 
     def open_page(document: Document) -> None:
@@ -452,32 +445,28 @@ def _bind(background: BackgroundFit, port: int) -> Server:
         {"/": Application(FunctionHandler(open_page, trap_exceptions=False))},
         prefix=secret_path(),
         address=LOOPBACK,
-        port=free_port,
-        allow_websocket_origin=sorted(hosts),
+        port=port,
+        allow_websocket_origin=["*"],  # checked below, with all else
         # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
         keep_alive_milliseconds=20_000,
         check_unused_sessions_milliseconds=5_000,
         unused_session_lifetime_milliseconds=10_000,
         use_index=False,
     )
-    _refuse_other_hosts(server, hosts)
-    server.start()
-    return server
-
-
-def _refuse_other_hosts(server: Server, hosts: frozenset[str]) -> None:
-    """Answer 403, on every route and on the web socket, to requests with another host name (DNS rebinding). Bokeh
-    checks only the origin of a web socket, which matches if a foreign name resolves to this machine.
-    """
     tornado = server._tornado
     routed = tornado.find_handler
 
     def find_handler(request: Any, **given: Any) -> Any:
-        if request.host in hosts:
+        """Answer 403 to other pages, on every route: bokeh checks only the origin of a web socket, which matches if a
+        foreign name resolves to this machine.
+        """
+        if is_from_page(request.headers, server.port):
             return routed(request, **given)
         return tornado.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
 
     tornado.find_handler = find_handler
+    server.start()
+    return server
 
 
 def address(server: Server) -> str:
