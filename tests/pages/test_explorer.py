@@ -24,14 +24,15 @@ from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
+from vinetrack.core.problems import UserError
 from vinetrack.effects import Parameter
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
-    FitJob,
     Fitted,
+    Job,
     choice_in_use,
     commands,
     first_fit,
@@ -41,7 +42,7 @@ from vinetrack.pages.campaign import (
     predict_choice,
     slider_range,
 )
-from vinetrack.pages.film_panel import DecodedRecording, RecordingView, recording_view
+from vinetrack.pages.film_panel import RecordingView, decode, recording_view
 from vinetrack.pages.page import address as where
 from vinetrack.pages.page import open_campaign, start_server
 from vinetrack.results.folder_layout import Results, ResultsError
@@ -71,7 +72,7 @@ def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> N
 
 def test_an_effect_of_no_size_changes_nothing(campaign: Campaign) -> None:
     start = choice_in_use(campaign)
-    none = predict_choice(campaign, start.with_effect("air_drag").with_size("air_drag.C_D", 0.0))
+    none = predict_choice(campaign, start.with_effect("air_drag").with_sizes({"air_drag.C_D": 0.0}))
     for bare, with_it in zip(predict_choice(campaign, start).trials, none.trials, strict=True):
         np.testing.assert_allclose(with_it.predicted_position_m, bare.predicted_position_m, atol=1e-9)
 
@@ -166,13 +167,10 @@ class RecordedCallbacks:
 
     def __init__(self) -> None:
         self.steps: list[Step] = []
-        self.results: list[Fitted] = []
-        self.reasons: list[str] = []
+        self.ends: list[tuple[Fitted | None, str]] = []
 
-    def job(self, work: object) -> FitJob:
-        return FitJob(
-            work, on_progress=self.steps.append, on_success=self.results.append, on_failure=self.reasons.append
-        )  # type: ignore[arg-type]
+    def job(self, work: object) -> Job:
+        return Job(work, self.steps.append, lambda *end: self.ends.append(end))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -181,7 +179,10 @@ def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted
     job = recorded.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
     job.wait(60)
     assert recorded.steps
-    assert recorded.results[0].fit.model.names == first.fit.model.names
+    ((fitted, reason),) = recorded.ends
+    assert fitted is not None
+    assert fitted.fit.model.names == first.fit.model.names
+    assert reason == ""
 
 
 def test_a_cancelled_job_calls_no_callback() -> None:
@@ -200,8 +201,7 @@ def test_a_cancelled_job_calls_no_callback() -> None:
     count = len(recorded.steps)
     time.sleep(0.05)
     assert len(recorded.steps) == count
-    assert not recorded.results
-    assert not recorded.reasons
+    assert not recorded.ends
 
 
 @pytest.mark.slow
@@ -212,7 +212,7 @@ def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:
     def hear() -> None:
         news.append(background.fitted is not None)
 
-    background.add_listener(hear)
+    background.listeners.append(hear)
     background.begin().wait(120)
     assert background.failure == ""
     assert not background.running
@@ -221,8 +221,6 @@ def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:
     assert background.step is not None
     assert len(news) > 2
     assert news[-1]
-    background.remove_listener(hear)
-    background.remove_listener(hear)
 
 
 # A recording in the explorer: positions of edges in its picture, and the message for a trial without one.
@@ -234,30 +232,24 @@ def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) 
 
 
 def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
-    told: list[int] = []
-    film = DecodedRecording(write_clip(tmp_path / "a.mp4")).decode(lambda one: told.append(one.count))
-    assert film.complete
-    assert film.error == ""
-    assert (film.count, film.expected, film.shape, film.scale) == (30, 30, (96, 320), 1.0)
-    assert told[0] == 1
-    assert told[-1] == 30
-    row = film.picture(10)[48]
-    assert abs(int(np.argmax(row < 120)) - 100) <= 1
+    told: list[tuple[int, float]] = []
+    film = decode(write_clip(tmp_path / "a.mp4"), told.append)
+    assert (len(film.frames), film.scale) == (30, 1.0)
+    assert told == [(1, 1 / 30), (11, 11 / 30), (21, 21 / 30)]
+    assert film.picture(10).shape == (96, 320)
+    assert abs(int(np.argmax(film.picture(10)[48] < 120)) - 100) <= 1
 
 
 def test_a_file_that_is_not_a_recording_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"not a film")
-    film = DecodedRecording(tmp_path / "a.mp4").decode()
-    assert film.complete
-    assert film.count == 0
-    assert "a.mp4" in film.error
+    with pytest.raises(UserError, match=r"a\.mp4"):
+        decode(tmp_path / "a.mp4", lambda _: None)
 
 
 def view(angle: float = 0.0) -> RecordingView:
     frames = np.arange(20.0)
     edge_px = np.where(frames < 15, 10 + 5 * frames, np.nan)
     return RecordingView(
-        trial="a",
         path=Path("a.mp4"),
         axis=Axis((100.0, 50.0), (100.0 + 300 * float(np.cos(angle)), 50.0 + 300 * float(np.sin(angle)))),
         half_width_px=10.0,
@@ -265,6 +257,7 @@ def view(angle: float = 0.0) -> RecordingView:
         edge_px=edge_px,
         lead_position_m=1e-3 * (edge_px - 10),
         shake_px=np.where(frames == 3, 2.0, 0.0),
+        by_hand=frames == 4,
     )
 
 

@@ -24,9 +24,11 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_result import Fit
 from vinetrack.pages import controls
 from vinetrack.pages.campaign import BackgroundFit, Campaign
+from vinetrack.pages.film_panel import RecordingView
 from vinetrack.pages.page import open_campaign
 from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
+from vinetrack.video.axis import Axis
 
 # The page without a browser: user input to its models, and the resulting state of the page.
 
@@ -169,6 +171,22 @@ def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
     assert error_of(browser) == before
 
 
+def test_a_recording_that_cannot_be_decoded_is_named_beside_the_positions(
+    browser: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Also once the text of the page was updated."""
+    (tmp_path / "torn.mp4").write_bytes(b"not a film")
+    nothing = np.zeros(0)
+    view = RecordingView(
+        tmp_path / "torn.mp4", Axis((0.0, 0.0), (50.0, 0.0)), 5.0, nothing, nothing, nothing, nothing, nothing > 0
+    )
+    monkeypatch.setattr("vinetrack.pages.film_panel.recording_view", lambda *_: view)
+    browser.page.film.show_trial(browser.page.campaign.trials[0].name)
+    browser.until(lambda: "tracked" in browser.text("film_caption"), 30)
+    browser.page._update_text()
+    assert "torn.mp4" in browser.text("film_caption")
+
+
 # Whatever a user does on the page, its errors are those that `compare`, `add` and the report give the same model.
 
 
@@ -281,7 +299,7 @@ def test_add_finds_what_the_page_finds_and_until_the_next_run_the_page_says_whic
 
     campaign = open_campaign(results)
     assert campaign.in_use == tuple(json.loads((results / "fit.json").read_text())["model"])
-    assert campaign.saved == (*campaign.in_use, EFFECT)
+    assert tuple(campaign.experiment.settings.model) == (*campaign.in_use, EFFECT)
     background = BackgroundFit(campaign).begin()
     background.wait(240)
     again = Browser(background)
@@ -363,13 +381,13 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     settings = read_experiment_settings(folder / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("spring_line", ("spring_line.py",))
     assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
-    assert "spring_line" in open_campaign(unexplained.folder, folder).saved
+    assert "spring_line" in open_campaign(unexplained.folder, folder).experiment.settings.model
 
 
 def _fitted_commands(page: Browser) -> str:
     """Commands of the page once the effect that is ticked was fitted."""
     page.click("refit")
-    page.until(lambda: page.model("refit").label == "Refit" and page.page.is_fitted(), 240)
+    page.until(lambda: page.model("refit").label == "Refit" and not page.page._sizes_changed, 240)
     page.page._update_text()
     return page.text("commands")
 

@@ -1,20 +1,18 @@
-"""A results folder as read by the explorer: aligned trials, the model in use, and the effects to choose from.
-
-It is read once and never changed; the choice of the user is in `choice`, its curves are in `curves`.
-"""
+"""A results folder as read by the explorer, the models that a user may choose in it, and their predictions and fits."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import shlex
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -31,6 +29,7 @@ from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
+from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.local_page import THREAD_PREFIX
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result
 
@@ -69,27 +68,28 @@ class ExplorerTrial:
         return self.data.lead_position_m - self.origin_m
 
     @cached_property
-    def first_drawn(self) -> int:
-        """The first frame to draw: a little before the release, since rest would take most of a figure."""
+    def rows(self) -> slice:
+        """The frames to draw: from the end of the rest."""
         released = int(np.searchsorted(self.data.time_s, self.release_s))
-        first = min(released, max(self.data.n_rest - 1, 0), self.data.time_s.size - 1)
-        return max(first - max((self.data.time_s.size - first) // 20, 2), 0)
+        return drawn_rows(self.time_s.size, min(released, max(self.data.n_rest - 1, 0)))
 
 
-@dataclass(frozen=True)
-class ReplicateBand:
-    """Mean and standard deviation of the replicates of one condition, shape (n_times,)."""
-
-    time_s: Floats
-    mean_m: Floats
-    sigma_m: Floats
+def drawn_rows(count: int, first: int) -> slice:
+    """Return the rows to draw of `count`, from a little before the `first` of the motion: rest would take most of a
+    figure, and points closer than a pixel need not be sent.
+    """
+    first = min(first, count - 1)
+    begin = max(first - max((count - first) // 20, 2), 0)
+    # 250: points of a line; chosen: one per three or four pixels
+    return slice(begin, None, max(math.ceil((count - begin) / 250), 1))
 
 
 @dataclass(frozen=True)
 class Campaign:
     """A results folder with its experiment, read by `read_campaign`. `numbers` are the estimates of the fit in
     `fit.json`, by name, SI; empty if the fit was refused, with the reason in `refused`. `log_likelihood` is that of the
-    same fit, NaN if it was refused. `in_use` are the effects of the model that the results are of.
+    same fit, NaN if it was refused. `in_use` are the effects of the model that the results are of. `bands` are time,
+    mean and standard deviation of the replicates of a condition, shape (3, n_times).
     """
 
     name: str
@@ -99,7 +99,7 @@ class Campaign:
     kinematics: Mapping[str, Kinematics]
     trials: tuple[ExplorerTrial, ...]
     left_out: Mapping[str, str]
-    bands: Mapping[str, ReplicateBand]
+    bands: Mapping[str, Floats]
     floors_m: Mapping[str, float]
     numbers: Mapping[str, float]
     log_likelihood: float
@@ -107,11 +107,6 @@ class Campaign:
     effects: Mapping[str, Effect]
     unusable: Mapping[str, str]
     in_use: tuple[str, ...]
-
-    @property
-    def saved(self) -> tuple[str, ...]:
-        """The effects of `model:` in the settings, which differ from those in use until the next run."""
-        return tuple(self.experiment.settings.model)
 
     @cached_property
     def conditions(self) -> tuple[str, ...]:
@@ -188,7 +183,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         refused=refused,
         effects=effects,
         in_use=fitted.names if fitted.names and set(fitted.names) <= set(effects) else tuple(experiment.settings.model),
-        unusable=_unusable(effects.values(), [trial_data.trial for trial_data in data]),
+        unusable=_unusable(effects.values(), data),
     )
 
 
@@ -209,26 +204,22 @@ def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
     return trials
 
 
-def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, ReplicateBand]:
-    """Mean and standard deviation of the replicates at the times of the longest trial of each condition."""
+def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, Floats]:
+    """The replicates at the times of the longest trial of each condition, where they are known."""
     bands = {}
     for condition, table in compared.items():
-        if table["trial"].nunique() < 2:
-            continue
         longest = table.groupby("trial")["time_s"].max().idxmax()
-        rows = table[table["trial"] == longest]
-        names = ("time_s", "replicates_mean_m", "replicates_sigma_m")
-        time_s, mean_m, sigma_m = (rows[name].to_numpy(dtype=float) for name in names)
-        known = np.isfinite(sigma_m) & np.isfinite(mean_m)
-        bands[condition] = ReplicateBand(time_s[known], mean_m[known], sigma_m[known])
+        columns = ["time_s", "replicates_mean_m", "replicates_sigma_m"]
+        rows = table.loc[table["trial"] == longest, columns].to_numpy(dtype=float)
+        bands[condition] = rows[np.isfinite(rows[:, 1:]).all(axis=1)].T
     return bands
 
 
-def _unusable(effects: Any, trials: list[Trial]) -> dict[str, str]:
+def _unusable(effects: Iterable[Effect], data: Sequence[FitTrial]) -> dict[str, str]:
     reasons = {}
     for effect in effects:
         try:
-            check_needs(Model((effect,)), *trials)
+            check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))
         except EffectError:
             reasons[effect.name] = f"needs {' and '.join(effect.needs)} in the sheet"
     return reasons
@@ -237,27 +228,24 @@ def _unusable(effects: Any, trials: list[Trial]) -> dict[str, str]:
 def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
     """Return a label for each condition, from the settings in which the trials of the experiment differ."""
     written = {name: _settings(trial) for name, trial in conditions.items()}
-    keys = list(dict.fromkeys(key for settings in written.values() for key in settings))
-    varying = [key for key in keys if len({settings.get(key, "") for settings in written.values()}) > 1]
-    kept = _without_redundant(varying, written) or ["pressure"]
+
+    def told_apart(keys: Sequence[str]) -> int:
+        return len({tuple(settings.get(key, "") for key in keys) for settings in written.values()})
+
+    kept: list[str] = []
+    for key in dict.fromkeys(key for settings in written.values() for key in settings):
+        sizes = ("diameter", "thickness", "length")
+        # A size that those before determine is left out.
+        before = [other for other in kept if other in sizes] if key in sizes else []
+        if told_apart([*before, key]) > told_apart(before):
+            kept.append(key)
     labels = {
-        name: ", ".join(settings[key] for key in kept if settings.get(key)) or name
+        name: ", ".join(settings[key] for key in kept or ["pressure"] if settings.get(key)) or name
         for name, settings in written.items()
     }
     named = list(labels.values())
     # Conditions that differ in another setting get their name appended.
     return {name: label if named.count(label) == 1 else f"{label} ({name})" for name, label in labels.items()}
-
-
-def _without_redundant(keys: list[str], written: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Drop thickness and length if the other sizes determine them."""
-    kept = list(keys)
-    for key in ("length", "thickness"):
-        others = [other for other in kept if other in ("diameter", "thickness", "length") and other != key]
-        with_it = {tuple(s.get(k, "") for k in (*others, key)) for s in written.values()}
-        if key in kept and others and len(with_it) == len({pair[:-1] for pair in with_it}):
-            kept.remove(key)
-    return kept
 
 
 def _settings(trial: Trial) -> dict[str, str]:
@@ -294,11 +282,14 @@ class Prediction:
 
 def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[str, float] | None = None) -> Prediction:
     """Predict every trial by a choice; the scatter of replicates hardly depends on it, and is taken as given."""
-    yields_Pa = fitted_yield_pressures(campaign, choice.numbers)
-    data = [trial.data for trial in campaign.trials]
-    for i, aligned in enumerate(campaign.trials):
-        if aligned.name in yields_Pa:
-            data[i] = replace(data[i], trial=replace(data[i].trial, yield_pressure_Pa=yields_Pa[aligned.name]))
+    data = []
+    for aligned in campaign.trials:
+        trial = aligned.data.trial
+        yield_Pa = trial.yield_pressure_Pa
+        # Fitted by vine, and by stated value if a vine has several
+        for group in (trial.vine, f"{trial.vine}, {yield_Pa / 1e3:g} kPa"):
+            yield_Pa = choice.numbers.get(f"{YIELD_PRESSURE}[{group}]", yield_Pa)
+        data.append(replace(aligned.data, trial=replace(trial, yield_pressure_Pa=yield_Pa)))
     predicted = predict_from_rest(sized_model(campaign, choice), data, campaign.host)
     squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in predicted]
     errors_m = {
@@ -326,31 +317,17 @@ def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
     return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
 
 
-def fitted_yield_pressures(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
-    """Return fitted yield pressures by trial, from those by vine (and stated value, if a vine has several)."""
-    yields_Pa = {}
-    for aligned in campaign.trials:
-        trial = aligned.data.trial
-        for vine in (trial.vine, f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"):
-            value = numbers.get(f"{YIELD_PRESSURE}[{vine}]")
-            if value is not None:
-                yields_Pa[trial.name] = value
-    return yields_Pa
-
-
 # ------------------------------------------------------------------------------
 # The user's choice: the effects in the model and their sizes. Immutable; a change returns a new choice.
 
 
 @dataclass(frozen=True)
 class SizeControl:
-    """One parameter of an effect with a slider, SI; `vine` is blank if one value applies to all trials."""
+    """One parameter of an effect with a slider; `vine` is blank if one value applies to all trials."""
 
     effect: str
     parameter: Parameter
     vine: str
-    low: float
-    high: float
 
     @property
     def key(self) -> str:
@@ -387,10 +364,6 @@ class ModelChoice:
         kept = tuple(name for name in self.effects if name != effect)
         return replace(self, effects=(*kept, effect) if wanted else kept)
 
-    def with_size(self, name: str, value: float) -> ModelChoice:
-        """Return the choice with another value of one parameter."""
-        return self.with_sizes({name: value})
-
     def with_sizes(self, numbers: Mapping[str, float]) -> ModelChoice:
         """Return the same effects with these values of parameters."""
         return replace(self, numbers={**self.numbers, **numbers})
@@ -398,31 +371,24 @@ class ModelChoice:
 
 def choice_in_use(campaign: Campaign) -> ModelChoice:
     """Return the model in use with its fitted values, and all other parameters at their defaults."""
-    numbers = {
-        size.name: size.parameter.default
-        for effect in campaign.effects.values()
-        for size in sizes_of(campaign, effect, {})
-    }
-    return ModelChoice(campaign.in_use, {**numbers, **campaign.numbers})
+    sizes = [size for effect in campaign.effects.values() for size in sizes_of(campaign, effect)]
+    return ModelChoice(campaign.in_use, {size.name: size.parameter.default for size in sizes} | {**campaign.numbers})
 
 
-def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[SizeControl]:
-    """Return the sliders of an effect: one per parameter, or one per vine or day if each has its own value. Their
-    ranges include the present value.
-    """
-    sizes = []
-    for parameter in effect.parameters:
-        for vine in campaign.groups(parameter.shared):
-            bare = SizeControl(effect.name, parameter, vine, 0.0, 1.0)
-            low, high = slider_range(bare.key, parameter, numbers.get(bare.name, parameter.default))
-            sizes.append(replace(bare, low=low, high=high))
-    return sizes
+def sizes_of(campaign: Campaign, effect: Effect) -> list[SizeControl]:
+    """Return the sliders of an effect: one per parameter, or one per vine or day if each has its own value."""
+    return [
+        SizeControl(effect.name, parameter, vine)
+        for parameter in effect.parameters
+        for vine in campaign.groups(parameter.shared)
+    ]
 
 
 def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, float]:
     """Return the range of a slider: the plausible range, extended to the size without effect and the present value.
-    Returns low, high, >>> slider_range("x.k", Parameter("k", "k", "1", 1.0, bounds=(0.0, 9.0), plausible=(0.0, 3.0)),
-    5.0), (0.0, 6.25).
+
+    >>> slider_range("x.k", Parameter("k", "k", "1", 1.0, bounds=(0.0, 9.0), plausible=(0.0, 3.0)), 5.0)
+    (0.0, 6.25)
     """
     low, high = parameter.plausible or parameter.bounds
     if key == DAMPING or not (math.isfinite(low) and math.isfinite(high)):
@@ -439,7 +405,7 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> Model:
     effects = tuple(campaign.effects[name] for name in choice.effects)
     values: dict[str, Value] = {}
     for effect in effects:
-        for size in sizes_of(campaign, effect, choice.numbers):
+        for size in sizes_of(campaign, effect):
             value = choice.numbers.get(size.name, size.parameter.default)
             if size.vine:
                 by_vine = values.get(size.key, {})
@@ -460,8 +426,8 @@ FAULT = "A fault of the program, not of your data: run vinetrack explore with --
 CLEARLY_WORSE = 0.5  # Decrease in ln L (chosen)
 
 
-class FitCancelled(Exception):  # noqa: N818 - nothing went wrong
-    """The fit was cancelled."""
+class Cancelled(Exception):  # noqa: N818 - nothing went wrong
+    """The work of a job was cancelled."""
 
 
 @dataclass(frozen=True)
@@ -523,10 +489,9 @@ def likelihood_change_text(before: Fit, after: Fit) -> str:
     """Return how −2 ln L changed with a larger or smaller model, as a sentence."""
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     more = len(after.numbers) - len(before.numbers)
-    numbers = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
-    if more == 0:
-        return f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f} with the same number of parameters."
-    return f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f} for {numbers}."
+    count = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
+    change = f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f}"
+    return f"{change} for {count}." if more else f"{change} with the same number of parameters."
 
 
 def correlated_pairs_text(result: Fit) -> list[str]:
@@ -535,12 +500,12 @@ def correlated_pairs_text(result: Fit) -> list[str]:
     # parameter known
     strong_correlation = 0.9
     pairs = []
-    for i, number in enumerate(result.numbers):
-        for k in range(i):
-            scale = math.sqrt(float(result.covariance[i, i] * result.covariance[k, k]))
-            r = float(result.covariance[i, k]) / scale if scale > 0 and math.isfinite(scale) else 0.0
-            if abs(r) > strong_correlation:
-                pairs.append((abs(r), f"{result.numbers[k].title} and {number.title}: correlation {r:+.2f}"))
+    variance = np.diag(result.covariance)
+    known = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    for k, i in itertools.combinations(known.tolist(), 2):
+        r = float(result.covariance[i, k]) / math.sqrt(variance[i] * variance[k])
+        if abs(r) > strong_correlation:
+            pairs.append((abs(r), f"{result.numbers[i].title} and {result.numbers[k].title}: correlation {r:+.2f}"))
     return [words for _, words in sorted(pairs, reverse=True)]
 
 
@@ -548,20 +513,20 @@ Progress = TypeVar("Progress")
 Outcome = TypeVar("Outcome")
 
 
-class FitJob(Generic[Progress, Outcome]):
-    """One fit, or a search made of fits, in a thread; the callbacks are called from that thread."""
+class Job(Generic[Progress, Outcome]):
+    """Work in a thread, which calls `on_progress` with every step, and `on_end` with the outcome or
+    else with None and the reason.
+    """
 
     def __init__(
         self,
         work: Callable[[Callable[[Progress], None]], Outcome],
-        *,
         on_progress: Callable[[Progress], None],
-        on_success: Callable[[Outcome], None],
-        on_failure: Callable[[str], None],
+        on_end: Callable[[Outcome | None, str], None],
     ) -> None:
-        self._work, self._on_progress, self._on_success, self._on_failure = work, on_progress, on_success, on_failure
+        self._work, self._on_progress, self._on_end = work, on_progress, on_end
         self._cancelled = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}fit")
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}job")
         self._thread.start()
 
     def cancel(self) -> None:
@@ -573,32 +538,28 @@ class FitJob(Generic[Progress, Outcome]):
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
+        outcome, reason = None, ""
         try:
-            result = self._work(self._watch)
-        except FitCancelled:
+            outcome = self._work(self._watch)
+        except Cancelled:
             return
         except UserError as error:
-            self._report(self._on_failure, str(error))
+            reason = str(error)
         except Exception:
-            log.exception("a fit of the explorer")
-            self._report(self._on_failure, FAULT)
-        else:
-            if not self._cancelled.is_set():
-                self._on_success(result)
-
-    def _report(self, callback: Callable[[str], None], message: str) -> None:
+            log.exception("a job of the explorer")
+            reason = FAULT
         if not self._cancelled.is_set():
-            callback(message)
+            self._on_end(outcome, reason)
 
     def _watch(self, step: Progress) -> None:
         if self._cancelled.is_set():
-            raise FitCancelled
+            raise Cancelled
         self._on_progress(step)
 
 
 class BackgroundFit:
     """Computes in a thread the `prediction` of the model in use, then its fit. `failure` is the reason if it
-    failed, else blank. Listeners are called from that thread.
+    failed, else blank. The listeners are called from that thread whenever there is a new result or step.
     """
 
     def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
@@ -609,29 +570,18 @@ class BackgroundFit:
         self.fitted: Fitted | None = None
         self.step: Step | None = None
         self.failure = ""
-        self._listeners: list[Callable[[], None]] = []
-        self._job: FitJob[Step, Fitted] | None = None
+        self.listeners: list[Callable[[], None]] = []
+        self._job: Job[Step, Fitted] | None = None
 
     def begin(self) -> BackgroundFit:
         """Start the thread."""
-        self._job = FitJob(
-            self._work, on_progress=self._on_step, on_success=self._on_success, on_failure=self._on_failure
-        )
+        self._job = Job(self._work, self._on_step, self._on_end)
         return self
 
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait until it has finished or failed."""
         if self._job is not None:
             self._job.wait(timeout_s)
-
-    def add_listener(self, listener: Callable[[], None]) -> None:
-        """Call `listener` whenever there is a new result or step."""
-        self._listeners.append(listener)
-
-    def remove_listener(self, listener: Callable[[], None]) -> None:
-        """Remove a listener."""
-        if listener in self._listeners:
-            self._listeners.remove(listener)
 
     @property
     def running(self) -> bool:
@@ -643,20 +593,16 @@ class BackgroundFit:
         self._notify()
         return first_fit(self.campaign, self.initial, watch)
 
-    def _on_success(self, fitted: Fitted) -> None:
-        self.fitted = fitted
-        self._notify()
-
-    def _on_failure(self, reason: str) -> None:
-        self.failure = reason
-        self._notify()
-
     def _on_step(self, step: Step) -> None:
         self.step = step
         self._notify()
 
+    def _on_end(self, fitted: Fitted | None, reason: str) -> None:
+        self.fitted, self.failure = fitted, reason
+        self._notify()
+
     def _notify(self) -> None:
-        for listener in list(self._listeners):
+        for listener in list(self.listeners):
             listener()
 
 
@@ -686,11 +632,9 @@ class FitProgress:
         self._step = step
         if math.isfinite(step.predicted_decrease) and step.predicted_decrease > 0:
             self._largest = max(self._largest, step.predicted_decrease)
+            to_go = math.log10(max(step.predicted_decrease, CONVERGED_DECREASE) / CONVERGED_DECREASE)
             whole = math.log10(max(self._largest, 10 * CONVERGED_DECREASE) / CONVERGED_DECREASE)
-            done = math.log10(
-                max(self._largest, step.predicted_decrease) / max(step.predicted_decrease, CONVERGED_DECREASE)
-            )
-            self._fraction = max(self._fraction, min(done / whole, 0.97))
+            self._fraction = max(self._fraction, min(1 - to_go / whole, 0.97))
 
     def state(self, now: float, task: str, other: Step | None = None) -> tuple[float, str]:
         """Return the fraction done and the text of the status line. Returns fraction, text."""
@@ -698,15 +642,12 @@ class FitProgress:
         if self._typical_s:
             return max(self._fraction, passed_s / (passed_s + self._typical_s / 2)), f"{task} · {passed_s:.0f} s"
         step = other or self._step
-        where = f" · step {step.iteration}" if step is not None else ""
-        promise = ""
-        if step is not None and math.isfinite(step.predicted_decrease):
-            promise = (
-                f" · the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
-                if step.predicted_decrease < 1e4
-                else " · still far off"
-            )
-        return self._fraction, f"{task}{where}{promise} · {passed_s:.1f} s"
+        if step is not None:
+            task += f" · step {step.iteration}"
+            if math.isfinite(step.predicted_decrease):
+                gain = f"the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
+                task += f" · {gain if step.predicted_decrease < 1e4 else 'still far off'}"
+        return self._fraction, f"{task} · {passed_s:.1f} s"
 
 
 def commands(campaign: Campaign, choice: ModelChoice, *, fitted: bool, save: bool = False) -> list[str]:
@@ -719,20 +660,18 @@ def commands(campaign: Campaign, choice: ModelChoice, *, fitted: bool, save: boo
         return []
     if not added:
         return [f"vinetrack compare {folder}"]
-    end = " --save" if save else ""
-    return [f"vinetrack add {_command_line_name(campaign, name)} {folder}{end}" for name in added]
-
-
-def _command_line_name(campaign: Campaign, effect: str) -> str:
-    """Name of an effect on the command line: its file, if the settings do not list that yet."""
-    path = campaign.effects[effect].path
-    is_unlisted = campaign.own_files([effect]) and path.name not in campaign.experiment.settings.effects
-    return shlex.quote(path.as_posix()) if is_unlisted else effect
+    lines = []
+    for name in added:
+        path = campaign.effects[name].path
+        # A file beside the experiment is named by its path until the settings list it.
+        is_unlisted = campaign.own_files([name]) and path.name not in campaign.experiment.settings.effects
+        lines.append(f"vinetrack add {shlex.quote(path.as_posix()) if is_unlisted else name} {folder}")
+    return [f"{line} --save" for line in lines] if save else lines
 
 
 def model_text(names: Sequence[str]) -> str:
     """Return a model as text, with one name for the base effects together."""
-    others = [name.replace("_", " ") for name in names if name not in BASE_EFFECTS]
+    others = [spaced_name(name) for name in names if name not in BASE_EFFECTS]
     missing_base = [name for name in BASE_EFFECTS if name not in names]
     base = "base model" if not missing_base else " + ".join(name for name in names if name in BASE_EFFECTS)
     return " + ".join([base, *others])

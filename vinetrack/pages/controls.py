@@ -15,29 +15,26 @@ from bokeh.models import (
     Column,
     ColumnDataSource,
     CustomJS,
-    Div,
     PrintfTickFormatter,
     Slider,
     Toggle,
     UIElement,
 )
 
-from vinetrack.core.problems import ExperimentError, UserError, format_problems
-from vinetrack.core.tables import TableError
+from vinetrack.core.problems import UserError
 from vinetrack.diagnosis.result import UNEXPLAINED
-from vinetrack.effects import BASE_EFFECTS, Effect, load_effect
-from vinetrack.experiment.folder import save_model
+from vinetrack.effects import BASE_EFFECTS, load_effect
+from vinetrack.inference.fit_result import Number
+from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
-    FitJob,
     FitProgress,
     Fitted,
+    Job,
     ModelChoice,
     SizeControl,
     choice_in_use,
-    commands,
-    model_text,
     read_campaign,
     sizes_of,
     slider_range,
@@ -48,6 +45,7 @@ from vinetrack.pages.plots import (
     escaped,
     html_div,
     progress_bar,
+    set_text,
     side_by_side,
     stacked,
     stylesheet,
@@ -71,48 +69,55 @@ input { accent-color: var(--accent); width: 1rem; height: 1rem; margin-right: .4
 """
 
 
-class EffectRow:
-    """Controls of one effect: tick box, sliders, formula and fitted values."""
+class SizeSlider:
+    """Slider of one parameter, and the text of its fitted value; calls `moved(name, value)` with the value in SI."""
 
-    def __init__(self, campaign: Campaign, effect: Effect, choice: ModelChoice) -> None:
-        self.effect, self.sizes = effect, sizes_of(campaign, effect, choice.numbers)
-        unusable = campaign.unusable.get(effect.name, "")
-        self.tick = Checkbox(
-            label=effect.name.replace("_", " "),
-            active=effect.name in choice,
-            disabled=bool(unusable) or effect.name in BASE_EFFECTS,  # all others are added to these
-            name=f"tick_{effect.name}",
-            stylesheets=[stylesheet(TICK)],
-            margin=(6, 0, 0, 0),
+    def __init__(self, size: SizeControl, value: float, disabled: bool, moved: Callable[[str, float], None]) -> None:
+        self.size = size
+        unit, factor = size.shown
+        what = size.vine or size.parameter.meaning
+        self._opened = slider_range(size.key, size.parameter, value)
+        low, high = (factor * bound for bound in self._opened)
+        self.slider = Slider(
+            start=low,
+            end=high,
+            value=factor * value,
+            step=_step(low, high),
+            title=f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol,
+            format=PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
+            sizing_mode="stretch_width",
+            disabled=disabled,
+            name=f"size_{size.name}",
+            stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; }")],
+            margin=(2, 0, 6, 0),
         )
-        self.sliders = [_slider(size, choice, bool(unusable)) for size in self.sizes]
-        self.fitted_texts = [html_div(visible=False, name=f"found_{size.name}") for size in self.sizes]
-        about = f"<small>{escaped(unusable or effect.formula)}</small>"
-        pairs = [part for pair in zip(self.sliders, self.fitted_texts, strict=True) for part in pair]
-        self.root = stacked(self.tick, html_div(about), *pairs, margin=(0, 0, 4, 0))
+        self.fitted = html_div(visible=False, name=f"found_{size.name}")
+        self.slider.on_change("value", lambda _attr, _old, new: moved(size.name, float(new) / factor))
 
-    def value(self, k: int) -> float:
-        """Return the value of a slider in SI units."""
-        return float(self.sliders[k].value) / self.sizes[k].shown[1]
+    def set(self, value: float) -> None:
+        """Move the slider to a value, with a range that holds it and the one of the beginning."""
+        factor = self.size.shown[1]
+        low, high = slider_range(self.size.key, self.size.parameter, value)
+        low, high = factor * min(low, self._opened[0]), factor * max(high, self._opened[1])
+        if (self.slider.start, self.slider.end) != (low, high):
+            self.slider.update(start=low, end=high, step=_step(low, high))
+        if self.slider.value != value * factor:
+            self.slider.value = value * factor
 
-
-def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
-    unit, factor = size.shown
-    low, high = factor * size.low, factor * size.high
-    what = size.vine or size.parameter.meaning
-    return Slider(
-        start=low,
-        end=high,
-        value=factor * choice.numbers.get(size.name, size.parameter.default),
-        step=_step(low, high),
-        title=f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol,
-        format=PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
-        sizing_mode="stretch_width",
-        disabled=disabled,
-        name=f"size_{size.name}",
-        stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; }")],
-        margin=(2, 0, 6, 0),
-    )
+    def show_fitted(self, number: Number | None) -> None:
+        """Show the estimate of a fit below the slider, or nothing."""
+        if number is None:
+            self.fitted.visible = False
+            return
+        unit, factor = self.size.shown
+        low, high, value = (factor * x for x in (number.low, number.high, number.value))
+        if math.isfinite(number.bound):
+            text = f"<b>{factor * number.bound:.4g}</b> {escaped(unit)}, at its bound"
+        else:
+            error = f" ± {factor * number.sigma:.2g}" if math.isfinite(number.sigma) else ""
+            ends = f" (its {number.ends_at} bound)" if number.ends_at else ""
+            text = f"<b>{value:.4g}{error}</b> {escaped(unit)} · 95 %: {low:.4g} to {high:.4g}{ends}"
+        self.fitted.update(text=f"<small>fitted: {text}</small>", visible=True)
 
 
 def _step(low: float, high: float) -> float:
@@ -138,80 +143,71 @@ class EffectPanel:
         ticked: Callable[[str, bool], None],
         moved: Callable[[str, str, float], None],
     ) -> None:
-        self.campaign, self._ticked, self._moved = campaign, ticked, moved
+        self._ticked, self._moved = ticked, moved
         self._updating = False
-        self.rows = {name: EffectRow(campaign, effect, choice) for name, effect in campaign.effects.items()}
-        for name, row in self.rows.items():
-            row.tick.on_change("active", partial(self._on_tick, name))
-            for k, slider in enumerate(row.sliders):
-                slider.on_change("value", partial(self._on_size, name, k))
-        self.root = stacked(*self._groups(choice, suspects), name="effects")
-
-    def _groups(self, choice: ModelChoice, suspects: Sequence[str]) -> list[Column]:
-        in_use = [name for name in self.rows if name in choice]
-        likely = [name for name in suspects if name in self.rows and name not in in_use][:6]
-        others = [name for name in self.rows if name not in in_use and name not in likely]
-        kinds = {name: self.campaign.effects[name].kind for name in others}
+        self.ticks: dict[str, Checkbox] = {}
+        self.sliders: dict[str, list[SizeSlider]] = {}
+        rows: dict[str, Column] = {}
+        for name, effect in campaign.effects.items():
+            unusable = campaign.unusable.get(name, "")
+            self.ticks[name] = Checkbox(
+                label=spaced_name(name),
+                active=name in choice,
+                disabled=bool(unusable) or name in BASE_EFFECTS,  # all others are added to these
+                name=f"tick_{name}",
+                stylesheets=[stylesheet(TICK)],
+                margin=(6, 0, 0, 0),
+            )
+            self.ticks[name].on_change("active", partial(self._on_tick, name))
+            self.sliders[name] = [
+                SizeSlider(size, _value(choice, size), bool(unusable), partial(self._on_size, name))
+                for size in sizes_of(campaign, effect)
+            ]
+            about = html_div(f"<small>{escaped(unusable or effect.formula)}</small>")
+            parts = [part for one in self.sliders[name] for part in (one.slider, one.fitted)]
+            rows[name] = stacked(self.ticks[name], about, *parts, margin=(0, 0, 4, 0))
+        in_use = [name for name in rows if name in choice]
+        likely = [name for name in suspects if name in rows and name not in in_use][:6]
+        others = [name for name in rows if name not in in_use and name not in likely]
+        measured = [name for name in others if campaign.effects[name].kind == "measurement"]
         groups = [
             ("Suspected by the diagnosis", likely, True),
-            ("Physical effects", [name for name in others if kinds[name] != "measurement"], not likely),
-            ("Measurement effects", [name for name in others if kinds[name] == "measurement"], False),
+            ("Physical effects", [name for name in others if name not in measured], not likely),
+            ("Measurement effects", measured, False),
             ("In the model in use", in_use, True),
         ]
-        return [self._group(title, names, shown) for title, names, shown in groups if names]
-
-    def _group(self, title: str, names: Sequence[str], shown: bool) -> Column:
-        inside = stacked(*(self.rows[name].root for name in names), visible=shown)
-        return stacked(_opens(inside, title, HEADING, sizing_mode="stretch_width"), inside)
+        shown = []
+        for title, names, visible in groups:
+            if names:
+                inside = stacked(*(rows[name] for name in names), visible=visible)
+                shown.append(stacked(_opens(inside, title, HEADING, sizing_mode="stretch_width"), inside))
+        self.root = stacked(*shown, name="effects")
 
     def _on_tick(self, name: str, _attr: str, _old: bool, new: bool) -> None:
         if not self._updating:
             self._ticked(name, new)
 
-    def _on_size(self, name: str, k: int, _attr: str, _old: float, _new: float) -> None:
+    def _on_size(self, effect: str, number: str, value: float) -> None:
         if not self._updating:
-            row = self.rows[name]
-            self._moved(name, row.sizes[k].name, row.value(k))
+            self._moved(effect, number, value)
 
     def show(self, choice: ModelChoice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
         """Set tick boxes and, optionally, sliders to a choice; show the fitted value at each slider."""
         self._updating = True
         try:
-            for name, row in self.rows.items():
-                if row.tick.active != (name in choice):
-                    row.tick.active = name in choice
-                for k, size in enumerate(row.sizes):
+            for name, tick in self.ticks.items():
+                if tick.active != (name in choice):
+                    tick.active = name in choice
+                for one in self.sliders[name]:
                     if sliders:
-                        _set_slider(row.sliders[k], size, choice.numbers.get(size.name, size.parameter.default))
-                    _show_fitted_value(row.fitted_texts[k], size, fitted if name in choice else None)
+                        one.set(_value(choice, one.size))
+                    one.show_fitted(fitted.number(one.size.name) if fitted is not None and name in choice else None)
         finally:
             self._updating = False
 
 
-def _set_slider(slider: Slider, size: SizeControl, value: float) -> None:
-    low, high = slider_range(size.key, size.parameter, value)
-    low, high = (bound * size.shown[1] for bound in (min(low, size.low), max(high, size.high)))
-    shown = value * size.shown[1]
-    if (slider.start, slider.end) != (low, high):
-        slider.update(start=low, end=high, step=_step(low, high))
-    if slider.value != shown:
-        slider.value = shown
-
-
-def _show_fitted_value(div: Div, size: SizeControl, fitted: Fitted | None) -> None:
-    number = None if fitted is None else fitted.number(size.name)
-    if number is None:
-        div.visible = False
-        return
-    unit, factor = size.shown
-    low, high, value = (factor * x for x in (number.low, number.high, number.value))
-    if math.isfinite(number.bound):
-        text = f"<small>fitted: <b>{factor * number.bound:.4g}</b> {escaped(unit)}, at its bound</small>"
-    else:
-        error = f" ± {factor * number.sigma:.2g}" if math.isfinite(number.sigma) else ""
-        ends = f" (its {number.ends_at} bound)" if number.ends_at else ""
-        text = f"<small>fitted: <b>{value:.4g}{error}</b> {escaped(unit)} · 95 %: {low:.4g} to {high:.4g}{ends}</small>"
-    div.update(text=text, visible=True)
+def _value(choice: ModelChoice, size: SizeControl) -> float:
+    return choice.numbers.get(size.name, size.parameter.default)
 
 
 CHIPS = """
@@ -273,43 +269,6 @@ class TrialSelector:
         return [i for i in sorted(self._trials.active) if self.campaign.trials[i].condition in conditions]
 
 
-class SavePanel:
-    """Button of one page to save the model."""
-
-    def __init__(self, page: Page) -> None:
-        self._page = page
-        self.message = html_div(name="saved")
-        save = button("Save the model to experiment.yaml", "save", self._save)
-        self.root = stacked(side_by_side(save), self.message, name="keep")
-
-    def _save(self) -> None:
-        page = self._page
-        folder = page.campaign.experiment.folder
-        try:
-            path = save_model(folder, page.choice.effects, page.campaign.own_files(page.choice.effects))
-        except (ExperimentError, TableError, OSError) as error:
-            lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
-            self.message.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
-            return
-        rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
-        lines = self._lines(save=True)
-        same = f" The same as a command:</p>{command_block(lines)}<p>" if lines else " "
-        self.message.text = (
-            f'<p><span class="good">Saved.</span> {escaped(path.as_posix())} now has the'
-            f" {escaped(model_text(page.choice.effects))}.{same}"
-            f"For new tables and a new report:</p>{command_block([rerun])}"
-        )
-
-    def _lines(self, *, save: bool = False) -> list[str]:
-        page = self._page
-        return commands(page.campaign, page.choice, fitted=page.is_fitted(), save=save)
-
-    def commands(self) -> str:
-        """The commands that reproduce the state of the page, as HTML."""
-        lines = self._lines()
-        return "<small>The same from the command line:</small>" + command_block(lines) if lines else ""
-
-
 # ------------------------------------------------------------------------------
 # If no known effect explains the misfit: a button that proposes an effect, and one that opens the page with it.
 
@@ -343,7 +302,7 @@ class ProposalPanel:
 
     def __init__(self, page: Page, reopen: Reopen | None) -> None:
         self._page, self._reopen = page, reopen
-        self._job: FitJob[str, ReadProposal] | None = None
+        self._job: Job[str, ReadProposal] | None = None
         # Time in which the progress bar of a search is two thirds full (chosen)
         self._task, self._progress = "", FitProgress(150.0)
         self._outcome: ReadProposal | None = None
@@ -362,19 +321,15 @@ class ProposalPanel:
         unexplained = diagnosis is not None and UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
         self.root.visible = self._job is not None or self._outcome is not None or unexplained
         if self._job is not None:
-            self._say(progress_bar(*self._progress.state(time.monotonic(), self._task)))
+            set_text(self.text, progress_bar(*self._progress.state(time.monotonic(), self._task)))
         elif self._outcome is None and not self.text.text:
             command = command_block([f"vinetrack propose {self._page.campaign.folder.as_posix()}"])
-            self._say(f"<p>{INTRODUCTION} The same from the command line:</p>{command}")
+            set_text(self.text, f"<p>{INTRODUCTION} The same from the command line:</p>{command}")
 
     def close(self) -> None:
         """The page was closed."""
         if self._job is not None:
             self._job.cancel()
-
-    def _say(self, text: str) -> None:
-        if self.text.text != text:
-            self.text.text = text
 
     def _propose_or_stop(self) -> None:
         if self._job is not None:
@@ -384,11 +339,10 @@ class ProposalPanel:
         self._task, self.button.label = "reading the results", "Stop"
         self._progress.begin(time.monotonic())
         soon = self._page.document.add_next_tick_callback
-        self._job = FitJob(
+        self._job = Job(
             partial(propose_and_read, self._page.campaign),
-            on_progress=self._on_progress,
-            on_success=lambda outcome: soon(partial(self._done, outcome)),
-            on_failure=lambda reason: soon(partial(self._ended, f'<p class="bad">{escaped(reason)}</p>')),
+            self._on_progress,
+            lambda outcome, reason: soon(partial(self._done, outcome, reason)),
         )
         self.show()
 
@@ -396,8 +350,11 @@ class ProposalPanel:
         """Called from the job's thread; the status line shows it."""
         self._task = task
 
-    def _done(self, outcome: ReadProposal) -> None:
+    def _done(self, outcome: ReadProposal | None, reason: str) -> None:
         if self._job is None:
+            return
+        if outcome is None:
+            self._ended(f'<p class="bad">{escaped(reason)}</p>')
             return
         self._outcome = outcome if outcome.written.files else None
         self.open.visible = self._outcome is not None and self._reopen is not None
@@ -406,7 +363,7 @@ class ProposalPanel:
     def _ended(self, text: str) -> None:
         self._job, self.button.label = None, PROPOSE
         self.button.visible = self._outcome is None
-        self._say(text)
+        set_text(self.text, text)
         self.root.visible = True
 
     def _open(self) -> None:
@@ -417,7 +374,7 @@ class ProposalPanel:
         try:
             choice = choice_in_use(campaign).with_effect(load_effect(first).name)
         except UserError as error:
-            self._say(f'<p class="bad">{escaped(error)}</p>')
+            set_text(self.text, f'<p class="bad">{escaped(error)}</p>')
             return
         self._reopen(BackgroundFit(campaign, choice).begin())
         self._reload.data = {"times": [1]}

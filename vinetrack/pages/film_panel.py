@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
 from bokeh.document import Document
 from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d, Select, Slider
@@ -17,9 +17,10 @@ from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial, hand_corrected
-from vinetrack.pages.campaign import Campaign, ExplorerTrial, Prediction
-from vinetrack.pages.local_page import THREAD_PREFIX, jpeg
+from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
+from vinetrack.pages.local_page import jpeg
 from vinetrack.pages.plots import (
     MEASURED_EDGE,
     MODEL_EDGE,
@@ -34,10 +35,9 @@ from vinetrack.pages.plots import (
 )
 from vinetrack.pipeline.overlays_stage import shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-
-if TYPE_CHECKING:
-    from vinetrack.video.axis import Axis
-
+from vinetrack.video.axis import Axis
+from vinetrack.video.curved_axis import axis_from_entry
+from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
 # ------------------------------------------------------------------------------
 # Frames of one recording, and the positions of the tracked edge and the model's edge in the picture.
@@ -53,7 +53,6 @@ class RecordingView:
     the track.
     """
 
-    trial: str
     path: Path
     axis: Axis
     half_width_px: float
@@ -61,22 +60,20 @@ class RecordingView:
     edge_px: Floats
     lead_position_m: Floats
     shake_px: Floats
-    by_hand: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    by_hand: NDArray[np.bool_]
 
     def along_px(self, lead_position_m: Floats) -> Floats:
         """Return the pixels along the axis of positions of the track; linearly extrapolated beyond the track. NaN if
         the track has fewer than two points.
         """
-        known = np.isfinite(self.edge_px) & np.isfinite(self.lead_position_m)
-        if np.count_nonzero(known) < 2:
+        known = np.flatnonzero(np.isfinite(self.edge_px) & np.isfinite(self.lead_position_m))
+        if known.size < 2:
             return np.full(np.shape(lead_position_m), np.nan)
+        known = known[np.argsort(self.lead_position_m[known], kind="stable")]
         position, along = self.lead_position_m[known], self.edge_px[known]
-        order = np.argsort(position, kind="stable")
-        position, along = position[order], along[order]
         scale, offset = np.polyfit(position, along, 1)
-        inside = np.interp(lead_position_m, position, along)
         outside = (lead_position_m < position[0]) | (lead_position_m > position[-1])
-        return np.where(outside, offset + scale * lead_position_m, inside)
+        return np.where(outside, offset + scale * lead_position_m, np.interp(lead_position_m, position, along))
 
     def across(self, along_px: float, frame: int | None = None) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the ends of a line across the vine at a position along the axis; with `frame`, in that picture.
@@ -103,12 +100,9 @@ def recording_view(results: Results, trial: Trial) -> RecordingView | str:
         return str(error)
     if not axis:
         return f"The position of the axis of {trial.name} in its picture was not stored: run snakemake again."
-    from vinetrack.video.curved_axis import axis_from_entry
-
     line = axis_from_entry(axis)
     width = axis.get("width_px")
     return RecordingView(
-        trial=trial.name,
         path=trial.video,
         axis=line,
         half_width_px=0.75 * float(width) if width else 0.05 * line.length_px,
@@ -120,73 +114,50 @@ def recording_view(results: Results, trial: Trial) -> RecordingView | str:
     )
 
 
-@dataclass
-class DecodedRecording:
-    """Frames of one recording, decoded in the background. `shape` is the height and width of the pictures, px. `scale`
-    is the number of their pixels per pixel of the recording; `error` is blank unless decoding failed.
-    """
+@dataclass(frozen=True)
+class Film:
+    """Decoded frames of a recording as JPEG, with the number of their pixels per pixel of the recording."""
 
-    path: Path
-    count: int = 0
-    expected: int = 0
-    shape: tuple[int, int] = (0, 0)
-    scale: float = 1.0
-    complete: bool = False
-    error: str = ""
-    _frames: list[bytes] = field(default_factory=list)
-    _cancelled: bool = False
+    frames: Sequence[bytes]
+    scale: float
 
     def picture(self, frame: int) -> NDArray[np.uint8]:
         """Return the grey levels of one frame."""
-        import cv2
-
-        data = np.frombuffer(self._frames[frame], dtype=np.uint8)
+        data = np.frombuffer(self.frames[frame], dtype=np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
-    def decode(self, on_progress: Callable[[DecodedRecording], None] | None = None) -> DecodedRecording:
-        """Decode every frame."""
-        from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
-        max_width_px = 960  # Chosen: as wide as the page shows a recording
-        try:
-            recording = inspect_recording(self.path)
-            self.expected = recording.declared_frames or 0
-            for luma in iterate_frames(recording):
-                if self._cancelled:
-                    return self
-                height, width = luma.shape
-                shown_px = min(width, max_width_px)
-                self.shape, self.scale = (max(1, round(height * shown_px / width)), shown_px), shown_px / width
-                self._frames.append(jpeg(luma, max_width_px, 2.0**recording.bit_depth - 1))
-                self.count += 1
-                # Frames between two reports of progress; chosen: several reports a second
-                if on_progress is not None and self.count % 10 == 1:
-                    on_progress(self)
-        except (RecordingError, OSError) as error:
-            self.error = str(error)
-        self.complete = True
-        if on_progress is not None:
-            on_progress(self)
-        return self
-
-    def start_decoding(self, on_progress: Callable[[DecodedRecording], None]) -> None:
-        """Run `decode` in a thread, from which `on_progress` is called."""
-        threading.Thread(target=self.decode, args=(on_progress,), daemon=True, name=f"{THREAD_PREFIX}film").start()
-
-    def cancel(self) -> None:
-        """Stop decoding."""
-        self._cancelled = True
+def decode(path: Path, watch: Callable[[tuple[int, float]], None]) -> Film:
+    """Decode a recording as far as it can be decoded; `watch` gets the number of frames so far, and their share."""
+    max_width_px = 960  # Chosen: as wide as the page shows a recording
+    frames: list[bytes] = []
+    scale, reason = 1.0, "no frame could be decoded"
+    try:
+        recording = inspect_recording(path)
+        for luma in iterate_frames(recording):
+            scale = min(max_width_px / luma.shape[1], 1.0)
+            frames.append(jpeg(luma, max_width_px, 2.0**recording.bit_depth - 1))
+            # Frames between two reports of progress; chosen: several reports a second
+            if len(frames) % 10 == 1:
+                watch((len(frames), len(frames) / (recording.declared_frames or math.inf)))
+    except (RecordingError, OSError) as error:
+        reason = str(error)
+    if not frames:
+        raise UserError(reason)
+    return Film(frames, scale)
 
 
 class FilmPanel:
-    """Shows one trial at a time; calls `instant` with the time of the frame, s since release (None: no frame)."""
+    """Shows one trial at a time; calls `instant` with the time of the frame, s since release."""
 
-    def __init__(self, campaign: Campaign, document: Document, instant: Callable[[str, float | None], None]) -> None:
+    def __init__(self, campaign: Campaign, document: Document, instant: Callable[[str, float], None]) -> None:
         self.campaign, self._document, self._instant = campaign, document, instant
         self._now: Prediction | None = None
         self._reference: Prediction | None = None
-        self._film: DecodedRecording | None = None
+        self._film: Film | None = None
+        self._job: Job[tuple[int, float], Film] | None = None
         self._view: RecordingView | None = None
+        self._no_view = ""
         self._playing: Any = None
         names = [aligned.name for aligned in campaign.trials]
         common: dict[str, Any] = {"stylesheets": [stylesheet()], "margin": 0}
@@ -241,65 +212,70 @@ class FilmPanel:
         fig.multi_line("xs", "ys", source=self._edges, line_color="colour", line_width=2.6, line_dash={"field": "dash"})
         return fig
 
-    def set_predictions(self, now: Prediction | None, reference: Prediction | None) -> None:
+    def set_predictions(self, now: Prediction, reference: Prediction | None) -> None:
         """Set the predictions of the current model and of the model for comparison."""
         self._now, self._reference = now, reference
         self._draw_edges()
+        if self._job is None:
+            self._update_caption(int(self.frame.value))
 
     def show_trial(self, name: str) -> None:
         """Show another trial: decode its recording, or show why there is none."""
         self._stop()
-        if self._film is not None:
-            self._film.cancel()
-        self._film = self._view = None
+        self.close()
         if self.trial_select.value != name:
             self.trial_select.value = name
             return
-        aligned = self.campaign.trial(name)
-        view = recording_view(Results(self.campaign.folder), aligned.data.trial)
         self.figure.visible = False
+        view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
         if isinstance(view, str):
-            last = max(aligned.data.time_s.size - 1, 1)
-            self.frame.update(start=0, end=last, value=(aligned.data.n_rest + last) // 2)
-            self._update_caption(int(self.frame.value), view)
+            self._show_track(view)
             return
-        self._view = view
+        self._view, self._no_view = view, ""
         self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
-        self._film = DecodedRecording(view.path)
-        # The decoding thread only asks for a callback in that of the document.
-        self._film.start_decoding(lambda film: self._document.add_next_tick_callback(partial(self._decoded, film)))
+        soon = self._document.add_next_tick_callback
+        self._job = Job(
+            partial(decode, view.path),
+            lambda done: soon(partial(self._decoding, view, *done)),
+            lambda film, reason: soon(partial(self._decoded, view, film, reason)),
+        )
 
-    def _decoded(self, film: DecodedRecording) -> None:
-        if film is not self._film or self._view is None:
+    def _show_track(self, reason: str) -> None:
+        """Show the positions alone, and why there is no recording."""
+        self._view, self._no_view = None, reason
+        data = self._shown.data
+        last = max(data.time_s.size - 1, 1)
+        self.frame.update(start=0, end=last, value=(data.n_rest + last) // 2)
+        self._update_caption(int(self.frame.value))
+
+    def _decoding(self, view: RecordingView, count: int, share: float) -> None:
+        if view is self._view and self._job is not None:
+            self.caption.text = progress_bar(share, f"decoding {view.path.name}: {count} frames")
+
+    def _decoded(self, view: RecordingView, film: Film | None, reason: str) -> None:
+        if view is not self._view:
             return
-        if film.count and not self.figure.visible:
-            self._fit_figure(film)
-        if not film.complete:
-            share = film.count / film.expected if film.expected else 0.0
-            self.caption.text = progress_bar(share, f"decoding {film.path.name}: {film.count} frames")
+        self._job, self._film = None, film
+        if film is None:
+            self._show_track(reason)
             return
-        if film.count == 0:
-            self.caption.text = f'<span class="bad">{escaped(film.error or "no frame could be decoded")}</span>'
-            return
+        height, width = film.picture(0).shape
+        self.figure.x_range.update(start=-0.5, end=width - 0.5)
+        self.figure.y_range.update(start=height - 0.5, end=-0.5)
+        self._image.glyph.update(dw=width, dh=height)
+        self.figure.update(aspect_ratio=width / height, visible=True)
         # The frame shown first is half-way along the motion.
-        known = np.flatnonzero(np.isfinite(self._view.edge_px))
-        moving = int(min(known[known.size // 2], film.count - 1)) if known.size else 0
-        self.frame.update(start=0, end=max(film.count - 1, 1))
+        known = np.flatnonzero(np.isfinite(view.edge_px))
+        last = len(film.frames) - 1
+        moving = int(min(known[known.size // 2], last)) if known.size else 0
+        self.frame.update(start=0, end=max(last, 1))
         if self.frame.value != moving:
             self.frame.value = moving
         else:
             self._show_frame(moving)
 
-    def _fit_figure(self, film: DecodedRecording) -> None:
-        height, width = film.shape
-        self.figure.x_range.update(start=-0.5, end=width - 0.5)
-        self.figure.y_range.update(start=height - 0.5, end=-0.5)
-        self._image.glyph.update(dw=width, dh=height)
-        self.figure.aspect_ratio = width / height
-        self.figure.visible = True
-
     def _show_frame(self, frame: int) -> None:
-        if self._film is not None and self._film.complete and frame < self._film.count:
+        if self._film is not None and frame < len(self._film.frames):
             self._picture.data = {"image": [self._film.picture(frame)]}
             self._draw_edges()
         self._update_caption(frame)
@@ -313,27 +289,24 @@ class FilmPanel:
     def _shown(self) -> ExplorerTrial:
         return self.campaign.trial(self.trial_select.value)
 
-    def _positions(self, frame: int) -> tuple[float, float, float]:
+    def _positions(self, frame: int) -> list[float]:
         """Positions of the edge, m: measured, of the model for comparison, of the current model; NaN if unknown."""
         time_s, aligned = self._time_s(frame), self._shown
         place = self.campaign.trials.index(aligned)
-        # The model is defined between the first and the last frame of the fit.
-        model_m = [
-            math.nan
-            if one is None
-            else float(
-                np.interp(time_s, aligned.data.time_s, one.trials[place].predicted_position_m, math.nan, math.nan)
-            )
-            for one in (self._reference, self._now)
-        ]
-        if self._view is None:
-            return float(aligned.data.lead_position_m[min(frame, aligned.data.time_s.size - 1)]), model_m[0], model_m[1]
-        known = frame < self._view.lead_position_m.size
-        return (float(self._view.lead_position_m[frame]) if known else math.nan), model_m[0], model_m[1]
+        measured_m = aligned.data.lead_position_m if self._view is None else self._view.lead_position_m
+        positions_m = [float(measured_m[frame]) if frame < measured_m.size else math.nan]
+        for prediction in (self._reference, self._now):
+            at_m = math.nan
+            if prediction is not None:
+                # The model is defined between the first and the last frame of the fit.
+                predicted_m = prediction.trials[place].predicted_position_m
+                at_m = float(np.interp(time_s, aligned.data.time_s, predicted_m, math.nan, math.nan))
+            positions_m.append(at_m)
+        return positions_m
 
     def _draw_edges(self) -> None:
         view, film = self._view, self._film
-        if view is None or film is None or not film.complete or film.count == 0:
+        if view is None or film is None:
             return
         frame = int(self.frame.value)
         measured_m, reference_m, now_m = self._positions(frame)
@@ -356,8 +329,8 @@ class FilmPanel:
             "dash": [dash for _, _, dash in drawn],
         }
 
-    def _update_caption(self, frame: int, reason: str = "") -> None:
-        aligned = self._shown
+    def _update_caption(self, frame: int) -> None:
+        aligned, view = self._shown, self._view
         since_s = self._time_s(frame) - aligned.release_s
         names, colours = ("tracked", "comparison", "model"), (MEASURED_EDGE, REFERENCE_EDGE, MODEL_EDGE)
         positions_text = [
@@ -365,19 +338,12 @@ class FilmPanel:
             for name, colour, m in zip(names, colours, self._positions(frame), strict=True)
             if math.isfinite(m)
         ]
-        if not reason and self._view is None:
-            reason = str(recording_view(Results(self.campaign.folder), aligned.data.trial))
-        if self._view is not None and frame < self._view.by_hand.size and self._view.by_hand[frame]:
+        if view is not None and frame < view.by_hand.size and view.by_hand[frame]:
             positions_text.append("corrected by hand")
-        notice = f"<p>{escaped(reason)}</p>" if reason else ""
+        notice = f"<p>{escaped(self._no_view)}</p>" if self._no_view else ""
         when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
         self.caption.text = f"{notice}<p>{when} · {' · '.join(positions_text)}</p>"
         self._instant(aligned.name, since_s)
-
-    def refresh(self) -> None:
-        """Update the caption after a change of the predictions."""
-        if self._film is None or self._film.complete:
-            self._update_caption(int(self.frame.value))
 
     def _toggle_play(self) -> None:
         if self._playing is not None:
@@ -399,6 +365,7 @@ class FilmPanel:
         self.play.label = "▶ play"
 
     def close(self) -> None:
-        """The page was closed."""
-        if self._film is not None:
-            self._film.cancel()
+        """Stop decoding, and let the recording go."""
+        if self._job is not None:
+            self._job.cancel()
+        self._job = self._film = self._view = None

@@ -6,6 +6,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,25 +17,32 @@ from bokeh.document import Document
 from bokeh.models import CustomJS
 from bokeh.server.server import Server
 from bokeh.themes import Theme
+from jinja2 import Environment
 from markupsafe import Markup
 from tornado.web import ErrorHandler
 
+from vinetrack.core.problems import ExperimentError, format_problems
+from vinetrack.core.tables import TableError
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.experiment.folder import save_model
 from vinetrack.figures.style import TOKENS, follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.optimiser import Step
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
-    FitJob,
     FitProgress,
     Fitted,
+    Job,
     ModelChoice,
     Prediction,
+    commands,
     fit_choice,
+    model_text,
     predict_choice,
     read_campaign,
 )
-from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
+from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, TrialSelector
 from vinetrack.pages.film_panel import FilmPanel
 from vinetrack.pages.local_page import LOOPBACK, is_from_page, secret_path, serve_on_free_port, serve_until_stopped
 from vinetrack.pages.plots import (
@@ -43,21 +51,22 @@ from vinetrack.pages.plots import (
     HeldModel,
     Plots,
     button,
+    command_block,
     comparison_table,
-    diagnosis_of,
     escaped,
     fitted_numbers_html,
     headline,
     html_div,
     next_panel,
     progress_bar,
+    set_text,
     side_by_side,
     stacked,
     suspects,
     tied_panel,
     vine_colours,
 )
-from vinetrack.results.folder_layout import Results
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
 # A swipe over a figure scrolls the page, as it does elsewhere
 LET_SCROLL = """
@@ -65,6 +74,11 @@ for (const plot of plots) {
   Bokeh.index.find_one(plot)?.canvas_view?.events_el?.style.setProperty("touch-action", "pan-y");
 }
 """
+
+
+REDRAW_MS = 4  # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
+# Chosen: text follows a slider at reading speed, because each change makes the browser lay out the page again
+TEXT_MS = 150
 
 
 class Page:
@@ -76,15 +90,17 @@ class Page:
         self.shown: Prediction | None = None
         self.fits: list[Fitted] = []
         self.held: HeldModel | None = None
-        self.diagnosis, self._diagnosed_at = diagnosis_of(self.campaign.folder), self._diagnosis_time()
+        self.diagnosis: Diagnosis | None = None
+        self._diagnosed_at = 0.0
+        self._read_diagnosis()
         self._sizes_changed = False
-        self._redraw_pending = self._text_pending = False
-        self._job: FitJob[Step, Fitted] | None = None
+        self._pending: set[Callable[[], None]] = set()
+        self._job: Job[Step, Fitted] | None = None
         self._refit_requested = False
         self._step: Step | None = None
         self._progress = FitProgress()
         self._build(reopen)
-        background.add_listener(self._on_background_change)
+        background.listeners.append(self._on_background_change)
         document.on_session_destroyed(lambda _context: self.close())
         # Chosen: interval at which the page looks for a new diagnosis
         document.add_periodic_callback(self._check_for_diagnosis, 2000)
@@ -101,7 +117,8 @@ class Page:
         self.plots = Plots(campaign, self.selector.toggle)
         self.panel = EffectPanel(campaign, self.choice, suspects(self.diagnosis), self._ticked, self._size_moved)
         self.film = FilmPanel(campaign, self.document, self._instant)
-        self.save_panel = SavePanel(self)
+        self.saved = html_div(name="saved")
+        save = side_by_side(button("Save the model to experiment.yaml", "save", self._save))
         self.proposal = ProposalPanel(self, reopen)
         self.refit = button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
         back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
@@ -113,32 +130,27 @@ class Page:
             "model for comparison.</small>"
         )
         actions = stacked(buttons, hint, self.command_text, name="actions")
-        roots = [self.headline, self.status, self.selector.root, self.plots.motion, self.plots.residual]
-        roots += [self.plots.errors, self.panel.root, actions, self.numbers, self.tied, self.next]
-        for root in (*roots, self.film.root, self.save_panel.root, self.proposal.root):
+        texts = [self.headline, self.status, self.numbers, self.tied, self.next]
+        figures = [self.plots.motion, self.plots.residual, self.plots.errors]
+        panels = [self.selector.root, self.panel.root, self.film.root, self.proposal.root]
+        for root in (*texts, *figures, *panels, actions, stacked(save, self.saved, name="keep")):
             self.document.add_root(root)
-        figures = [self.plots.motion, self.plots.residual, self.plots.errors, self.film.figure]
-        self.document.js_on_event("document_ready", CustomJS(args={"plots": figures}, code=LET_SCROLL))
+        swiped = {"plots": [*figures, self.film.figure]}
+        self.document.js_on_event("document_ready", CustomJS(args=swiped, code=LET_SCROLL))
         # A recording keeps its greys, and the edges their colours over them.
-        code = (TEMPLATES / "screen.js").read_text(encoding="utf-8")
-        screen = CustomJS(args={"plots": figures[:-1], "tokens": TOKENS}, code=code)
-        self.document.js_on_event("document_ready", screen)
+        page, style, script = (
+            (TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.html", "page.css", "screen.js")
+        )
+        self.document.js_on_event("document_ready", CustomJS(args={"plots": figures, "tokens": TOKENS}, code=script))
         self.document.title = f"{campaign.name} – vinetrack explorer"
         self.document.theme = Theme(json=THEME)
-        self._set_template()
-
-    def _set_template(self) -> None:
-        from jinja2 import Environment
-
-        trials, conditions = len(self.campaign.trials), len(self.campaign.conditions)
-        out = len(self.campaign.left_out)
-        page, style = ((TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.html", "page.css"))
         self.document.template = Environment(autoescape=True).from_string(page)
+        left_out = f", {len(campaign.left_out)} left out" if campaign.left_out else ""
         self.document.template_variables.update(
-            name=self.campaign.name,
+            name=campaign.name,
             style=Markup(page_frame() + style),
-            vines=[(vine, follows_screen(colour)) for vine, colour in vine_colours(self.campaign)],
-            tally=f"{trials} trials, {conditions} conditions" + (f", {out} left out" if out else ""),
+            vines=[(vine, follows_screen(colour)) for vine, colour in vine_colours(campaign)],
+            tally=f"{len(campaign.trials)} trials, {len(campaign.conditions)} conditions{left_out}",
         )
 
     # ---- user input ------------------------------------------------------------------------------------------------
@@ -150,7 +162,7 @@ class Page:
 
     def _size_moved(self, effect: str, number: str, value: float) -> None:
         known = effect in self.choice
-        self.choice = self.choice.with_effect(effect).with_size(number, value)
+        self.choice = self.choice.with_effect(effect).with_sizes({number: value})
         if not known:
             self.panel.show(self.choice, sliders=False)
         self._mark_changed()
@@ -159,20 +171,18 @@ class Page:
         self._sizes_changed = True
         if self._job is not None:
             self._end_job("The fit was cancelled: the model has changed.")
-        self._redraw_soon()
+        self._soon(self._redraw, REDRAW_MS)
 
     def _selection_changed(self) -> None:
-        self.plots.set_shown(self.selector.shown, self._reference.prediction if self._differs() else None)
-        if self.shown is not None:
-            self.plots.set_curves(self.shown, self.selector.shown)
-            self._show_errors()
+        self.plots.set_shown(self.selector.shown)
+        self._draw()
 
     def _as_fitted(self) -> None:
         """Return to the last fit, or to the model with which the page opened."""
         self.choice = self.background.initial if self.last is None else self.last.choice
         self._sizes_changed = False
         self.panel.show(self.choice, self.last)
-        self._redraw_soon()
+        self._soon(self._redraw, REDRAW_MS)
 
     def _refit_or_stop(self) -> None:
         if self._job is not None or self._refit_requested:
@@ -193,9 +203,8 @@ class Page:
         elif self.shown is not None:
             self.held = HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
         self.hold.label = "Hold to compare" if self.held is None else "Release"
-        if self.shown is not None:
-            self._draw()
-            self._update_text()
+        self._draw()
+        self._update_text()
 
     @property
     def last(self) -> Fitted | None:
@@ -237,7 +246,7 @@ class Page:
         as_fitted = self.last is not None and self.choice is self.last.choice
         if self.choice is not self.background.initial and not as_fitted:
             self._sizes_changed = True
-            self._redraw_soon()
+            self._soon(self._redraw, REDRAW_MS)
 
     def _show_first_fit(self, fitted: Fitted) -> None:
         self.fits = [fitted]
@@ -250,23 +259,18 @@ class Page:
         self._refit_requested = False
         before = (self.last or first).fit
         self._step = None
-        self._job = FitJob(
+        self._job = Job(
             partial(fit_choice, self.campaign, before, self.choice),
-            on_progress=self._on_step,
-            on_success=lambda fitted: self._in_document(partial(self._fit_done, fitted)),
-            on_failure=lambda reason: self._in_document(partial(self._end_job, reason)),
+            self._on_step,
+            lambda fitted, reason: self.document.add_next_tick_callback(partial(self._fit_ended, fitted, reason)),
         )
-
-    def _in_document(self, work: Any) -> None:
-        """Called from a fit's thread: run `work` in the document's thread."""
-        self.document.add_next_tick_callback(work)
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread. A page that cannot keep up draws only the newest step."""
         is_idle = self._step is None
         self._step = step
         if is_idle:
-            self._in_document(self._show_step)
+            self.document.add_next_tick_callback(self._show_step)
 
     def _show_step(self) -> None:
         step, self._step = self._step, None
@@ -275,19 +279,20 @@ class Page:
         self._progress.update(step)
         self._update_status()
         self._predict(self.choice.with_sizes(step.values))
-        self._update_text_soon()
+        self._soon(self._update_text, TEXT_MS)
 
-    def _fit_done(self, fitted: Fitted) -> None:
+    def _fit_ended(self, fitted: Fitted | None, reason: str) -> None:
         if self._job is None:
             return
-        self._job = None
-        self.fits.append(fitted)
-        self.choice, self._sizes_changed = fitted.choice, False
-        self.shown = fitted.prediction
-        self.panel.show(self.choice, fitted)
-        self._draw()
-        self._update_text()
-        self._end_job("")
+        if fitted is not None:
+            self._job = None
+            self.fits.append(fitted)
+            self.choice, self._sizes_changed = fitted.choice, False
+            self.shown = fitted.prediction
+            self.panel.show(self.choice, fitted)
+            self._draw()
+            self._update_text()
+        self._end_job(reason)
 
     def _end_job(self, reason: str) -> None:
         if self._job is not None:
@@ -296,28 +301,26 @@ class Page:
         self._progress.message = reason
         self.refit.label = "Refit"
         self._update_status()
-        self._update_text_soon()
+        self._soon(self._update_text, TEXT_MS)
 
     # ---- drawing -------------------------------------------------------------------------------------------------
 
-    def _redraw_soon(self) -> None:
-        if not self._redraw_pending:
-            self._redraw_pending = True
-            # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
-            self.document.add_timeout_callback(self._redraw, 4)
+    def _soon(self, work: Callable[[], None], delay_ms: int) -> None:
+        """Do it once after a delay, however often it is asked for until then."""
+        if work in self._pending:
+            return
+
+        def begin() -> None:
+            self._pending.discard(work)
+            work()
+
+        self._pending.add(work)
+        self.document.add_timeout_callback(begin, delay_ms)
 
     def _redraw(self) -> None:
-        self._redraw_pending = False
         if self.background.prediction is not None:
             self._predict(self.choice)
-        self._update_text_soon()
-
-    def _update_text_soon(self) -> None:
-        if not self._text_pending:
-            self._text_pending = True
-            # 150: chosen: text follows a slider at reading speed, because each change makes the browser
-            # lay out the page again
-            self.document.add_timeout_callback(self._update_text, 150)
+        self._soon(self._update_text, TEXT_MS)
 
     def _predict(self, choice: ModelChoice) -> None:
         """Predict and draw a choice; if that fails, show the error and keep the former prediction."""
@@ -331,99 +334,91 @@ class Page:
         self._draw()
 
     def _draw(self) -> None:
-        assert self.shown is not None
-        self.plots.set_curves(self.shown, self.selector.shown)
-        self.plots.set_reference(self._reference.prediction if self._differs() else None, self.selector.shown)
-        self._show_errors()
-
-    def _show_errors(self) -> None:
-        assert self.shown is not None
-        self.plots.set_errors(
-            self.shown.errors_m, self._reference.errors_m, self.shown.floors_m, self.selector.conditions
-        )
-
-    def _differs(self) -> bool:
-        """Whether the model drawn is another than the model for comparison."""
-        return self.shown is not None and self.shown is not self._reference.prediction
+        if self.shown is not None:
+            self.plots.draw(self.shown, self._reference, self.selector.shown, self.selector.conditions)
 
     def _update_text(self) -> None:
         """Update all text of the page."""
-        self._text_pending = False
         if self._job is None and not self._refit_requested:
             # The error at a step of a fit, or before a fit, says nothing about the effect.
-            _set(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
+            set_text(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
+        compared = ""
         if self.shown is not None:
             self.film.set_predictions(self.shown, self._reference.prediction)
-            self.film.refresh()
-        fit = None if self._sizes_changed else self.last
-        comparison = (
-            ""
-            if self.shown is None
-            else comparison_table(self.campaign, self.held, HeldModel(self.choice.effects, self.shown, fit))
-        )
-        _set(
-            self.numbers,
-            comparison + fitted_numbers_html(self.campaign, self.fits, self._sizes_changed),
-        )
-        _set(self.tied, tied_panel(self.campaign, self.diagnosis, self.last))
-        _set(self.next, next_panel(self.campaign, self.diagnosis))
-        _set(self.command_text, self.save_panel.commands())
+            now = HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
+            compared = comparison_table(self.campaign, self.held, now)
+        set_text(self.numbers, compared + fitted_numbers_html(self.campaign, self.fits, self._sizes_changed))
+        set_text(self.tied, tied_panel(self.campaign, self.diagnosis, self.last))
+        set_text(self.next, next_panel(self.campaign, self.diagnosis))
+        lines = self._commands()
+        same = "<small>The same from the command line:</small>" + command_block(lines)
+        set_text(self.command_text, same if lines else "")
 
     def _update_status(self) -> None:
         """Update the status line."""
         self.proposal.show()
+        background, text = self.background, ""
         if self._job is not None or self._refit_requested:
             task = "refitting" if self._job is not None else "fitting the model in use first"
-            share, text = self._progress.state(
-                time.monotonic(), task, self.background.step if self._refit_requested else None
-            )
-            _set(self.status, progress_bar(share, text))
-        elif self._progress.message:
-            _set(self.status, f'<span class="bad">{escaped(self._progress.message)}</span>')
-        elif self.background.running:
-            what = (
-                "preparing the model"
-                if self.background.prediction is None
-                else "fitting the model in use, in the background"
-            )
-            _set(self.status, f"<small>{what} …</small>")
-        else:
-            _set(
-                self.status,
-                f'<span class="bad">{escaped(self.background.failure)}</span>' if self.background.failure else "",
-            )
+            other = background.step if self._refit_requested else None
+            text = progress_bar(*self._progress.state(time.monotonic(), task, other))
+        elif failure := self._progress.message or background.failure:
+            text = f'<span class="bad">{escaped(failure)}</span>'
+        elif background.running:
+            fitting = "fitting the model in use, in the background"
+            text = f"<small>{'preparing the model' if background.prediction is None else fitting} …</small>"
+        set_text(self.status, text)
 
-    def _instant(self, trial: str, since_s: float | None) -> None:
+    def _instant(self, trial: str, since_s: float) -> None:
         """Mark in the figure the time of the frame shown."""
         shown = {self.campaign.trials[i].name for i in self.selector.shown}
         self.plots.set_instant(since_s if trial in shown else None)
 
-    def _diagnosis_time(self) -> float:
-        path = Results(self.campaign.folder).diagnosis
-        return path.stat().st_mtime if path.exists() else 0.0
+    def _read_diagnosis(self) -> bool:
+        """Read the diagnosis of the results, None if there is none or it cannot be read; whether it has changed."""
+        results = Results(self.campaign.folder)
+        changed_at = results.diagnosis.stat().st_mtime if results.diagnosis.exists() else 0.0
+        if changed_at == self._diagnosed_at:
+            return False
+        self.diagnosis, self._diagnosed_at = None, changed_at
+        with suppress(ResultsError):
+            self.diagnosis = read_diagnosis(results)
+        return True
 
     def _check_for_diagnosis(self) -> None:
-        if self._diagnosis_time() != self._diagnosed_at:
-            self.diagnosis, self._diagnosed_at = diagnosis_of(self.campaign.folder), self._diagnosis_time()
+        if self._read_diagnosis():
             self._update_text()
 
-    def is_fitted(self) -> bool:
-        """Whether the sizes are those of a fit."""
-        return not self._sizes_changed
+    # ---- saving --------------------------------------------------------------------------------------------------
+
+    def _commands(self, *, save: bool = False) -> list[str]:
+        return commands(self.campaign, self.choice, fitted=not self._sizes_changed, save=save)
+
+    def _save(self) -> None:
+        folder, effects = self.campaign.experiment.folder, self.choice.effects
+        try:
+            path = save_model(folder, effects, self.campaign.own_files(effects))
+        except (ExperimentError, TableError, OSError) as error:
+            lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
+            self.saved.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
+            return
+        rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
+        lines = self._commands(save=True)
+        same = f" The same as a command:</p>{command_block(lines)}<p>" if lines else " "
+        self.saved.text = (
+            f'<p><span class="good">Saved.</span> {escaped(path.as_posix())} now has the'
+            f" {escaped(model_text(effects))}.{same}"
+            f"For new tables and a new report:</p>{command_block([rerun])}"
+        )
 
     def close(self) -> None:
         """The page was closed."""
-        self.background.remove_listener(self._on_background_change)
+        with suppress(ValueError):
+            self.background.listeners.remove(self._on_background_change)
         self.film.close()
         self.proposal.close()
         if self._job is not None:
             self._job.cancel()
-
-
-def _set(piece: Any, text: str) -> None:
-    """Change a piece of HTML only if it differs, because whatever is sent is drawn again."""
-    if piece.text != text:
-        piece.text = text
 
 
 # ------------------------------------------------------------------------------
@@ -432,27 +427,26 @@ def _set(piece: Any, text: str) -> None:
 
 def start_server(background: BackgroundFit, port: int | None = None) -> Server:
     """Return a server that is bound to the loopback address and refuses requests from other pages."""
-    return serve_on_free_port(lambda number: _bind(background, number), port)
-
-
-def _bind(background: BackgroundFit, port: int) -> Server:
     shown = [background]
 
     def open_page(document: Document) -> None:
         Page(shown[-1], document, shown.append)
 
-    server = Server(
-        {"/": Application(FunctionHandler(open_page, trap_exceptions=False))},
-        prefix=secret_path(),
-        address=LOOPBACK,
-        port=port,
-        allow_websocket_origin=["*"],  # checked below, with all else
-        # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
-        keep_alive_milliseconds=20_000,
-        check_unused_sessions_milliseconds=5_000,
-        unused_session_lifetime_milliseconds=10_000,
-        use_index=False,
-    )
+    def serve(number: int) -> Server:
+        return Server(
+            {"/": Application(FunctionHandler(open_page, trap_exceptions=False))},
+            prefix=secret_path(),
+            address=LOOPBACK,
+            port=number,
+            allow_websocket_origin=["*"],  # checked below, with all else
+            # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
+            keep_alive_milliseconds=20_000,
+            check_unused_sessions_milliseconds=5_000,
+            unused_session_lifetime_milliseconds=10_000,
+            use_index=False,
+        )
+
+    server = serve_on_free_port(serve, port)
     tornado = server._tornado
     routed = tornado.find_handler
 

@@ -35,7 +35,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import Number
-from vinetrack.narrative.verdict_text import quantity_text
+from vinetrack.narrative.verdict_text import quantity_text, spaced_name
 from vinetrack.pages.campaign import (
     Campaign,
     ExplorerTrial,
@@ -44,11 +44,11 @@ from vinetrack.pages.campaign import (
     Prediction,
     condition_labels,
     correlated_pairs_text,
+    drawn_rows,
     likelihood_change_text,
     model_text,
     overall_m,
 )
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
 # ------------------------------------------------------------------------------
 # Style shared with the report: colours, fonts, and the pieces of HTML of the page.
@@ -94,6 +94,12 @@ def stylesheet(more: str = "") -> InlineStyleSheet:
 def html_div(text: str = "", name: str | None = None, **keywords: Any) -> Div:
     """Return a piece of HTML as a widget."""
     return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[stylesheet()], margin=0, **keywords)
+
+
+def set_text(piece: Div, text: str) -> None:
+    """Change a piece of HTML only if it differs, because whatever is sent is drawn again."""
+    if piece.text != text:
+        piece.text = text
 
 
 def button(
@@ -164,17 +170,10 @@ def command_block(lines: Sequence[str]) -> str:
 
 
 # ------------------------------------------------------------------------------
-# Data of the page's figures, as plain columns in milliseconds and millimetres.
-
-MAX_POINTS = 250  # Points of a line on the page; chosen: one per three or four pixels
+# Figures and their data, as plain columns in milliseconds and millimetres.
 
 Columns = dict[str, list[Any]]
-
-
-def colours(campaign: Campaign) -> dict[str, str]:
-    """Return the colour of each condition: that of its vine, as in every figure."""
-    styles = vine_styles(campaign.vines)
-    return {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
+Errors = Mapping[str, float]
 
 
 def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
@@ -186,155 +185,53 @@ def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
     return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
 
 
-def _rows(aligned: ExplorerTrial) -> slice:
-    """The rows of a track to draw, at most `MAX_POINTS` and one."""
-    return plotted_rows(aligned.time_s.size, aligned.first_drawn)
+def axis_range(lines: Sequence[Floats]) -> dict[str, float]:
+    """Return the ends of an axis that holds lines with a margin."""
+    if not lines:
+        return {"start": 0.0, "end": 1.0}
+    low, high = (float(of(np.concatenate(lines))) for of in (np.nanmin, np.nanmax))
+    margin = 0.05 * ((high - low) or 1.0)
+    return {"start": low - margin, "end": high + margin}
 
 
-def plotted_rows(count: int, begin: int) -> slice:
-    """Return the rows to draw of `count`, from `begin`."""
-    return slice(begin, None, max(math.ceil((count - begin) / MAX_POINTS), 1))
+def round_up(value: float, steps: Sequence[float]) -> float:
+    """Return the next of these steps times a power of ten, so that an axis rarely changes; 1 for nothing."""
+    if not value > 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(round(power * step, 12) for step in steps if power * step >= value or step == steps[-1])
 
 
-def measured_lines(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Return lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`,
-    `condition`.
-    """
-    trials = [campaign.trials[i] for i in shown]
-    return _lines_by_trial(campaign, [(aligned, aligned.time_s, aligned.growth_m) for aligned in trials])
+@dataclass(frozen=True)
+class HeldModel:
+    """A model for comparison: its effects, what it predicts, and its fit, if it was fitted."""
 
+    effects: tuple[str, ...]
+    prediction: Prediction | None
+    fitted: Fitted | None
 
-def _lines_by_trial(campaign: Campaign, lines: Iterable[tuple[ExplorerTrial, Floats, Floats]]) -> Columns:
-    """One line per trial, from its abscissae and ordinates in SI, scaled by 1000."""
-    colour = colours(campaign)
-    columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
-    for aligned, x, y in lines:
-        rows = _rows(aligned)
-        columns["xs"].append(1e3 * x[rows])
-        columns["ys"].append(1e3 * _with_gaps(aligned, rows, y[rows]))
-        columns["colour"].append(colour[aligned.condition])
-        columns["trial"].append(aligned.name)
-        columns["condition"].append(campaign.labels[aligned.condition])
-    return columns
-
-
-def _with_gaps(aligned: ExplorerTrial, rows: slice, values: Floats) -> Floats:
-    """Insert NaN after each gap, so that no line is drawn across frames that were left out."""
-    stretch = np.cumsum(aligned.data.first)[rows]
-    out = values.copy()
-    out[np.flatnonzero(np.diff(stretch) > 0) + 1] = math.nan
-    return out
-
-
-def replicate_bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Return outlines of one standard deviation of the replicates around their mean, ms and mm."""
-    colour = colours(campaign)
-    columns: Columns = {"xs": [], "ys": [], "colour": []}
-    for condition in _conditions(campaign, shown):
-        band = campaign.bands.get(condition)
-        if band is None or band.time_s.size < 2:
-            continue
-        first = int(np.searchsorted(band.time_s, 0.0))
-        rows = plotted_rows(band.time_s.size, max(first - max((band.time_s.size - first) // 20, 2), 0))
-        time_ms, mean_mm, sigma_mm = (1e3 * part[rows] for part in (band.time_s, band.mean_m, band.sigma_m))
-        columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
-        columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
-        columns["colour"].append(colour[condition])
-    return columns
-
-
-def model_lines(campaign: Campaign, prediction: Prediction, shown: Sequence[int]) -> Columns:
-    """Return one line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
-    columns: Columns = {"xs": [], "ys": []}
-    for condition in _conditions(campaign, shown):
-        members = [i for i in shown if campaign.trials[i].condition == condition]
-        longest = max(members, key=lambda i: campaign.trials[i].time_s[-1])
-        aligned = campaign.trials[longest]
-        rows = _rows(aligned)
-        columns["xs"].append(1e3 * aligned.time_s[rows])
-        growth_m = prediction.trials[longest].predicted_position_m - aligned.origin_m
-        columns["ys"].append(1e3 * growth_m[rows])
-    return columns
-
-
-def residual_lines(campaign: Campaign, prediction: Prediction, shown: Sequence[int]) -> Columns:
-    """Return lines of measurement minus model, `ys` mm, against the growth, `xs` mm."""
-    trials = campaign.trials
-    return _lines_by_trial(campaign, [(trials[i], trials[i].growth_m, prediction.trials[i].residual_m) for i in shown])
-
-
-def error_bars(
-    campaign: Campaign,
-    now_m: Mapping[str, float],
-    before_m: Mapping[str, float],
-    floors_m: Mapping[str, float],
-    shown: Sequence[str],
-) -> Columns:
-    """Return one row per condition, the first at the bottom: `label`, `now`, `before`, `floor` (mm),
-    `colour`, `alpha`.
-    """
-    colour = colours(campaign)
-    names = list(reversed(campaign.conditions))
-    return {
-        "condition": names,
-        "label": [campaign.labels[name] for name in names],
-        "now": [_mm(now_m.get(name)) for name in names],
-        "before": [_mm(before_m.get(name)) for name in names],
-        "floor": [_mm(floors_m.get(name)) for name in names],
-        "colour": [colour[name] for name in names],
-        "alpha": [0.95 if name in shown else 0.3 for name in names],
-    }
-
-
-def axis_ranges(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return ranges that contain all lines with a margin. Returns (left, right), (bottom, top)."""
-    if not columns["xs"]:
-        return (0.0, 1.0), (0.0, 1.0)
-    ranges = []
-    for key in ("xs", "ys"):
-        low = min(float(np.nanmin(part)) for part in columns[key])
-        high = max(float(np.nanmax(part)) for part in columns[key])
-        room = share * ((high - low) or 1.0)
-        ranges.append((low - room, high + room))
-    return ranges[0], ranges[1]
-
-
-def symmetric_range(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
-    """Return a symmetric range for residuals, rounded so that it rarely changes while a slider moves. Returns low, high
-    : float, mm.
-    """
-    parts: list[Floats] = columns["ys"]
-    largest = max((float(np.nanmax(np.abs(part))) for part in parts), default=least_mm)
-    step = 10 ** math.floor(math.log10(max(largest, least_mm)))
-    reach = next(step * k for k in (1.2, 2, 3, 5, 7, 10) if step * k >= 1.05 * max(largest, least_mm) or k == 10)
-    return -reach, reach
-
-
-def _conditions(campaign: Campaign, shown: Sequence[int]) -> list[str]:
-    present = {campaign.trials[i].condition for i in shown}
-    return [name for name in campaign.conditions if name in present]
-
-
-def _mm(value: float | None) -> float:
-    return math.nan if value is None else 1e3 * value
+    @property
+    def errors_m(self) -> Mapping[str, float]:
+        """Errors by condition, m."""
+        return {} if self.prediction is None else self.prediction.errors_m
 
 
 class Plots:
-    """Figures and their data sources; the `set_…` methods update the data."""
+    """Figures and their data sources, updated by `set_shown`, `draw` and `set_instant`."""
 
     def __init__(self, campaign: Campaign, on_condition_click: Callable[[str], None]) -> None:
         self.campaign, self._on_condition_click = campaign, on_condition_click
-        self._reference_drawn: object = None
-        self._curves_drawn: tuple[int, ...] | None = None
-        empty: dict[str, Any] = {"xs": [], "ys": []}
-        self._band = ColumnDataSource({**empty, "colour": []})
-        self._measured = ColumnDataSource({**empty, "colour": [], "trial": [], "condition": []})
-        self._reference = ColumnDataSource(empty)
-        self._model = ColumnDataSource(empty, name="model_curves")
-        self._residuals = ColumnDataSource(
-            {**empty, "colour": [], "trial": [], "condition": []}, name="residual_curves"
-        )
-        self._bars = ColumnDataSource(error_bars(campaign, {}, {}, {}, ()), name="error_bars")
+        styles = vine_styles(campaign.vines)
+        # The colour of each condition is that of its vine, as in every figure.
+        self._colour = {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
+        self._trials_drawn: tuple[int, ...] | None = None
+        self._other_drawn: Prediction | None = None
+        self._band = ColumnDataSource(self._replicate_bands(()))
+        self._measured = ColumnDataSource(self._lines(()))
+        self._reference = ColumnDataSource({"xs": [], "ys": []})
+        self._model = ColumnDataSource({"xs": [], "ys": []}, name="model_curves")
+        self._residuals = ColumnDataSource(self._lines(()), name="residual_curves")
+        self._bars = ColumnDataSource(self._error_bars({}, {}, {}, ()), name="error_bars")
         self.motion, self.residual = self._draw_motion(), self._draw_residual()
         self.errors = self._draw_errors()
 
@@ -410,56 +307,102 @@ class Plots:
         self._bars.selected.indices = []
         self._on_condition_click(names[new[0]])
 
-    def set_shown(self, shown: Sequence[int], reference: Prediction | None) -> None:
-        """Select the trials to draw, and the reference curves of their conditions."""
-        lines = measured_lines(self.campaign, shown)
-        (left, right), (bottom, top) = axis_ranges(lines)
-        self.motion.x_range.update(start=left, end=right)
-        self.motion.y_range.update(start=bottom, end=top)
-        self.residual.x_range.update(start=bottom, end=top)
-        self._measured.data = lines
-        self.set_reference(reference, shown)
-        # Chosen: bands of more conditions overlap and hide the curves
-        few = len({self.campaign.trials[i].condition for i in shown}) <= 4
-        self._band.data = replicate_bands(self.campaign, shown if few else [])
+    def _lines(self, lines: Iterable[tuple[ExplorerTrial, Floats, Floats]]) -> Columns:
+        """One line per trial, from its abscissae and ordinates in SI, scaled by 1000; none is drawn across frames that
+        were left out.
+        """
+        columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
+        for aligned, x, y in lines:
+            gaps = np.diff(np.cumsum(aligned.data.first)[aligned.rows], prepend=0) > 0
+            gaps[0] = False
+            columns["xs"].append(1e3 * x[aligned.rows])
+            columns["ys"].append(np.where(gaps, math.nan, 1e3 * y[aligned.rows]))
+            columns["colour"].append(self._colour[aligned.condition])
+            columns["trial"].append(aligned.name)
+            columns["condition"].append(self.campaign.labels[aligned.condition])
+        return columns
 
-    def set_reference(self, reference: Prediction | None, shown: Sequence[int]) -> None:
-        """Set the curves for comparison."""
-        key = (id(reference), tuple(shown))
-        if key != self._reference_drawn:
-            self._reference_drawn = key
-            self._reference.data = (
-                model_lines(self.campaign, reference, shown) if reference is not None else {"xs": [], "ys": []}
-            )
+    def _replicate_bands(self, conditions: Sequence[str]) -> Columns:
+        """Outlines of one standard deviation of the replicates around their mean, ms and mm."""
+        columns: Columns = {"xs": [], "ys": [], "colour": []}
+        for condition in conditions:
+            band = self.campaign.bands.get(condition)
+            if band is None or band.shape[1] < 2:
+                continue
+            rows = drawn_rows(band.shape[1], int(np.searchsorted(band[0], 0.0)))
+            time_ms, mean_mm, sigma_mm = 1e3 * band[:, rows]
+            columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
+            columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
+            columns["colour"].append(self._colour[condition])
+        return columns
+
+    def _model_lines(self, prediction: Prediction, shown: Sequence[int]) -> Columns:
+        """One line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
+        trials = self.campaign.trials
+        longest: dict[str, int] = {}
+        for i in sorted(shown, key=lambda i: trials[i].time_s[-1], reverse=True):
+            longest.setdefault(trials[i].condition, i)
+        conditions = [name for name in self.campaign.conditions if name in longest]
+        drawn = [(trials[longest[name]], prediction.trials[longest[name]]) for name in conditions]
+        return {
+            "xs": [1e3 * trial.time_s[trial.rows] for trial, _ in drawn],
+            "ys": [1e3 * (model.predicted_position_m - trial.origin_m)[trial.rows] for trial, model in drawn],
+        }
+
+    def _error_bars(
+        self, now_m: Errors, before_m: Errors, floors_m: Errors, conditions: Sequence[str]
+    ) -> dict[str, list[Any]]:
+        """One row per condition, the first at the bottom, mm; those not in `conditions` are faint."""
+        names = list(reversed(self.campaign.conditions))
+        errors = {"now": now_m, "before": before_m, "floor": floors_m}
+        return {
+            "condition": names,
+            "label": [self.campaign.labels[name] for name in names],
+            **{key: [1e3 * of_condition.get(name, math.nan) for name in names] for key, of_condition in errors.items()},
+            "colour": [self._colour[name] for name in names],
+            "alpha": [0.95 if name in conditions else 0.3 for name in names],
+        }
+
+    def set_shown(self, shown: Sequence[int]) -> None:
+        """Select the trials to draw."""
+        trials = [self.campaign.trials[i] for i in shown]
+        lines = self._lines((aligned, aligned.time_s, aligned.growth_m) for aligned in trials)
+        self.motion.x_range.update(**axis_range(lines["xs"]))
+        self.motion.y_range.update(**axis_range(lines["ys"]))
+        self.residual.x_range.update(**axis_range(lines["ys"]))
+        self._measured.data = lines
+        conditions = [name for name in self.campaign.conditions if name in {one.condition for one in trials}]
+        # Chosen: bands of more than four conditions overlap and hide the curves
+        self._band.data = self._replicate_bands(conditions if len(conditions) <= 4 else [])
 
     def set_instant(self, since_s: float | None) -> None:
         """Mark a time since release, or none."""
         self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
 
-    def set_curves(self, now: Prediction, shown: Sequence[int]) -> None:
-        """Set the curves of the current model; for lines already drawn only their ordinates are sent."""
-        lines, residual = model_lines(self.campaign, now, shown), residual_lines(self.campaign, now, shown)
-        low, high = symmetric_range(residual)
-        if high != self.residual.y_range.end:
-            self.residual.y_range.update(start=low, end=high)
-        if tuple(shown) == self._curves_drawn:
+    def draw(self, now: Prediction, reference: HeldModel, shown: Sequence[int], conditions: Sequence[str]) -> None:
+        """Draw the current model, and the one for comparison where it is another; errors of conditions that are not
+        selected are faint. Only what has changed is sent: for lines already drawn their ordinates.
+        """
+        trials = self.campaign.trials
+        lines = self._model_lines(now, shown)
+        residual = self._lines((trials[i], trials[i].growth_m, now.trials[i].residual_m) for i in shown)
+        largest_mm = max((float(np.nanmax(np.abs(part))) for part in residual["ys"]), default=0.0)
+        reach = round_up(1.05 * max(largest_mm, 0.1), (1.2, 2, 3, 5, 7, 10))
+        if reach != self.residual.y_range.end:
+            self.residual.y_range.update(start=-reach, end=reach)
+        same_trials = tuple(shown) == self._trials_drawn
+        if same_trials:
             self._model.data["ys"] = lines["ys"]
             self._residuals.data["ys"] = residual["ys"]
         else:
-            self._curves_drawn = tuple(shown)
             self._model.data, self._residuals.data = lines, residual
-
-    def set_errors(
-        self,
-        now_m: Mapping[str, float],
-        before_m: Mapping[str, float],
-        floors_m: Mapping[str, float],
-        conditions: Sequence[str],
-    ) -> None:
-        """Set the error of every condition; those not in `conditions` are drawn faint."""
-        rows = error_bars(self.campaign, now_m, before_m, floors_m, conditions)
+        other = None if reference.prediction is now else reference.prediction
+        if not same_trials or other is not self._other_drawn:
+            self._reference.data = {"xs": [], "ys": []} if other is None else self._model_lines(other, shown)
+        self._trials_drawn, self._other_drawn = tuple(shown), other
+        rows = self._error_bars(now.errors_m, reference.errors_m, now.floors_m, conditions)
         known = [value for key in ("now", "before", "floor") for value in rows[key] if math.isfinite(value)]
-        end = round_up(1.04 * max(known, default=1.0))
+        end = round_up(1.04 * max(known, default=1.0), (1, 1.5, 2, 3, 4, 5, 6, 8, 10))
         if end != self.errors.x_range.end:
             self.errors.x_range.end = end
         for key, values in rows.items():
@@ -467,30 +410,8 @@ class Plots:
                 self._bars.data[key] = values
 
 
-def round_up(value: float) -> float:
-    """Return the next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten, so that an axis rarely changes."""
-    if not value > 0:
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(round(power * k, 12) for k in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if power * k >= value or k == 10)
-
-
 # ------------------------------------------------------------------------------
 # Text panels as HTML: headline, fitted parameters, tied candidates and next trial of a diagnosis.
-
-
-@dataclass(frozen=True)
-class HeldModel:
-    """A model for comparison: its effects, what it predicts, and its fit, if it was fitted."""
-
-    effects: tuple[str, ...]
-    prediction: Prediction | None
-    fitted: Fitted | None
-
-    @property
-    def errors_m(self) -> Mapping[str, float]:
-        """Errors by condition, m."""
-        return {} if self.prediction is None else self.prediction.errors_m
 
 
 def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel) -> str:
@@ -513,10 +434,10 @@ def headline(
     campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
 ) -> str:
     """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
-    parts: list[Mapping[str, float]] = [{}, {}, campaign.floors_m]
-    if prediction is not None:
-        parts = [prediction.errors_m, opened_with.errors_m if opened_with else {}, prediction.floors_m]
-    now, before, floor = (overall_m(errors, campaign.conditions) for errors in parts)
+    now, before = (
+        overall_m({} if one is None else one.errors_m, campaign.conditions) for one in (prediction, opened_with)
+    )
+    floor = overall_m(campaign.floors_m if prediction is None else prediction.floors_m, campaign.conditions)
     words = model_text(choice.effects)
     model = escaped(words[:1].upper() + words[1:])
     if not math.isfinite(now):
@@ -537,12 +458,12 @@ def headline(
 
 def not_run_yet(campaign: Campaign) -> str:
     """Return that the results are of another model than the settings name now; blank if they are of the same."""
-    if campaign.saved == campaign.in_use:
+    if tuple(campaign.experiment.settings.model) == campaign.in_use:
         return ""
-    saved, shown = escaped(model_text(campaign.saved)), escaped(model_text(campaign.in_use))
+    named, shown = (escaped(model_text(model)) for model in (campaign.experiment.settings.model, campaign.in_use))
     command = f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}"
     return (
-        f'<p class="bad">experiment.yaml has the {saved} since these results were made: they, and what this page opened'
+        f'<p class="bad">experiment.yaml has the {named} since these results were made: they, and what this page opened'
         f" with, are of the {shown}. For new results: <code>{escaped(command)}</code></p>"
     )
 
@@ -593,46 +514,37 @@ def _ladder(campaign: Campaign, fits: Sequence[Fitted]) -> str:
     rows = []
     for fitted in fits:
         rms = overall_m(fitted.prediction.errors_m, campaign.conditions)
-        beyond = math.sqrt(max(rms**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
-        rows.append(
-            (
-                model_text(fitted.choice.effects),
-                _in_mm(rms),
-                _in_mm(beyond) if math.isfinite(beyond) else "–",
-            )
-        )
+        beyond = _in_mm(math.sqrt(max(rms**2 - floor**2, 0.0))) if math.isfinite(floor) else "–"
+        rows.append((model_text(fitted.choice.effects), _in_mm(rms), beyond))
     gained = likelihood_change_text(fits[-2].fit, fits[-1].fit) if len(fits) > 1 else ""
-    return (
-        "<h3>Fitted on this page</h3>"
-        + table(rows, ("model", "rms error", "excess over replicates"), (1, 2))
-        + (f"<p><small>{escaped(gained)}</small></p>" if gained else "")
-    )
+    shown = "<h3>Fitted on this page</h3>" + table(rows, ("model", "rms error", "excess over replicates"), (1, 2))
+    return shown + (f"<p><small>{escaped(gained)}</small></p>" if gained else "")
 
 
 def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None, fitted: Fitted | None) -> str:
     """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations."""
-    parts = []
     if diagnosis is None:
-        parts.append(
+        shown = (
             "<p>No diagnosis yet: it tests every effect and states which of them these trials cannot tell apart. It"
             " appears here after</p>"
-        )
-        parts.append(command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"]))
+        ) + _diagnose_command(campaign)
     else:
         verdict = diagnosis.verdict or "not diagnosed"
-        parts.append(f"<p><b>{escaped(verdict)}</b>: {escaped(diagnosis.explanation)}</p>")
+        shown = f"<p><b>{escaped(verdict)}</b>: {escaped(diagnosis.explanation)}</p>"
         if len(diagnosis.answer_set) > 1:
-            names = ", ".join(name.replace("_", " ") for name in diagnosis.answer_set)
-            parts.append(f"<p>Cannot be told apart: <b>{escaped(names)}</b>.</p>")
-        parts += [_cosine_grid(diagnosis)] if diagnosis.rounds else []
+            names = ", ".join(map(spaced_name, diagnosis.answer_set))
+            shown += f"<p>Cannot be told apart: <b>{escaped(names)}</b>.</p>"
+        shown += _cosine_grid(diagnosis) if diagnosis.rounds else ""
     if fitted is not None:
-        pairs_words = correlated_pairs_text(fitted.fit)
-        parts.append("<h3>In the last fit</h3>")
-        # Pairs of correlated parameters shown; chosen: the card has room for six lines
-        parts += [f"<p>{escaped(line)}</p>" for line in pairs_words[:6]] or [
-            "<p class='muted'>No two parameters have a correlation above 0.9.</p>"
-        ]
-    return "".join(parts)
+        # 6: pairs of correlated parameters shown; chosen: the card has room for six lines
+        pairs = "".join(f"<p>{escaped(line)}</p>" for line in correlated_pairs_text(fitted.fit)[:6])
+        none = "<p class='muted'>No two parameters have a correlation above 0.9.</p>"
+        shown += f"<h3>In the last fit</h3>{pairs or none}"
+    return shown
+
+
+def _diagnose_command(campaign: Campaign) -> str:
+    return command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
 
 
 def _cosine_grid(diagnosis: Diagnosis) -> str:
@@ -646,7 +558,7 @@ def _cosine_grid(diagnosis: Diagnosis) -> str:
     if len(names) < 2:
         return ""
     place = [known.index(name) for name in names]
-    titles = [escaped(name.replace("_", " ")) for name in names]
+    titles = [escaped(spaced_name(name)) for name in names]
     head = "".join(f"<th class='up'><span>{title}</span></th>" for title in titles)
     body = "".join(
         f"<tr><th>{title}</th>" + "".join(_cosine_cell(cosines[i][k]) for k in place) + "</tr>"
@@ -663,16 +575,14 @@ def _cosine_cell(cosine: float) -> str:
     if not math.isfinite(cosine):
         return "<td>–</td>"
     strength = min(abs(cosine), 1.0) ** 2
-    colour = f"rgba(0,114,178,{strength:.2f})" if cosine > 0 else f"rgba(213,94,0,{strength:.2f})"
-    ink = "#fff" if strength > 0.6 else "inherit"
-    return f"<td style='background:{colour};color:{ink}'>{cosine:+.2f}</td>"
+    colour = f"rgba({'0,114,178' if cosine > 0 else '213,94,0'},{strength:.2f})"
+    return f"<td style='background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}'>{cosine:+.2f}</td>"
 
 
 def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
     """Return the next experiment of the diagnosis, as HTML."""
     if diagnosis is None:
-        command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
-        return f"<p>A diagnosis states which trial would separate the candidates best.</p>{command}"
+        return "<p>A diagnosis states which trial would separate the candidates best.</p>" + _diagnose_command(campaign)
     advice = diagnosis.next_experiment
     if not advice:
         return "<p>The diagnosis proposes no further trial.</p>"
@@ -681,7 +591,7 @@ def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
     if rows:
         parts.append(table(rows, ("vine", "pressure", "payload", "trials", "other"), (1, 2, 3)))
     separations = [
-        (pair.replace(" | ", " from ").replace("_", " "), f"{sigma:.2g} σ")
+        (spaced_name(pair.replace(" | ", " from ")), f"{sigma:.2g} σ")
         for pair, sigma in (advice.get("separation_sigma") or {}).items()
         if sigma is not None
     ]
@@ -716,11 +626,3 @@ def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
         return ()
     ranked = [candidate.effect for candidate in diagnosis.ranking if math.isfinite(candidate.delta_chi2)]
     return tuple(dict.fromkeys([*diagnosis.answer_set, *ranked]))
-
-
-def diagnosis_of(folder: Path) -> Diagnosis | None:
-    """Return the diagnosis of a results folder, None if there is none or it cannot be read."""
-    try:
-        return read_diagnosis(Results(folder))
-    except ResultsError:
-        return None
