@@ -35,6 +35,7 @@ from vinetrack.pages.setup_server import (
     start_server,
     write_templates,
 )
+from vinetrack.video.curved_axis import axis_through
 
 # Listing of recordings, and columns from their names.
 
@@ -357,6 +358,14 @@ def test_frames_are_pictures_and_the_axis_lies_along_the_tube(server: SetupServe
     assert x1 - x0 > 300
     assert abs(y0 - 80) < 1.5
     assert abs(y1 - 80) < 1.5
+
+
+def test_a_curve_is_drawn_as_the_tracker_lays_it(server: SetupServer) -> None:
+    made = json.loads(ask(server, "/api/curve?points=20,80;200,90;440,80")[1])
+    along, across = axis_through([(20, 80), (200, 90), (440, 80)]).along_and_across(np.array(made["path_px"]))
+    assert np.abs(across).max() < 0.01
+    assert np.diff(along) == pytest.approx(4, abs=0.1)
+    assert ask(server, "/api/curve?points=20,80;20,80;20,80")[0] == 422
 
 
 def test_one_row_is_tracked_before_the_sheet_is_filled_in(server: SetupServer, clips: Path) -> None:

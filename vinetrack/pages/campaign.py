@@ -406,7 +406,7 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> Model:
     values: dict[str, Value] = {}
     for effect in effects:
         for size in sizes_of(campaign, effect):
-            value = choice.numbers.get(size.name, size.parameter.default)
+            value = choice.numbers[size.name]
             if size.vine:
                 by_vine = values.get(size.key, {})
                 assert isinstance(by_vine, Mapping)
@@ -502,7 +502,7 @@ def correlated_pairs_text(result: Fit) -> list[str]:
     pairs = []
     variance = np.diag(result.covariance)
     known = np.flatnonzero(np.isfinite(variance) & (variance > 0))
-    for k, i in itertools.combinations(known.tolist(), 2):
+    for i, k in itertools.combinations(known.tolist(), 2):
         r = float(result.covariance[i, k]) / math.sqrt(variance[i] * variance[k])
         if abs(r) > strong_correlation:
             pairs.append((abs(r), f"{result.numbers[i].title} and {result.numbers[k].title}: correlation {r:+.2f}"))
@@ -514,8 +514,8 @@ Outcome = TypeVar("Outcome")
 
 
 class Job(Generic[Progress, Outcome]):
-    """Work in a thread, which calls `on_progress` with every step, and `on_end` with the outcome or
-    else with None and the reason.
+    """Work in a thread, which calls `on_progress` with every step, and `on_end` with the outcome or else with None and
+    the reason, through `soon` where another thread is to do that.
     """
 
     def __init__(
@@ -523,8 +523,9 @@ class Job(Generic[Progress, Outcome]):
         work: Callable[[Callable[[Progress], None]], Outcome],
         on_progress: Callable[[Progress], None],
         on_end: Callable[[Outcome | None, str], None],
+        soon: Callable[[Callable[[], None]], object] | None = None,
     ) -> None:
-        self._work, self._on_progress, self._on_end = work, on_progress, on_end
+        self._work, self._on_progress, self._on_end, self._soon = work, on_progress, on_end, soon
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}job")
         self._thread.start()
@@ -548,8 +549,12 @@ class Job(Generic[Progress, Outcome]):
         except Exception:
             log.exception("a job of the explorer")
             reason = FAULT
-        if not self._cancelled.is_set():
+        if self._cancelled.is_set():
+            return
+        if self._soon is None:
             self._on_end(outcome, reason)
+        else:
+            self._soon(partial(self._on_end, outcome, reason))
 
     def _watch(self, step: Progress) -> None:
         if self._cancelled.is_set():
@@ -606,26 +611,17 @@ class BackgroundFit:
             listener()
 
 
-_INITIAL_FRACTION = 0.04  # Fraction of the progress bar filled at the start; chosen: visible at a width of 200 pixels
-
-
 class FitProgress:
-    """Progress of a fit, as a fraction and as text; `message` is shown when no fit runs. The number of steps is
-    unknown. Progress is measured on the logarithm of the predicted decrease of −2 ln L by the next step, from its
-    largest value down to `CONVERGED_DECREASE`, where a fit stops; and by the clock where `typical_s` is given.
+    """Progress of a fit that began at `now`, as a fraction and as text. The number of steps is unknown. Progress is
+    measured on the logarithm of the predicted decrease of −2 ln L by the next step, from its largest value down to
+    `CONVERGED_DECREASE`, where a fit stops.
     """
 
-    def __init__(self, typical_s: float = 0.0) -> None:
-        self.message = ""
-        self._typical_s = typical_s
-        self._started = 0.0
+    def __init__(self, now: float) -> None:
+        self._started = now
         self._largest = 0.0
-        self._fraction = _INITIAL_FRACTION
+        self._fraction = 0.04  # Chosen: visible at a width of 200 pixels
         self._step: Step | None = None
-
-    def begin(self, now: float) -> None:
-        """Start the clock of a new fit."""
-        self._started, self._largest, self._fraction, self._step, self.message = now, 0.0, _INITIAL_FRACTION, None, ""
 
     def update(self, step: Step) -> None:
         """Take the latest step of the fit into account."""
@@ -637,17 +633,14 @@ class FitProgress:
             self._fraction = max(self._fraction, min(1 - to_go / whole, 0.97))
 
     def state(self, now: float, task: str, other: Step | None = None) -> tuple[float, str]:
-        """Return the fraction done and the text of the status line. Returns fraction, text."""
-        passed_s = now - self._started
-        if self._typical_s:
-            return max(self._fraction, passed_s / (passed_s + self._typical_s / 2)), f"{task} · {passed_s:.0f} s"
+        """Return the fraction done and the text of the status line."""
         step = other or self._step
         if step is not None:
             task += f" · step {step.iteration}"
             if math.isfinite(step.predicted_decrease):
                 gain = f"the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
                 task += f" · {gain if step.predicted_decrease < 1e4 else 'still far off'}"
-        return self._fraction, f"{task} · {passed_s:.1f} s"
+        return self._fraction, f"{task} · {now - self._started:.1f} s"
 
 
 def commands(campaign: Campaign, choice: ModelChoice, *, fitted: bool, save: bool = False) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,6 @@ from bokeh.models import (
     UIElement,
 )
 
-from vinetrack.core.problems import UserError
 from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.effects import BASE_EFFECTS, load_effect
 from vinetrack.inference.fit_result import Number
@@ -29,7 +27,6 @@ from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
-    FitProgress,
     Fitted,
     Job,
     ModelChoice,
@@ -41,9 +38,9 @@ from vinetrack.pages.campaign import (
 )
 from vinetrack.pages.plots import (
     button,
-    command_block,
     escaped,
     html_div,
+    panel,
     progress_bar,
     set_text,
     side_by_side,
@@ -160,7 +157,7 @@ class EffectPanel:
             )
             self.ticks[name].on_change("active", partial(self._on_tick, name))
             self.sliders[name] = [
-                SizeSlider(size, _value(choice, size), bool(unusable), partial(self._on_size, name))
+                SizeSlider(size, choice.numbers[size.name], bool(unusable), partial(self._on_size, name))
                 for size in sizes_of(campaign, effect)
             ]
             about = html_div(f"<small>{escaped(unusable or effect.formula)}</small>")
@@ -200,14 +197,10 @@ class EffectPanel:
                     tick.active = name in choice
                 for one in self.sliders[name]:
                     if sliders:
-                        one.set(_value(choice, one.size))
+                        one.set(choice.numbers[one.size.name])
                     one.show_fitted(fitted.number(one.size.name) if fitted is not None and name in choice else None)
         finally:
             self._updating = False
-
-
-def _value(choice: ModelChoice, size: SizeControl) -> float:
-    return choice.numbers.get(size.name, size.parameter.default)
 
 
 CHIPS = """
@@ -275,26 +268,20 @@ class TrialSelector:
 Reopen = Callable[[BackgroundFit], None]  # Makes pages opened from now on show another campaign
 
 PROPOSE = "Propose an effect"
-INTRODUCTION = (
-    "No effect of the catalogue explains these trials. The missing force can be learned from them and written"
-    " as an effect file of your own, beside the experiment. It takes minutes."
-)
 
 
-@dataclass(frozen=True)
-class ReadProposal:
-    """The files written, and the campaign with the proposed effects."""
-
-    written: WrittenProposal
-    campaign: Campaign
-
-
-def propose_and_read(campaign: Campaign, on_progress: Callable[[str], None]) -> ReadProposal:
-    """Propose an effect, write it to the experiment's folder, and read the campaign with it."""
+def propose_and_read(
+    campaign: Campaign, on_progress: Callable[[str], None]
+) -> tuple[WrittenProposal, Campaign, ModelChoice]:
+    """Propose an effect, write it to the experiment's folder, and read the campaign with it; in the model chosen is the
+    first of the effects (the law, if there is one).
+    """
     written = propose_effect(campaign.experiment, campaign.folder, None, on_progress)
-    effects = {effect.name: effect for effect in map(load_effect, written.files)}
-    known = {name: effect for name, effect in campaign.effects.items() if name not in effects}
-    return ReadProposal(written, read_campaign(campaign.folder, campaign.experiment, known | effects))
+    proposed = {effect.name: effect for effect in map(load_effect, written.files)}
+    known = {name: effect for name, effect in campaign.effects.items() if name not in proposed}
+    read = read_campaign(campaign.folder, campaign.experiment, known | proposed)
+    choice = choice_in_use(read)
+    return written, read, choice.with_effect(next(iter(proposed))) if proposed else choice
 
 
 class ProposalPanel:
@@ -302,10 +289,9 @@ class ProposalPanel:
 
     def __init__(self, page: Page, reopen: Reopen | None) -> None:
         self._page, self._reopen = page, reopen
-        self._job: Job[str, ReadProposal] | None = None
-        # Time in which the progress bar of a search is two thirds full (chosen)
-        self._task, self._progress = "", FitProgress(150.0)
-        self._outcome: ReadProposal | None = None
+        self._job: Job[str, tuple[WrittenProposal, Campaign, ModelChoice]] | None = None
+        self._task, self._begun_s = "", 0.0
+        self._outcome: tuple[Campaign, ModelChoice] | None = None
         self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
         self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)
         self.text = html_div(name="proposal")
@@ -321,10 +307,12 @@ class ProposalPanel:
         unexplained = diagnosis is not None and UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
         self.root.visible = self._job is not None or self._outcome is not None or unexplained
         if self._job is not None:
-            set_text(self.text, progress_bar(*self._progress.state(time.monotonic(), self._task)))
+            passed_s = time.monotonic() - self._begun_s
+            # 75 s: time in which the progress bar of a search is half full (chosen)
+            share = max(passed_s / (passed_s + 75.0), 0.04)
+            set_text(self.text, progress_bar(share, f"{self._task} · {passed_s:.0f} s"))
         elif self._outcome is None and not self.text.text:
-            command = command_block([f"vinetrack propose {self._page.campaign.folder.as_posix()}"])
-            set_text(self.text, f"<p>{INTRODUCTION} The same from the command line:</p>{command}")
+            set_text(self.text, panel("propose", command=f"vinetrack propose {self._page.campaign.folder.as_posix()}"))
 
     def close(self) -> None:
         """The page was closed."""
@@ -336,29 +324,25 @@ class ProposalPanel:
             self._job.cancel()
             self._ended("<p>The search was stopped; nothing was written.</p>")
             return
-        self._task, self.button.label = "reading the results", "Stop"
-        self._progress.begin(time.monotonic())
+        self._task, self._begun_s, self.button.label = "reading the results", time.monotonic(), "Stop"
         soon = self._page.document.add_next_tick_callback
-        self._job = Job(
-            partial(propose_and_read, self._page.campaign),
-            self._on_progress,
-            lambda outcome, reason: soon(partial(self._done, outcome, reason)),
-        )
+        self._job = Job(partial(propose_and_read, self._page.campaign), self._on_progress, self._done, soon)
         self.show()
 
     def _on_progress(self, task: str) -> None:
         """Called from the job's thread; the status line shows it."""
         self._task = task
 
-    def _done(self, outcome: ReadProposal | None, reason: str) -> None:
+    def _done(self, outcome: tuple[WrittenProposal, Campaign, ModelChoice] | None, reason: str) -> None:
         if self._job is None:
             return
         if outcome is None:
             self._ended(f'<p class="bad">{escaped(reason)}</p>')
             return
-        self._outcome = outcome if outcome.written.files else None
+        written = outcome[0]
+        self._outcome = outcome[1:] if written.files else None
         self.open.visible = self._outcome is not None and self._reopen is not None
-        self._ended("".join(f"<p>{escaped(line)}</p>" for line in outcome.written.lines))
+        self._ended("".join(f"<p>{escaped(line)}</p>" for line in written.lines))
 
     def _ended(self, text: str) -> None:
         self._job, self.button.label = None, PROPOSE
@@ -367,14 +351,6 @@ class ProposalPanel:
         self.root.visible = True
 
     def _open(self) -> None:
-        """Show the campaign with the first of the effects (the law, if there is one) in the model."""
-        if self._outcome is None or self._reopen is None:
-            return
-        campaign, first = self._outcome.campaign, self._outcome.written.files[0]
-        try:
-            choice = choice_in_use(campaign).with_effect(load_effect(first).name)
-        except UserError as error:
-            set_text(self.text, f'<p class="bad">{escaped(error)}</p>')
-            return
-        self._reopen(BackgroundFit(campaign, choice).begin())
-        self._reload.data = {"times": [1]}
+        if self._outcome is not None and self._reopen is not None:
+            self._reopen(BackgroundFit(*self._outcome).begin())
+            self._reload.data = {"times": [1]}

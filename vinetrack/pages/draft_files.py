@@ -117,10 +117,8 @@ def with_recordings(sheet: Table, recordings: Sequence[str], shared: Mapping[str
     return replace(sheet, columns=(*missing, *columns), rows=tuple(rows))
 
 
-def _path(text: str) -> str:
-    """A normalised path."""
-    parts = [part for part in text.strip().replace("\\", "/").split("/") if part not in ("", ".")]
-    return "/".join(parts)
+def _path(text: str) -> PurePosixPath:
+    return PurePosixPath(text.strip().replace("\\", "/"))
 
 
 # ------------------------------------------------------------------------------

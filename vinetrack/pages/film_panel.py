@@ -22,9 +22,6 @@ from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction
 from vinetrack.pages.local_page import jpeg
 from vinetrack.pages.plots import (
-    MEASURED_EDGE,
-    MODEL_EDGE,
-    REFERENCE_EDGE,
     button,
     escaped,
     html_div,
@@ -44,6 +41,10 @@ from vinetrack.video.frames import RecordingError, inspect_recording, iterate_fr
 #
 # A recording is decoded once, in the background, and its frames are kept as JPEG no wider than the page shows them: one
 # second of a high-speed camera takes a few tens of megabytes.
+
+
+# Name, colour over a grey picture, and line of each edge that is drawn
+EDGES = (("tracked", "#56B4E9", "solid"), ("comparison", "#E69F00", "dotted"), ("model", "#D55E00", "dashed"))
 
 
 @dataclass(frozen=True)
@@ -234,11 +235,8 @@ class FilmPanel:
         self._view, self._no_view = view, ""
         self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
         soon = self._document.add_next_tick_callback
-        self._job = Job(
-            partial(decode, view.path),
-            lambda done: soon(partial(self._decoding, view, *done)),
-            lambda film, reason: soon(partial(self._decoded, view, film, reason)),
-        )
+        decoding, decoded = partial(self._decoding, view), partial(self._decoded, view)
+        self._job = Job(partial(decode, view.path), lambda done: soon(partial(decoding, *done)), decoded, soon)
 
     def _show_track(self, reason: str) -> None:
         """Show the positions alone, and why there is no recording."""
@@ -289,19 +287,17 @@ class FilmPanel:
     def _shown(self) -> ExplorerTrial:
         return self.campaign.trial(self.trial_select.value)
 
-    def _positions(self, frame: int) -> list[float]:
-        """Positions of the edge, m: measured, of the model for comparison, of the current model; NaN if unknown."""
+    def _positions(self, frame: int) -> Floats:
+        """Position of each of `EDGES` in a frame, m; NaN if unknown. Shape (3,)."""
         time_s, aligned = self._time_s(frame), self._shown
-        place = self.campaign.trials.index(aligned)
         measured_m = aligned.data.lead_position_m if self._view is None else self._view.lead_position_m
-        positions_m = [float(measured_m[frame]) if frame < measured_m.size else math.nan]
-        for prediction in (self._reference, self._now):
-            at_m = math.nan
+        positions_m = np.full(3, math.nan)
+        positions_m[0] = measured_m[frame] if frame < measured_m.size else math.nan
+        for k, prediction in enumerate((self._reference, self._now), 1):
             if prediction is not None:
                 # The model is defined between the first and the last frame of the fit.
-                predicted_m = prediction.trials[place].predicted_position_m
-                at_m = float(np.interp(time_s, aligned.data.time_s, predicted_m, math.nan, math.nan))
-            positions_m.append(at_m)
+                predicted_m = prediction.trials[self.campaign.trials.index(aligned)].predicted_position_m
+                positions_m[k] = np.interp(time_s, aligned.data.time_s, predicted_m, math.nan, math.nan)
         return positions_m
 
     def _draw_edges(self) -> None:
@@ -309,17 +305,10 @@ class FilmPanel:
         if view is None or film is None:
             return
         frame = int(self.frame.value)
-        measured_m, reference_m, now_m = self._positions(frame)
-        edges = [
-            (float(view.edge_px[frame]) if frame < view.edge_px.size else math.nan, MEASURED_EDGE, "solid", measured_m),
-            (float(view.along_px(np.array(reference_m))), REFERENCE_EDGE, "dotted", reference_m),
-            (float(view.along_px(np.array(now_m))), MODEL_EDGE, "dashed", now_m),
-        ]
-        same = self._reference is self._now
         drawn = [
-            (view.across(px, frame), colour, dash)
-            for px, colour, dash, at in edges
-            if math.isfinite(px) and math.isfinite(at) and not (same and colour == REFERENCE_EDGE)
+            (view.across(float(px), frame), colour, dash)
+            for (name, colour, dash), px in zip(EDGES, view.along_px(self._positions(frame)), strict=True)
+            if math.isfinite(px) and not (name == "comparison" and self._reference is self._now)
         ]
         half = 0.5 * (1 - film.scale)
         self._edges.data = {
@@ -332,10 +321,9 @@ class FilmPanel:
     def _update_caption(self, frame: int) -> None:
         aligned, view = self._shown, self._view
         since_s = self._time_s(frame) - aligned.release_s
-        names, colours = ("tracked", "comparison", "model"), (MEASURED_EDGE, REFERENCE_EDGE, MODEL_EDGE)
         positions_text = [
             f'<span style="border-bottom:3px solid {colour}">{name} {1e3 * (m - aligned.origin_m):.1f} mm</span>'
-            for name, colour, m in zip(names, colours, self._positions(frame), strict=True)
+            for (name, colour, _), m in zip(EDGES, self._positions(frame), strict=True)
             if math.isfinite(m)
         ]
         if view is not None and frame < view.by_hand.size and view.by_hand[frame]:

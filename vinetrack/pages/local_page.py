@@ -20,12 +20,7 @@ FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 page
 
 THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
 
-
 Server = TypeVar("Server")
-
-
-class PageError(UserError, RuntimeError):
-    """A page that cannot be served; the message is one sentence with a remedy."""
 
 
 def secret_path() -> str:
@@ -47,7 +42,7 @@ def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Serv
     for number in ports:
         with contextlib.suppress(OSError):
             return serve(number)
-    raise PageError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
+    raise UserError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
 
 
 def serve_until_stopped(

@@ -17,12 +17,12 @@ from bokeh.document import Document
 from bokeh.models import CustomJS
 from bokeh.server.server import Server
 from bokeh.themes import Theme
-from jinja2 import Environment
 from markupsafe import Markup
 from tornado.web import ErrorHandler
 
 from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.core.tables import TableError
+from vinetrack.core.terminal import waiting
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.folder import save_model
 from vinetrack.figures.style import TOKENS, follows_screen, page_frame
@@ -52,21 +52,23 @@ from vinetrack.pages.plots import (
     Plots,
     button,
     command_block,
-    comparison_table,
     escaped,
-    fitted_numbers_html,
     headline,
     html_div,
     next_panel,
+    numbers_panel,
+    panel,
     progress_bar,
     set_text,
     side_by_side,
     stacked,
     suspects,
+    templates,
     tied_panel,
     vine_colours,
 )
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
+from vinetrack.pipeline.effects_stage import effects_of
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
 # A swipe over a figure scrolls the page, as it does elsewhere
 LET_SCROLL = """
@@ -98,7 +100,7 @@ class Page:
         self._job: Job[Step, Fitted] | None = None
         self._refit_requested = False
         self._step: Step | None = None
-        self._progress = FitProgress()
+        self._progress, self._message = FitProgress(0.0), ""
         self._build(reopen)
         background.listeners.append(self._on_background_change)
         document.on_session_destroyed(lambda _context: self.close())
@@ -138,13 +140,11 @@ class Page:
         swiped = {"plots": [*figures, self.film.figure]}
         self.document.js_on_event("document_ready", CustomJS(args=swiped, code=LET_SCROLL))
         # A recording keeps its greys, and the edges their colours over them.
-        page, style, script = (
-            (TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.html", "page.css", "screen.js")
-        )
+        style, script = ((TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "screen.js"))
         self.document.js_on_event("document_ready", CustomJS(args={"plots": figures, "tokens": TOKENS}, code=script))
         self.document.title = f"{campaign.name} – vinetrack explorer"
         self.document.theme = Theme(json=THEME)
-        self.document.template = Environment(autoescape=True).from_string(page)
+        self.document.template = templates().get_template("page.html")
         left_out = f", {len(campaign.left_out)} left out" if campaign.left_out else ""
         self.document.template_variables.update(
             name=campaign.name,
@@ -192,7 +192,7 @@ class Page:
 
     def _begin_refit(self) -> None:
         self._refit_requested = True
-        self._progress.begin(time.monotonic())
+        self._progress, self._message = FitProgress(time.monotonic()), ""
         self.refit.label = "Stop"
         self._background_changed()
 
@@ -259,11 +259,8 @@ class Page:
         self._refit_requested = False
         before = (self.last or first).fit
         self._step = None
-        self._job = Job(
-            partial(fit_choice, self.campaign, before, self.choice),
-            self._on_step,
-            lambda fitted, reason: self.document.add_next_tick_callback(partial(self._fit_ended, fitted, reason)),
-        )
+        work, soon = partial(fit_choice, self.campaign, before, self.choice), self.document.add_next_tick_callback
+        self._job = Job(work, self._on_step, self._fit_ended, soon)
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread. A page that cannot keep up draws only the newest step."""
@@ -298,7 +295,7 @@ class Page:
         if self._job is not None:
             self._job.cancel()
         self._job, self._refit_requested = None, False
-        self._progress.message = reason
+        self._message = reason
         self.refit.label = "Refit"
         self._update_status()
         self._soon(self._update_text, TEXT_MS)
@@ -327,10 +324,10 @@ class Page:
         try:
             self.shown = predict_choice(self.campaign, choice, None if self.shown is None else self.shown.floors_m)
         except FitError as error:
-            self._progress.message = str(error)
+            self._message = str(error)
             self._update_status()
             return
-        self._progress.message = ""
+        self._message = ""
         self._draw()
 
     def _draw(self) -> None:
@@ -342,12 +339,10 @@ class Page:
         if self._job is None and not self._refit_requested:
             # The error at a step of a fit, or before a fit, says nothing about the effect.
             set_text(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
-        compared = ""
         if self.shown is not None:
             self.film.set_predictions(self.shown, self._reference.prediction)
-            now = HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
-            compared = comparison_table(self.campaign, self.held, now)
-        set_text(self.numbers, compared + fitted_numbers_html(self.campaign, self.fits, self._sizes_changed))
+        now = HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
+        set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, self.held, now))
         set_text(self.tied, tied_panel(self.campaign, self.diagnosis, self.last))
         set_text(self.next, next_panel(self.campaign, self.diagnosis))
         lines = self._commands()
@@ -362,7 +357,7 @@ class Page:
             task = "refitting" if self._job is not None else "fitting the model in use first"
             other = background.step if self._refit_requested else None
             text = progress_bar(*self._progress.state(time.monotonic(), task, other))
-        elif failure := self._progress.message or background.failure:
+        elif failure := self._message or background.failure:
             text = f'<span class="bad">{escaped(failure)}</span>'
         elif background.running:
             fitting = "fitting the model in use, in the background"
@@ -403,13 +398,8 @@ class Page:
             self.saved.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
             return
         rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
-        lines = self._commands(save=True)
-        same = f" The same as a command:</p>{command_block(lines)}<p>" if lines else " "
-        self.saved.text = (
-            f'<p><span class="good">Saved.</span> {escaped(path.as_posix())} now has the'
-            f" {escaped(model_text(effects))}.{same}"
-            f"For new tables and a new report:</p>{command_block([rerun])}"
-        )
+        given = {"model": model_text(effects), "same": self._commands(save=True), "rerun": rerun}
+        self.saved.text = panel("saved", path=path.as_posix(), **given)
 
     def close(self) -> None:
         """The page was closed."""
@@ -470,9 +460,6 @@ def address(server: Server) -> str:
 
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """Open a results folder and its experiment."""
-    from vinetrack.pipeline.effects_stage import effects_of
-    from vinetrack.results.folder_layout import read_source_experiment
-
     source = read_source_experiment(folder, experiment)
     return read_campaign(folder, source, effects_of(source.folder))
 
@@ -481,8 +468,6 @@ def explore(
     folder: Path, experiment: Path | None, say: Callable[[str], None], port: int | None, *, browser: bool
 ) -> None:
     """Serve the page of a results folder until Ctrl-C (or SIGTERM)."""
-    from vinetrack.core.terminal import waiting
-
     with waiting(f"opening {folder}"):
         background = BackgroundFit(open_campaign(folder, experiment))
     for name in ("bokeh", "tornado"):

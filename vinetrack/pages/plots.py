@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from bokeh.models import (
     UIElement,
 )
 from bokeh.plotting import figure
+from jinja2 import Environment, FileSystemLoader
 
 from vinetrack.core.records import Floats
 from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
@@ -55,8 +57,6 @@ from vinetrack.pages.campaign import (
 
 TEMPLATES = Path(__file__).with_name("templates")
 SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
-# Colours over a grey picture: the tracked edge, the edge of the model for comparison, and of the current model
-MEASURED_EDGE, REFERENCE_EDGE, MODEL_EDGE = "#56B4E9", "#E69F00", "#D55E00"
 
 _AXIS = {
     "axis_label_text_font": SANS,
@@ -147,15 +147,15 @@ def escaped(text: object) -> str:
     return html.escape(str(text))
 
 
-def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequence[int] = ()) -> str:
-    """Return a table in HTML; cells are escaped, columns `numeric` are right-aligned."""
-    kinds = [' class="n"' if k in numeric else "" for k in range(len(header))]
-    head = "".join(f"<th{kind}>{escaped(cell)}</th>" for kind, cell in zip(kinds, header, strict=True))
-    body = "".join(
-        "<tr>" + "".join(f"<td{kind}>{escaped(cell)}</td>" for kind, cell in zip(kinds, row, strict=True)) + "</tr>"
-        for row in rows
-    )
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+@cache
+def templates() -> Environment:
+    """The templates of the page."""
+    return Environment(loader=FileSystemLoader(TEMPLATES, encoding="utf-8"), autoescape=True)
+
+
+def panel(name: str, **given: Any) -> str:
+    """Return a piece of HTML that `panels.html` makes of what is given."""
+    return str(getattr(templates().get_template("panels.html").module, name)(**given))
 
 
 def progress_bar(share: float, text: str) -> str:
@@ -166,7 +166,7 @@ def progress_bar(share: float, text: str) -> str:
 
 def command_block(lines: Sequence[str]) -> str:
     """Return commands to copy, as HTML."""
-    return f"<pre><code>{escaped(chr(10).join(lines))}</code></pre>"
+    return panel("commands", lines=lines)
 
 
 # ------------------------------------------------------------------------------
@@ -411,23 +411,7 @@ class Plots:
 
 
 # ------------------------------------------------------------------------------
-# Text panels as HTML: headline, fitted parameters, tied candidates and next trial of a diagnosis.
-
-
-def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel) -> str:
-    """Return the held model and the current one as a table: error, and every fitted parameter of either."""
-    if held is None:
-        return ""
-    models = (held, now)
-    rows = [
-        ("effects", *(model_text(model.effects) for model in models)),
-        ("rms of position", *(_in_mm(overall_m(model.errors_m, campaign.conditions)) for model in models)),
-    ]
-    fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
-    for name in dict.fromkeys(name for numbers in fits for name in numbers):
-        title = next(numbers[name].title for numbers in fits if name in numbers)
-        rows.append((title, *(quantity_text(n[name]) if name in n else "–" for n in fits)))
-    return table(rows, ("", "held", "now"), ())
+# Numbers and words of the text panels, which `panels.html` lays out.
 
 
 def headline(
@@ -439,61 +423,72 @@ def headline(
     )
     floor = overall_m(campaign.floors_m if prediction is None else prediction.floors_m, campaign.conditions)
     words = model_text(choice.effects)
-    model = escaped(words[:1].upper() + words[1:])
-    if not math.isfinite(now):
-        reason = f"The model in use was not fitted: {escaped(campaign.refused)}" if campaign.refused else "Preparing …"
-        return f"<h1>{reason}</h1>"
-    # Chosen: an error up to 1.15 times the replicate scatter counts as equal to it
-    at_floor = math.isfinite(floor) and now <= 1.15 * floor
-    grade = "good" if at_floor else "bad"
-    was = f", {_in_mm(before)} when the page opened" if math.isfinite(before) and _in_mm(before) != _in_mm(now) else ""
-    if math.isfinite(floor):
-        least = f"; replicate scatter {_in_mm(floor)}" + (": nothing is left to explain" if at_floor else "")
-    else:
-        least = "; there are no replicates to compare with"
-    return (
-        f'<h1>{model}: <span class="{grade}">off by {_in_mm(now)}</span> rms{was}{least}.</h1>{not_run_yet(campaign)}'
-    )
-
-
-def not_run_yet(campaign: Campaign) -> str:
-    """Return that the results are of another model than the settings name now; blank if they are of the same."""
-    if tuple(campaign.experiment.settings.model) == campaign.in_use:
-        return ""
-    named, shown = (escaped(model_text(model)) for model in (campaign.experiment.settings.model, campaign.in_use))
-    command = f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}"
-    return (
-        f'<p class="bad">experiment.yaml has the {named} since these results were made: they, and what this page opened'
-        f" with, are of the {shown}. For new results: <code>{escaped(command)}</code></p>"
+    return panel(
+        "headline",
+        model=words[:1].upper() + words[1:],
+        now=_in_mm(now),
+        before=_in_mm(before),
+        floor=_in_mm(floor),
+        at_floor=now <= 1.15 * floor,  # chosen: an error up to 1.15 times the replicate scatter counts as equal to it
+        refused=campaign.refused,
+        named=model_text(campaign.experiment.settings.model),
+        in_use=model_text(campaign.in_use),
+        command=f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}",
     )
 
 
 def _in_mm(value_m: float) -> str:
-    return f"{1e3 * value_m:.3g} mm"
+    return f"{1e3 * value_m:.3g} mm" if math.isfinite(value_m) else ""
 
 
-def fitted_numbers_html(campaign: Campaign, fits: Sequence[Fitted], sizes_changed: bool) -> str:
-    """Return the table of the parameters of the last fit of this page, and all its fits, as HTML."""
+def numbers_panel(
+    campaign: Campaign, fits: Sequence[Fitted], sizes_changed: bool, held: HeldModel | None, now: HeldModel
+) -> str:
+    """Return the held model beside the current one, the parameters of the last fit of this page, and all its fits."""
+    compared = [] if held is None else _compared(campaign, (held, now))
     if not fits:
-        return "<p class='muted'>The model in use is being fitted; its parameters will appear here.</p>"
-    fitted = fits[-1]
+        return panel("numbers", compared=compared)
+    seconds, fit = fits[-1].seconds, fits[-1].fit
     vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
     known = vines if len(vines) > 1 else {}
-    rows = [_number_row(number, known.get(number.vine, number.vine) or "all") for number in fitted.fit.numbers]
-    parts = [table(rows, ("", "vine", "value", "error", "95 %"), (2, 3, 4))]
-    if sizes_changed:
-        parts.append('<p class="muted">Sizes were changed since: these are the parameters of the last fit.</p>')
     spreads = "; ".join(
-        f"{escaped(name)} {100 * s.value:.2g} %{'' if s.estimated else ' (fixed)'}"
-        for name, s in fitted.fit.spreads.items()
+        f"{name} {100 * s.value:.2g} %{'' if s.estimated else ' (fixed)'}" for name, s in fit.spreads.items()
     )
-    chi2 = f"χ² per degree of freedom {fitted.fit.chi2_per_dof:.3g}" if math.isfinite(fitted.fit.chi2_per_dof) else ""
-    noise = f"noise {1e3 * fitted.fit.noise_m:.2g} mm"
-    facts = [noise, chi2, f"between-trial standard deviations: {spreads}" if spreads else "", f"{fitted.seconds:.2g} s"]
-    parts.append(f"<p><small>{' · '.join(fact for fact in facts if fact)}</small></p>")
-    parts += [f"<p><small>{escaped(message)}</small></p>" for message in fitted.fit.messages]
-    parts.append(_ladder(campaign, fits))
-    return "".join(parts)
+    facts = (
+        f"noise {1e3 * fit.noise_m:.2g} mm",
+        f"χ² per degree of freedom {fit.chi2_per_dof:.3g}" if math.isfinite(fit.chi2_per_dof) else "",
+        f"between-trial standard deviations: {spreads}" if spreads else "",
+        f"{seconds:.2g} s",
+    )
+    floor = overall_m(campaign.floors_m, campaign.conditions)
+    ladder = []
+    for fitted in fits:
+        rms = overall_m(fitted.prediction.errors_m, campaign.conditions)
+        beyond = math.sqrt(max(rms**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
+        ladder.append((model_text(fitted.choice.effects), _in_mm(rms), _in_mm(beyond) or "–"))
+    return panel(
+        "numbers",
+        compared=compared,
+        rows=[_number_row(number, known.get(number.vine, number.vine) or "all") for number in fit.numbers],
+        sizes_changed=sizes_changed,
+        facts=facts,
+        messages=fit.messages,
+        ladder=ladder,
+        gained=likelihood_change_text(fits[-2].fit, fit) if len(fits) > 1 else "",
+    )
+
+
+def _compared(campaign: Campaign, models: Sequence[HeldModel]) -> list[tuple[str, ...]]:
+    """Error and every fitted parameter of either of two models."""
+    rows = [
+        ("effects", *(model_text(model.effects) for model in models)),
+        ("rms of position", *(_in_mm(overall_m(model.errors_m, campaign.conditions)) for model in models)),
+    ]
+    fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
+    for name in dict.fromkeys(name for numbers in fits for name in numbers):
+        title = next(numbers[name].title for numbers in fits if name in numbers)
+        rows.append((title, *(quantity_text(n[name]) if name in n else "–" for n in fits)))
+    return rows
 
 
 def _number_row(number: Number, vine: str) -> tuple[str, ...]:
@@ -508,47 +503,25 @@ def _number_row(number: Number, vine: str) -> tuple[str, ...]:
     return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
 
 
-def _ladder(campaign: Campaign, fits: Sequence[Fitted]) -> str:
-    """The models fitted on this page, with the error in excess of replicate scatter."""
-    floor = overall_m(campaign.floors_m, campaign.conditions)
-    rows = []
-    for fitted in fits:
-        rms = overall_m(fitted.prediction.errors_m, campaign.conditions)
-        beyond = _in_mm(math.sqrt(max(rms**2 - floor**2, 0.0))) if math.isfinite(floor) else "–"
-        rows.append((model_text(fitted.choice.effects), _in_mm(rms), beyond))
-    gained = likelihood_change_text(fits[-2].fit, fits[-1].fit) if len(fits) > 1 else ""
-    shown = "<h3>Fitted on this page</h3>" + table(rows, ("model", "rms error", "excess over replicates"), (1, 2))
-    return shown + (f"<p><small>{escaped(gained)}</small></p>" if gained else "")
-
-
 def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None, fitted: Fitted | None) -> str:
     """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations."""
-    if diagnosis is None:
-        shown = (
-            "<p>No diagnosis yet: it tests every effect and states which of them these trials cannot tell apart. It"
-            " appears here after</p>"
-        ) + _diagnose_command(campaign)
-    else:
-        verdict = diagnosis.verdict or "not diagnosed"
-        shown = f"<p><b>{escaped(verdict)}</b>: {escaped(diagnosis.explanation)}</p>"
-        if len(diagnosis.answer_set) > 1:
-            names = ", ".join(map(spaced_name, diagnosis.answer_set))
-            shown += f"<p>Cannot be told apart: <b>{escaped(names)}</b>.</p>"
-        shown += _cosine_grid(diagnosis) if diagnosis.rounds else ""
-    if fitted is not None:
+    tied = () if diagnosis is None or len(diagnosis.answer_set) < 2 else diagnosis.answer_set
+    titles, cosines = ([], []) if diagnosis is None or not diagnosis.rounds else _cosine_grid(diagnosis)
+    return panel(
+        "tied",
+        diagnosis=diagnosis,
+        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
+        names=[spaced_name(name) for name in tied],
+        titles=titles,
+        cosines=cosines,
+        fitted=fitted is not None,
         # 6: pairs of correlated parameters shown; chosen: the card has room for six lines
-        pairs = "".join(f"<p>{escaped(line)}</p>" for line in correlated_pairs_text(fitted.fit)[:6])
-        none = "<p class='muted'>No two parameters have a correlation above 0.9.</p>"
-        shown += f"<h3>In the last fit</h3>{pairs or none}"
-    return shown
+        pairs=[] if fitted is None else correlated_pairs_text(fitted.fit)[:6],
+    )
 
 
-def _diagnose_command(campaign: Campaign) -> str:
-    return command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
-
-
-def _cosine_grid(diagnosis: Diagnosis) -> str:
-    """The cosines between the effects of the likeliest candidates as a table; blank for fewer than two."""
+def _cosine_grid(diagnosis: Diagnosis) -> tuple[list[str], list[list[tuple[str, str]]]]:
+    """The titles of the likeliest candidates and the cosines between their effects; none for fewer than two."""
     known, cosines = diagnosis.rounds[0].cosine_names, diagnosis.rounds[0].cosines
     pairs = [(abs(cosines[i][k]), name, other) for i, name in enumerate(known) for k, other in enumerate(known[:i])]
     tied = sorted((pair for pair in pairs if pair[0] >= TIED_COSINE), key=lambda pair: -pair[0])
@@ -556,50 +529,35 @@ def _cosine_grid(diagnosis: Diagnosis) -> str:
     # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
     names = list(dict.fromkeys([*likely, *(name for _, *pair in tied for name in pair)]))[:8]
     if len(names) < 2:
-        return ""
+        return [], []
     place = [known.index(name) for name in names]
-    titles = [escaped(spaced_name(name)) for name in names]
-    head = "".join(f"<th class='up'><span>{title}</span></th>" for title in titles)
-    body = "".join(
-        f"<tr><th>{title}</th>" + "".join(_cosine_cell(cosines[i][k]) for k in place) + "</tr>"
-        for title, i in zip(titles, place, strict=True)
-    )
-    caption = (
-        "<small>Cosines between the effects on the trajectories: near ±1 two effects cannot be told apart.</small>"
-    )
-    return f"<div class='scroll'><table class='cosines'><tr><th></th>{head}</tr>{body}</table></div>{caption}"
+    return [spaced_name(name) for name in names], [[_cosine_cell(cosines[i][k]) for k in place] for i in place]
 
 
-def _cosine_cell(cosine: float) -> str:
-    """Blue for positive, vermillion for negative cosines, the deeper the larger."""
+def _cosine_cell(cosine: float) -> tuple[str, str]:
+    """A cosine and its style: blue if it is positive, vermillion if negative, the deeper the larger."""
     if not math.isfinite(cosine):
-        return "<td>–</td>"
+        return "–", ""
     strength = min(abs(cosine), 1.0) ** 2
     colour = f"rgba({'0,114,178' if cosine > 0 else '213,94,0'},{strength:.2f})"
-    return f"<td style='background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}'>{cosine:+.2f}</td>"
+    return f"{cosine:+.2f}", f"background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}"
 
 
 def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
     """Return the next experiment of the diagnosis, as HTML."""
-    if diagnosis is None:
-        return "<p>A diagnosis states which trial would separate the candidates best.</p>" + _diagnose_command(campaign)
-    advice = diagnosis.next_experiment
-    if not advice:
-        return "<p>The diagnosis proposes no further trial.</p>"
-    parts = [f"<p>{escaped(advice.get('text', ''))}</p>"]
-    rows = [_trial_row(trial) for trial in advice.get("trials", ())]
-    if rows:
-        parts.append(table(rows, ("vine", "pressure", "payload", "trials", "other"), (1, 2, 3)))
-    separations = [
-        (spaced_name(pair.replace(" | ", " from ")), f"{sigma:.2g} σ")
-        for pair, sigma in (advice.get("separation_sigma") or {}).items()
-        if sigma is not None
-    ]
-    if separations:
-        parts.append(table(separations, ("separates", "by"), (1,)))
-    if advice.get("calibration"):
-        parts.append(f"<p>{escaped(advice['calibration'])}</p>")
-    return "".join(parts)
+    advice = None if diagnosis is None else diagnosis.next_experiment or {}
+    separations = (advice or {}).get("separation_sigma") or {}
+    return panel(
+        "next",
+        advice=advice,
+        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
+        trials=[_trial_row(trial) for trial in (advice or {}).get("trials", ())],
+        separations=[
+            (spaced_name(pair.replace(" | ", " from ")), f"{sigma:.2g} σ")
+            for pair, sigma in separations.items()
+            if sigma is not None
+        ],
+    )
 
 
 def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:

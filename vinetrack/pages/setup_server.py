@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import ExperimentError, Problem, UserError
 from vinetrack.core.records import Correction, Trial
 from vinetrack.core.tables import list_recordings, parse_yaml, read_table, safe_join, with_value
-from vinetrack.core.units import UNITS, other_units, split_unit
+from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
 from vinetrack.experiment.folder import SETTINGS, check_experiment, read_corrections
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import in_sheet_units, read_experiment_settings
@@ -59,7 +59,7 @@ from vinetrack.pipeline.workflow import check_folder
 from vinetrack.tracks.importers import TrackError, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import find_board
-from vinetrack.video.curved_axis import axis_entry
+from vinetrack.video.curved_axis import axis_entry, axis_through
 from vinetrack.video.frames import (
     Frames,
     Recording,
@@ -123,6 +123,11 @@ def axis_json(axis: Axis) -> dict[str, Any]:
         along = np.linspace(0.0, axis.length_px, max(2, round(axis.length_px / 4.0)))
         entry["path_px"] = axis.points(along).round(2).tolist()
     return {**entry, "width_px": _rounded(axis.width_px, 2)}
+
+
+def _points(text: str) -> list[list[float]]:
+    """The points of `x,y;x,y`."""
+    return [[float(value) for value in point.split(",")] for point in text.split(";")]
 
 
 def track_row(folder: Path, index: int) -> dict[str, Any]:
@@ -282,12 +287,6 @@ def _column_json(name: str) -> dict[str, Any]:
     return {**told, "quantity": quantity(name), "units": units if several else [], "unit": units[0] if several else ""}
 
 
-def _correction(point: Mapping[str, Any]) -> Correction:
-    """A correction from the JSON of the page."""
-    edge_px = math.nan if point["edge_px"] is None else float(point["edge_px"])
-    return Correction(int(point["frame"]), str(point["action"]), edge_px)
-
-
 def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
     """Return the draft sent by the page; comments and keys unknown to the page come from the files."""
     from_files = open_draft(folder)
@@ -300,12 +299,11 @@ def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
         value = content.get(key)
         if value is not None or present.get(key) is not None:
             text = with_value(text, key, value, SETTINGS)
-    given = content.get("corrections", {}).items()
-    corrections = {
-        str(trial): tuple(sorted(map(_correction, points), key=lambda made: made.frame))
-        for trial, points in given
-        if points
-    }
+    corrections = {}
+    for trial, points in content.get("corrections", {}).items():
+        given = [Correction(int(one["frame"]), str(one["action"]), or_nan(one["edge_px"])) for one in points]
+        if given:
+            corrections[str(trial)] = tuple(sorted(given, key=lambda correction: correction.frame))
     return Draft(sheet, text, str(content["stamp"]), corrections)
 
 
@@ -426,6 +424,7 @@ ANSWERS: dict[str, Callable[[SetupServer, Mapping[str, Any]], bytes | Mapping[st
     # 220: width of the pictures in the list; chosen: as wide as its column
     "GET /api/thumbnail": lambda server, given: server.picture(given["recording"], 220),
     "GET /api/picture": lambda server, given: server.picture(given["picture"]),
+    "GET /api/curve": lambda _, given: axis_json(axis_through(_points(given["points"]))),
     "GET /api/board": lambda server, given: board_in(safe_join(server.folder, given["picture"]), given["picture"]),
     "POST /api/check": SetupServer.check,
     "POST /api/paste": lambda _, given: vars(place_block(**given)),

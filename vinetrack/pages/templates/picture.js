@@ -1,5 +1,4 @@
 // The picture: frames of the chosen recording, the growth axis dragged on it, and its scale.
-import {curveThrough, middleOfLongest} from "./curve.js";
 import {$, ask, changed, decimals, el, numberOf, round, state, url} from "./state.js";
 
 const view = {source: "", frame: 0, tool: "axis", image: null, width: 1, height: 1, board: "", words: "", edge: null};
@@ -111,9 +110,19 @@ function setAxis(axis, scope) {
 
 const pointsOf = (axis) => [axis.from_px, ...(axis.via_px ?? []), axis.to_px];
 
-// Points along an axis in order: those of the curve from the server, or else its given points.
+// Points along an axis in order: its ends, or those of the curve that the tracker lays through its bends. While the
+// server is asked for it the former curve stays; there is none through points that coincide.
+const curve = {key: "", path_px: null, asked: 0, drawn: 0};
 export function placesOf(axis) {
-  return axis.path_px ?? curveThrough(pointsOf(axis));
+  if (axis.path_px || !axis.via_px?.length) return axis.path_px ?? pointsOf(axis);
+  const key = pointsOf(axis).join(";");
+  if (key !== curve.key) {
+    curve.key = key;
+    const turn = ++curve.asked;
+    const draw = (path_px) => { if (turn > curve.drawn) { Object.assign(curve, {path_px, drawn: turn}); drawOver(); } };
+    ask(url("api/curve", {points: key})).then((made) => draw(made.path_px), () => draw(null));
+  }
+  return curve.path_px ?? pointsOf(axis);
 }
 
 // The axis with other bends and the same scope.
@@ -125,9 +134,15 @@ function setBends(via_px) {
 }
 
 function addBend() {
-  const now = currentAxis(), {index, point} = middleOfLongest(pointsOf(now));
-  setBends((now.via_px ?? []).toSpliced(index - 1, 0, point));
-  document.querySelector(`[data-handle="${bendWords(index - 1)}"]`)?.focus();
+  const now = currentAxis(), points = pointsOf(now), path = placesOf(now);
+  const apart = ([x0, y0], [x1, y1]) => Math.hypot(x1 - x0, y1 - y0);
+  const lengths = points.slice(1).map((point, i) => apart(points[i], point));
+  const i = lengths.indexOf(Math.max(...lengths));
+  // In the middle of the longest segment: on the curve, if there is one.
+  const nearest = (point) => path.reduce((best, one, k) => (apart(one, point) < apart(path[best], point) ? k : best), 0);
+  const middle = points[i].map((v, k) => (v + points[i + 1][k]) / 2);
+  setBends((now.via_px ?? []).toSpliced(i, 0, path.length > 2 ? path[Math.round((nearest(points[i]) + nearest(points[i + 1])) / 2)] : middle));
+  document.querySelector(`[data-handle="${bendWords(i)}"]`)?.focus();
 }
 
 function removeBend(i) {
