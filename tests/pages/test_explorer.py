@@ -42,9 +42,9 @@ from vinetrack.pages.campaign import (
     predict_choice,
     slider_range,
 )
-from vinetrack.pages.film_panel import RecordingView, decode, recording_view
 from vinetrack.pages.page import address as where
 from vinetrack.pages.page import open_campaign, start_server
+from vinetrack.pages.plots import RecordingView, decode, recording_view
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.video.axis import Axis
 

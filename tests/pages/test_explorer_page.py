@@ -24,8 +24,8 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_result import Fit
 from vinetrack.pages import controls
 from vinetrack.pages.campaign import BackgroundFit, Campaign
-from vinetrack.pages.film_panel import RecordingView
 from vinetrack.pages.page import open_campaign
+from vinetrack.pages.plots import RecordingView
 from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
 from vinetrack.video.axis import Axis
@@ -180,7 +180,7 @@ def test_a_recording_that_cannot_be_decoded_is_named_beside_the_positions(
     view = RecordingView(
         tmp_path / "torn.mp4", Axis((0.0, 0.0), (50.0, 0.0)), 5.0, nothing, nothing, nothing, nothing, nothing > 0
     )
-    monkeypatch.setattr("vinetrack.pages.film_panel.recording_view", lambda *_: view)
+    monkeypatch.setattr("vinetrack.pages.plots.recording_view", lambda *_: view)
     browser.page.film.show_trial(browser.page.campaign.trials[0].name)
     browser.until(lambda: "tracked" in browser.text("film_caption"), 30)
     browser.page._update_text()

@@ -187,13 +187,13 @@ EXPECTED = {(0, "pressure_kPa"): "24.1317", (0, "payload_g"): "0", (1, "pressure
 
 
 def changed(text: str, at_row: int | str = 0, at_column: str = "trial", decimal: str = ".") -> dict[tuple, str]:
-    placed = place_block(text, COLUMNS, ROWS, at_row, at_column, decimal)
-    assert len({cell[:2] for cell in placed.cells}) == len(placed.cells)
-    return {(row, column): text for row, column, text in placed.cells}
+    placed, _ = place_block(text, COLUMNS, ROWS, at_row, at_column, decimal)
+    assert len({cell[:2] for cell in placed}) == len(placed)
+    return {(row, column): text for row, column, text in placed}
 
 
 def notes(text: str, at_row: int | str = 0, at_column: str = "trial") -> int:
-    return len(place_block(text, COLUMNS, ROWS, at_row, at_column).notes)
+    return len(place_block(text, COLUMNS, ROWS, at_row, at_column)[1])
 
 
 @pytest.mark.parametrize("mark", ["\t", ";", ",", "  "])
@@ -241,7 +241,7 @@ def test_what_matches_nothing_is_named_and_changes_nothing() -> None:
 
 def test_a_name_of_two_recordings_is_of_neither() -> None:
     rows = [{"trial": "a", "video": "x/1.mp4"}, {"trial": "b", "video": "y/1.mp4"}]
-    assert place_block("1.mp4\t24\nx/1.mp4\t30", COLUMNS, rows, 0, "pressure_kPa").cells == [(0, "pressure_kPa", "30")]
+    assert place_block("1.mp4\t24\nx/1.mp4\t30", COLUMNS, rows, 0, "pressure_kPa")[0] == [(0, "pressure_kPa", "30")]
 
 
 def test_decimal_commas_are_read_and_written_as_the_sheet_has_them() -> None:

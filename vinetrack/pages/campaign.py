@@ -161,12 +161,11 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"
         raise ResultsError(f"{folder} has no trial to explore: {why}")
     fitted = read_fit(results)
-    refused = fitted.refused
-    comparison = None if refused else read_result(results.comparison)
-    conditions = [] if comparison is None else list(comparison["condition"].astype(str))
-    floors = [] if comparison is None else map(float, comparison["replicate_floor_m"])
-    compared = {name: read_result(results.trajectories(name)) for name in conditions}
-    aligned = _align_trials(data, compared)
+    floors_m: dict[str, float] = {}
+    if not fitted.refused:
+        table = read_result(results.comparison).astype({"condition": str, "replicate_floor_m": float})
+        floors_m = table.set_index("condition")["replicate_floor_m"].to_dict()
+    compared = {name: read_result(results.trajectories(name)) for name in floors_m}
     effects = {**catalogue(), **user_effects}
     return Campaign(
         name=folder.name,
@@ -174,13 +173,13 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         experiment=experiment,
         pairs=tuple(pairs),
         kinematics=kinematics,
-        trials=tuple(aligned),
+        trials=tuple(_align_trials(data, compared)),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
         bands=_bands(compared),
-        floors_m=dict(zip(conditions, floors, strict=True)),
+        floors_m=floors_m,
         numbers={entry.name: entry.value for entry in fitted.numbers},
         log_likelihood=fitted.log_likelihood,
-        refused=refused,
+        refused=fitted.refused,
         effects=effects,
         in_use=fitted.names if fitted.names and set(fitted.names) <= set(effects) else tuple(experiment.settings.model),
         unusable=_unusable(effects.values(), data),

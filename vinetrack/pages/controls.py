@@ -53,19 +53,6 @@ if TYPE_CHECKING:
     from vinetrack.pages.page import Page
 
 
-HEADING = """
-:host { margin-top: .5rem; }
-.bk-btn { text-align: left; border: 0 !important; border-bottom: 1px solid var(--grid) !important; border-radius: 0; }
-.bk-btn { background: none !important; box-shadow: none !important; font-weight: 650; padding: .3rem 0; width: 100%; }
-.bk-btn, .bk-btn.bk-active { color: var(--ink) !important; }
-.bk-btn::before { content: "▸ "; color: var(--muted); } .bk-btn.bk-active::before { content: "▾ "; }
-"""
-TICK = """
-:host { font-weight: 600; }
-input { accent-color: var(--accent); width: 1rem; height: 1rem; margin-right: .4rem; }
-"""
-
-
 class SizeSlider:
     """Slider of one parameter, and the text of its fitted value; calls `moved(name, value)` with the value in SI."""
 
@@ -122,9 +109,10 @@ def _step(low: float, high: float) -> float:
     return (high - low) / 400 or 1.0
 
 
-def _opens(inside: UIElement, title: str, css: str, **keywords: Any) -> Toggle:
+def _opens(inside: UIElement, title: str, look: str, **keywords: Any) -> Toggle:
     """A toggle that shows and hides what is inside."""
-    head = Toggle(label=title, active=inside.visible, stylesheets=[stylesheet(css)], margin=0, **keywords)
+    look_of: dict[str, Any] = {"css_classes": [look], "stylesheets": [stylesheet()], "margin": 0}
+    head = Toggle(label=title, active=inside.visible, **look_of, **keywords)
     head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
     return head
 
@@ -152,7 +140,8 @@ class EffectPanel:
                 active=name in choice,
                 disabled=bool(unusable) or name in BASE_EFFECTS,  # all others are added to these
                 name=f"tick_{name}",
-                stylesheets=[stylesheet(TICK)],
+                css_classes=["tick"],
+                stylesheets=[stylesheet()],
                 margin=(6, 0, 0, 0),
             )
             self.ticks[name].on_change("active", partial(self._on_tick, name))
@@ -177,7 +166,7 @@ class EffectPanel:
         for title, names, visible in groups:
             if names:
                 inside = stacked(*(rows[name] for name in names), visible=visible)
-                shown.append(stacked(_opens(inside, title, HEADING, sizing_mode="stretch_width"), inside))
+                shown.append(stacked(_opens(inside, title, "heading", sizing_mode="stretch_width"), inside))
         self.root = stacked(*shown, name="effects")
 
     def _on_tick(self, name: str, _attr: str, _old: bool, new: bool) -> None:
@@ -203,37 +192,26 @@ class EffectPanel:
             self._updating = False
 
 
-CHIPS = """
-:host { max-height: 10.5rem; overflow-y: auto; }
-.bk-btn-group { display: flex; flex-wrap: wrap; gap: 4px; }
-.bk-btn-group > .bk-btn { flex: 0 1 auto; border-radius: 999px !important; margin: 0 !important; padding: 3px 10px; }
-.bk-btn-group > .bk-btn { border: 1px solid var(--grid); background: var(--card); color: var(--muted); }
-.bk-btn-group > .bk-btn.bk-active { background: var(--chosen); border-color: var(--accent); color: var(--ink); }
-.bk-btn-group > .bk-btn.bk-active { box-shadow: none; }
-"""
-
-
 class TrialSelector:
     """Buttons to select conditions and trials; calls `on_change` when the selection changes."""
 
     def __init__(self, campaign: Campaign, on_change: Callable[[], None]) -> None:
-        small = ".bk-btn { font-size: 12px; padding: 2px 9px; }"
         self.campaign, self._on_change = campaign, on_change
         self._conditions = self._chips([campaign.labels[name] for name in campaign.conditions], "conditions")
-        self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", small, visible=False)
+        self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", visible=False)
         tools = side_by_side(
-            button("all", "choose_all", self._all, css=small),
-            button("none", "choose_none", self._none, css=small),
-            _opens(self._trials, "single trials …", small, name="single_trials"),
+            button("all", "choose_all", self._all, css_classes=["small"]),
+            button("none", "choose_none", self._none, css_classes=["small"]),
+            _opens(self._trials, "single trials …", "small", name="single_trials"),
             css=":host { gap: 4px; }",
         )
         self.root = stacked(self._conditions, tools, self._trials, name="choose")
 
-    def _chips(self, labels: list[str], name: str, css: str = "", **keywords: Any) -> CheckboxButtonGroup:
+    def _chips(self, labels: list[str], name: str, **keywords: Any) -> CheckboxButtonGroup:
         """Buttons that are all chosen at first."""
-        margin = (4, 0, 0, 0) if css else (0, 0, 4, 0)
-        look: dict[str, Any] = {"stylesheets": [stylesheet(CHIPS + css)], "margin": margin, **keywords}
-        chips = CheckboxButtonGroup(labels=labels, active=list(range(len(labels))), name=name, **look)
+        look: dict[str, Any] = {"css_classes": ["chips", name], "stylesheets": [stylesheet()], **keywords}
+        margin = (4, 0, 0, 0) if name == "trials" else (0, 0, 4, 0)
+        chips = CheckboxButtonGroup(labels=labels, active=list(range(len(labels))), name=name, margin=margin, **look)
         chips.on_change("active", lambda _attr, _old, _new: self._on_change())
         return chips
 

@@ -28,6 +28,7 @@ from vinetrack.core.tables import (
     parse_yaml,
     read_table,
     read_text,
+    read_yaml,
     with_value,
     write_text,
 )
@@ -145,12 +146,8 @@ def read_settings_text(folder: Path) -> str:
     path = folder / SETTINGS
     if not path.exists():
         return first_settings()
-    try:
-        text = read_text(path)
-    except TableError as error:
-        raise ExperimentError([Problem.from_error(error, SETTINGS)]) from None
-    parse_yaml(text, SETTINGS)
-    return text
+    read_yaml(path)  # refuses what cannot be edited
+    return read_text(path)
 
 
 def first_settings() -> str:
@@ -296,14 +293,6 @@ SHARED_ROW = "shared"  # The row of the table that applies to all trials
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 
 
-@dataclass
-class Pasted:
-    """Cells to change, as (row of the sheet or `SHARED_ROW`, column, text), and sentences on what was left out."""
-
-    cells: list[tuple[int | str, str, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
 def read_block(text: str) -> list[list[str]]:
     """Split pasted text into rows of cells, at tabs, semicolons, commas or blanks, whichever it has first."""
     lines = [line for line in text.splitlines() if line.strip()]
@@ -331,17 +320,20 @@ def place_block(
     at_row: int | str,
     at_column: str,
     decimal: str = ".",
-) -> Pasted:
-    """Say which cells of a table with these columns (as shown, without the trial) and rows a pasted block changes.
-    Without a header its columns follow the one pasted into, and without names its rows the row pasted into.
+) -> tuple[list[tuple[int | str, str, str]], list[str]]:
+    """Say which cells of a table with these columns (as shown, without the trial) and rows a pasted block changes, as
+    (row of the sheet or `SHARED_ROW`, column, text), and what was left out, in sentences. Without a header its columns
+    follow the one pasted into, and without names its rows the row pasted into.
     """
-    block, pasted = read_block(text), Pasted()
+    block = read_block(text)
+    placed: list[tuple[int | str, str, str]] = []
+    notes: list[str] = []
     words, row_named = _header_words(columns), _rows_by_name(rows)
     first = block[0] if block else []
     header = [words.get(re.sub(r"[^a-z0-9%]+", "_", _in_ascii(word)).strip("_"), "") for word in first]
     if any(header) and not any(_NUMBER.fullmatch(word) for word in first):
         unknown = [word for word, name in zip(first, header, strict=True) if word and not name]
-        pasted.notes += [f"No column is named “{word}”: left out." for word in unknown]
+        notes += [f"No column is named “{word}”: left out." for word in unknown]
         block = block[1:]
         name_place = header.index("trial") if "trial" in header else None
     else:
@@ -350,14 +342,14 @@ def place_block(
         found = [sum(_plain(cells[i]) in row_named for cells in block if i < len(cells)) for i in range(wide)]
         name_place = found.index(max(found)) if any(found) else None
         if at_column not in columns and name_place is None:
-            pasted.notes.append("No cell of this block is the name of a recording or of a column: nothing was pasted.")
-            return pasted
+            notes.append("No cell of this block is the name of a recording or of a column: nothing was pasted.")
+            return placed, notes
         start = columns.index(at_column) if at_column in columns else 0
         places = [i for i in range(wide) if i != name_place]
         targets = dict(zip(places, columns[start:], strict=False))
         header = ["trial" if i == name_place else targets.get(i, "") for i in range(wide)]
         if len(places) > len(targets):
-            pasted.notes.append(f"{len(places) - len(targets)} columns of this block lie beyond the table: left out.")
+            notes.append(f"{len(places) - len(targets)} columns of this block lie beyond the table: left out.")
     following = iter([SHARED_ROW, *range(len(rows))][0 if at_row == SHARED_ROW else int(at_row) + 1 :])
     for cells in block:
         if name_place is None:
@@ -365,13 +357,13 @@ def place_block(
         else:
             row = row_named.get(_plain(cells[name_place])) if name_place < len(cells) else None
         if row is None:
-            pasted.notes.append(f"No recording for “{' '.join(cells)}”: left out.")
+            notes.append(f"No recording for “{' '.join(cells)}”: left out.")
             continue
         for name, cell in zip(header, cells, strict=False):
             if name and name != "trial":
                 column = column_of(name, columns)
-                pasted.cells.append((row, column, in_unit_of(column, name, cell, decimal)))
-    return pasted
+                placed.append((row, column, in_unit_of(column, name, cell, decimal)))
+    return placed, notes
 
 
 def _header_words(columns: Sequence[str]) -> dict[str, str]:

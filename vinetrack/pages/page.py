@@ -1,11 +1,13 @@
-"""The explorer's server, and the controller of an open page: input changes the model, from which all else follows."""
+"""The explorer's page: what it says, its controller, from whose model all else follows, and its server."""
 
 from __future__ import annotations
 
 import logging
+import math
+import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -23,11 +25,16 @@ from tornado.web import ErrorHandler
 from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.core.terminal import waiting
+from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.folder import save_model
+from vinetrack.experiment.schema import COLUMNS, LIMITED
+from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.figures.style import TOKENS, follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Number
 from vinetrack.inference.optimiser import Step
+from vinetrack.narrative.verdict_text import quantity_text, spaced_name
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
@@ -37,46 +44,215 @@ from vinetrack.pages.campaign import (
     ModelChoice,
     Prediction,
     commands,
+    correlated_pairs_text,
     fit_choice,
+    likelihood_change_text,
     model_text,
+    overall_m,
     predict_choice,
     read_campaign,
 )
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, TrialSelector
-from vinetrack.pages.film_panel import FilmPanel
 from vinetrack.pages.local_page import LOOPBACK, is_from_page, secret_path, serve_on_free_port, serve_until_stopped
 from vinetrack.pages.plots import (
     TEMPLATES,
     THEME,
+    FilmPanel,
     HeldModel,
     Plots,
     button,
     command_block,
     escaped,
-    headline,
     html_div,
-    next_panel,
-    numbers_panel,
     panel,
     progress_bar,
     set_text,
     side_by_side,
     stacked,
-    suspects,
     templates,
-    tied_panel,
     vine_colours,
 )
 from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
-# A swipe over a figure scrolls the page, as it does elsewhere
-LET_SCROLL = """
-for (const plot of plots) {
-  Bokeh.index.find_one(plot)?.canvas_view?.events_el?.style.setProperty("touch-action", "pan-y");
-}
-"""
+# ------------------------------------------------------------------------------
+# Numbers and words of the text panels, which `panels.html` lays out.
 
+
+def headline(
+    campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
+) -> str:
+    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
+    now, before = (
+        overall_m({} if one is None else one.errors_m, campaign.conditions) for one in (prediction, opened_with)
+    )
+    floor = overall_m(campaign.floors_m if prediction is None else prediction.floors_m, campaign.conditions)
+    words = model_text(choice.effects)
+    return panel(
+        "headline",
+        model=words[:1].upper() + words[1:],
+        now=_in_mm(now),
+        before=_in_mm(before),
+        floor=_in_mm(floor),
+        at_floor=now <= 1.15 * floor,  # chosen: an error up to 1.15 times the replicate scatter counts as equal to it
+        refused=campaign.refused,
+        named=model_text(campaign.experiment.settings.model),
+        in_use=model_text(campaign.in_use),
+        command=f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}",
+    )
+
+
+def _in_mm(value_m: float) -> str:
+    return f"{1e3 * value_m:.3g} mm" if math.isfinite(value_m) else ""
+
+
+def numbers_panel(
+    campaign: Campaign, fits: Sequence[Fitted], sizes_changed: bool, held: HeldModel | None, now: HeldModel
+) -> str:
+    """Return the held model beside the current one, the parameters of the last fit of this page, and all its fits."""
+    compared = [] if held is None else _compared(campaign, (held, now))
+    if not fits:
+        return panel("numbers", compared=compared)
+    seconds, fit = fits[-1].seconds, fits[-1].fit
+    vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
+    known = vines if len(vines) > 1 else {}
+    spreads = "; ".join(
+        f"{name} {100 * s.value:.2g} %{'' if s.estimated else ' (fixed)'}" for name, s in fit.spreads.items()
+    )
+    facts = (
+        f"noise {1e3 * fit.noise_m:.2g} mm",
+        f"χ² per degree of freedom {fit.chi2_per_dof:.3g}" if math.isfinite(fit.chi2_per_dof) else "",
+        f"between-trial standard deviations: {spreads}" if spreads else "",
+        f"{seconds:.2g} s",
+    )
+    floor = overall_m(campaign.floors_m, campaign.conditions)
+    ladder = []
+    for fitted in fits:
+        rms = overall_m(fitted.prediction.errors_m, campaign.conditions)
+        beyond = math.sqrt(max(rms**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
+        ladder.append((model_text(fitted.choice.effects), _in_mm(rms), _in_mm(beyond) or "–"))
+    return panel(
+        "numbers",
+        compared=compared,
+        rows=[_number_row(number, known.get(number.vine, number.vine) or "all") for number in fit.numbers],
+        sizes_changed=sizes_changed,
+        facts=facts,
+        messages=fit.messages,
+        ladder=ladder,
+        gained=likelihood_change_text(fits[-2].fit, fit) if len(fits) > 1 else "",
+    )
+
+
+def _compared(campaign: Campaign, models: Sequence[HeldModel]) -> list[tuple[str, ...]]:
+    """Error and every fitted parameter of either of two models."""
+    rows = [
+        ("effects", *(model_text(model.effects) for model in models)),
+        ("rms of position", *(_in_mm(overall_m(model.errors_m, campaign.conditions)) for model in models)),
+    ]
+    fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
+    for name in dict.fromkeys(name for numbers in fits for name in numbers):
+        title = next(numbers[name].title for numbers in fits if name in numbers)
+        rows.append((title, *(quantity_text(n[name]) if name in n else "–" for n in fits)))
+    return rows
+
+
+def _number_row(number: Number, vine: str) -> tuple[str, ...]:
+    unit, factor = display_unit(number.unit, SLIDER_UNITS)
+    name = f"{number.symbol}, {unit}" if unit else number.symbol
+    if math.isfinite(number.bound):
+        return name, vine, f"{number.bound * factor:.4g}", "at its bound", ""
+    if not (math.isfinite(number.sigma) and number.sigma > 0):
+        return name, vine, f"{number.value * factor:.4g}", "undetermined", ""
+    digits = decimals(number.sigma * factor)
+    value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
+    return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
+
+
+def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None, fitted: Fitted | None) -> str:
+    """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations."""
+    tied = () if diagnosis is None or len(diagnosis.answer_set) < 2 else diagnosis.answer_set
+    titles, cosines = ([], []) if diagnosis is None or not diagnosis.rounds else _cosine_grid(diagnosis)
+    return panel(
+        "tied",
+        diagnosis=diagnosis,
+        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
+        names=[spaced_name(name) for name in tied],
+        titles=titles,
+        cosines=cosines,
+        fitted=fitted is not None,
+        # 6: pairs of correlated parameters shown; chosen: the card has room for six lines
+        pairs=[] if fitted is None else correlated_pairs_text(fitted.fit)[:6],
+    )
+
+
+def _cosine_grid(diagnosis: Diagnosis) -> tuple[list[str], list[list[tuple[str, str]]]]:
+    """The titles of the likeliest candidates and the cosines between their effects; none for fewer than two."""
+    known, cosines = diagnosis.rounds[0].cosine_names, diagnosis.rounds[0].cosines
+    pairs = [(abs(cosines[i][k]), name, other) for i, name in enumerate(known) for k, other in enumerate(known[:i])]
+    tied = sorted((pair for pair in pairs if pair[0] >= TIED_COSINE), key=lambda pair: -pair[0])
+    likely = [name for name in suspects(diagnosis) if name in known]
+    # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
+    names = list(dict.fromkeys([*likely, *(name for _, *pair in tied for name in pair)]))[:8]
+    if len(names) < 2:
+        return [], []
+    place = [known.index(name) for name in names]
+    return [spaced_name(name) for name in names], [[_cosine_cell(cosines[i][k]) for k in place] for i in place]
+
+
+def _cosine_cell(cosine: float) -> tuple[str, str]:
+    """A cosine and its style: blue if it is positive, vermillion if negative, the deeper the larger."""
+    if not math.isfinite(cosine):
+        return "–", ""
+    strength = min(abs(cosine), 1.0) ** 2
+    colour = f"rgba({'0,114,178' if cosine > 0 else '213,94,0'},{strength:.2f})"
+    return f"{cosine:+.2f}", f"background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}"
+
+
+def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
+    """Return the next experiment of the diagnosis, as HTML."""
+    advice = None if diagnosis is None else diagnosis.next_experiment or {}
+    separations = (advice or {}).get("separation_sigma") or {}
+    return panel(
+        "next",
+        advice=advice,
+        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
+        trials=[_trial_row(trial) for trial in (advice or {}).get("trials", ())],
+        separations=[
+            (spaced_name(pair.replace(" | ", " from ")), f"{sigma:.2g} σ")
+            for pair, sigma in separations.items()
+            if sigma is not None
+        ],
+    )
+
+
+def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:
+    """One condition in the units of the sheet, with what differs from the present rig."""
+    size = f"{_cell(trial.get('diameter_mm'))} mm × {_cell(trial.get('thickness_um'))} µm"
+    changed = trial.get("changed") or ()
+    other = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in changed and trial.get(key)]
+    return (
+        f"{size}{' (new)' if trial.get('new_vine') else ''}",
+        f"{_cell(trial.get('pressure_kPa'))} kPa",
+        f"{_cell(trial.get('payload_g') or 0)} g",
+        _cell(trial.get("replicates", 1)),
+        ", ".join(other),
+    )
+
+
+def _cell(value: Any) -> str:
+    return "–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
+    """Return the effects worth trying first, best first."""
+    if diagnosis is None:
+        return ()
+    ranked = [candidate.effect for candidate in diagnosis.ranking if math.isfinite(candidate.delta_chi2)]
+    return tuple(dict.fromkeys([*diagnosis.answer_set, *ranked]))
+
+
+# ------------------------------------------------------------------------------
+# The controller of an open page.
 
 REDRAW_MS = 4  # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
 # Chosen: text follows a slider at reading speed, because each change makes the browser lay out the page again
@@ -137,11 +313,9 @@ class Page:
         panels = [self.selector.root, self.panel.root, self.film.root, self.proposal.root]
         for root in (*texts, *figures, *panels, actions, stacked(save, self.saved, name="keep")):
             self.document.add_root(root)
-        swiped = {"plots": [*figures, self.film.figure]}
-        self.document.js_on_event("document_ready", CustomJS(args=swiped, code=LET_SCROLL))
-        # A recording keeps its greys, and the edges their colours over them.
         style, script = ((TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "screen.js"))
-        self.document.js_on_event("document_ready", CustomJS(args={"plots": figures, "tokens": TOKENS}, code=script))
+        shown = {"plots": figures, "film": self.film.figure, "tokens": TOKENS}
+        self.document.js_on_event("document_ready", CustomJS(args=shown, code=script))
         self.document.title = f"{campaign.name} – vinetrack explorer"
         self.document.theme = Theme(json=THEME)
         self.document.template = templates().get_template("page.html")

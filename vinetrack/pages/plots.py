@@ -1,17 +1,18 @@
-"""Figures and texts that follow the choice of model: positions, residuals, errors, the fit, tied candidates."""
+"""Widgets and figures of the explorer: positions, residuals, errors, and the recording with edges drawn over it."""
 
 from __future__ import annotations
 
 import html
 import math
-import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from bokeh.document import Document
 from bokeh.models import (
     Button,
     CategoricalColorMapper,
@@ -21,36 +22,30 @@ from bokeh.models import (
     Div,
     HoverTool,
     InlineStyleSheet,
+    LinearColorMapper,
     Range1d,
     Row,
+    Select,
+    Slider,
     Span,
     TapTool,
     UIElement,
 )
+from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from jinja2 import Environment, FileSystemLoader
+from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
-from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
-from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.experiment.schema import COLUMNS, LIMITED
-from vinetrack.figures.diagnosis_figures import TIED_COSINE
+from vinetrack.core.problems import UserError
+from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
-from vinetrack.inference.fit_result import Number
-from vinetrack.narrative.verdict_text import quantity_text, spaced_name
-from vinetrack.pages.campaign import (
-    Campaign,
-    ExplorerTrial,
-    Fitted,
-    ModelChoice,
-    Prediction,
-    condition_labels,
-    correlated_pairs_text,
-    drawn_rows,
-    likelihood_change_text,
-    model_text,
-    overall_m,
-)
+from vinetrack.pages.campaign import Campaign, ExplorerTrial, Fitted, Job, Prediction, condition_labels, drawn_rows
+from vinetrack.pages.local_page import jpeg
+from vinetrack.pipeline.overlays_stage import shake_along
+from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+from vinetrack.video.axis import Axis
+from vinetrack.video.curved_axis import axis_from_entry
+from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
 # ------------------------------------------------------------------------------
 # Style shared with the report: colours, fonts, and the pieces of HTML of the page.
@@ -102,11 +97,9 @@ def set_text(piece: Div, text: str) -> None:
         piece.text = text
 
 
-def button(
-    label: str, name: str, does: Callable[[], None], *, css: str = "", margin: int = 0, **options: Any
-) -> Button:
+def button(label: str, name: str, does: Callable[[], None], *, margin: int = 0, **options: Any) -> Button:
     """Return a button that calls `does` when it is clicked."""
-    made = Button(label=label, name=name, stylesheets=[stylesheet(css)], margin=margin, **options)
+    made = Button(label=label, name=name, stylesheets=[stylesheet()], margin=margin, **options)
     made.on_click(does)
     return made
 
@@ -411,176 +404,323 @@ class Plots:
 
 
 # ------------------------------------------------------------------------------
-# Numbers and words of the text panels, which `panels.html` lays out.
+# Frames of one recording, and the positions of the tracked edge and the model's edge in the picture.
+#
+# A recording is decoded once, in the background, and its frames are kept as JPEG no wider than the page shows them: one
+# second of a high-speed camera takes a few tens of megabytes.
 
 
-def headline(
-    campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
-) -> str:
-    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
-    now, before = (
-        overall_m({} if one is None else one.errors_m, campaign.conditions) for one in (prediction, opened_with)
-    )
-    floor = overall_m(campaign.floors_m if prediction is None else prediction.floors_m, campaign.conditions)
-    words = model_text(choice.effects)
-    return panel(
-        "headline",
-        model=words[:1].upper() + words[1:],
-        now=_in_mm(now),
-        before=_in_mm(before),
-        floor=_in_mm(floor),
-        at_floor=now <= 1.15 * floor,  # chosen: an error up to 1.15 times the replicate scatter counts as equal to it
-        refused=campaign.refused,
-        named=model_text(campaign.experiment.settings.model),
-        in_use=model_text(campaign.in_use),
-        command=f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}",
-    )
+# Name, colour over a grey picture, and line of each edge that is drawn
+EDGES = (("tracked", "#56B4E9", "solid"), ("comparison", "#E69F00", "dotted"), ("model", "#D55E00", "dashed"))
 
 
-def _in_mm(value_m: float) -> str:
-    return f"{1e3 * value_m:.3g} mm" if math.isfinite(value_m) else ""
+@dataclass(frozen=True)
+class RecordingView:
+    """Mapping of positions along the growth axis to the picture of one recording, px of the recording. `edge_px`, shape
+    (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and `lead_position_m` are those of
+    the track.
+    """
+
+    path: Path
+    axis: Axis
+    half_width_px: float
+    time_s: Floats
+    edge_px: Floats
+    lead_position_m: Floats
+    shake_px: Floats
+    by_hand: NDArray[np.bool_]
+
+    def along_px(self, lead_position_m: Floats) -> Floats:
+        """Return the pixels along the axis of positions of the track; linearly extrapolated beyond the track. NaN if
+        the track has fewer than two points.
+        """
+        known = np.flatnonzero(np.isfinite(self.edge_px) & np.isfinite(self.lead_position_m))
+        if known.size < 2:
+            return np.full(np.shape(lead_position_m), np.nan)
+        known = known[np.argsort(self.lead_position_m[known], kind="stable")]
+        position, along = self.lead_position_m[known], self.edge_px[known]
+        scale, offset = np.polyfit(position, along, 1)
+        outside = (lead_position_m < position[0]) | (lead_position_m > position[-1])
+        return np.where(outside, offset + scale * lead_position_m, np.interp(lead_position_m, position, along))
+
+    def across(self, along_px: float, frame: int | None = None) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the ends of a line across the vine at a position along the axis; with `frame`, in that picture.
+        Returns xs, ys : of both ends, px.
+        """
+        if frame is not None and frame < self.shake_px.size:
+            along_px += float(self.shake_px[frame])
+        half = self.half_width_px
+        (x0, y0), (x1, y1) = self.axis.points(np.full(2, along_px), np.array([half, -half]))
+        return (float(x0), float(x1)), (float(y0), float(y1))
 
 
-def numbers_panel(
-    campaign: Campaign, fits: Sequence[Fitted], sizes_changed: bool, held: HeldModel | None, now: HeldModel
-) -> str:
-    """Return the held model beside the current one, the parameters of the last fit of this page, and all its fits."""
-    compared = [] if held is None else _compared(campaign, (held, now))
-    if not fits:
-        return panel("numbers", compared=compared)
-    seconds, fit = fits[-1].seconds, fits[-1].fit
-    vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
-    known = vines if len(vines) > 1 else {}
-    spreads = "; ".join(
-        f"{name} {100 * s.value:.2g} %{'' if s.estimated else ' (fixed)'}" for name, s in fit.spreads.items()
-    )
-    facts = (
-        f"noise {1e3 * fit.noise_m:.2g} mm",
-        f"χ² per degree of freedom {fit.chi2_per_dof:.3g}" if math.isfinite(fit.chi2_per_dof) else "",
-        f"between-trial standard deviations: {spreads}" if spreads else "",
-        f"{seconds:.2g} s",
-    )
-    floor = overall_m(campaign.floors_m, campaign.conditions)
-    ladder = []
-    for fitted in fits:
-        rms = overall_m(fitted.prediction.errors_m, campaign.conditions)
-        beyond = math.sqrt(max(rms**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
-        ladder.append((model_text(fitted.choice.effects), _in_mm(rms), _in_mm(beyond) or "–"))
-    return panel(
-        "numbers",
-        compared=compared,
-        rows=[_number_row(number, known.get(number.vine, number.vine) or "all") for number in fit.numbers],
-        sizes_changed=sizes_changed,
-        facts=facts,
-        messages=fit.messages,
-        ladder=ladder,
-        gained=likelihood_change_text(fits[-2].fit, fit) if len(fits) > 1 else "",
-    )
-
-
-def _compared(campaign: Campaign, models: Sequence[HeldModel]) -> list[tuple[str, ...]]:
-    """Error and every fitted parameter of either of two models."""
-    rows = [
-        ("effects", *(model_text(model.effects) for model in models)),
-        ("rms of position", *(_in_mm(overall_m(model.errors_m, campaign.conditions)) for model in models)),
-    ]
-    fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
-    for name in dict.fromkeys(name for numbers in fits for name in numbers):
-        title = next(numbers[name].title for numbers in fits if name in numbers)
-        rows.append((title, *(quantity_text(n[name]) if name in n else "–" for n in fits)))
-    return rows
-
-
-def _number_row(number: Number, vine: str) -> tuple[str, ...]:
-    unit, factor = display_unit(number.unit, SLIDER_UNITS)
-    name = f"{number.symbol}, {unit}" if unit else number.symbol
-    if math.isfinite(number.bound):
-        return name, vine, f"{number.bound * factor:.4g}", "at its bound", ""
-    if not (math.isfinite(number.sigma) and number.sigma > 0):
-        return name, vine, f"{number.value * factor:.4g}", "undetermined", ""
-    digits = decimals(number.sigma * factor)
-    value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
-    return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
-
-
-def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None, fitted: Fitted | None) -> str:
-    """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations."""
-    tied = () if diagnosis is None or len(diagnosis.answer_set) < 2 else diagnosis.answer_set
-    titles, cosines = ([], []) if diagnosis is None or not diagnosis.rounds else _cosine_grid(diagnosis)
-    return panel(
-        "tied",
-        diagnosis=diagnosis,
-        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
-        names=[spaced_name(name) for name in tied],
-        titles=titles,
-        cosines=cosines,
-        fitted=fitted is not None,
-        # 6: pairs of correlated parameters shown; chosen: the card has room for six lines
-        pairs=[] if fitted is None else correlated_pairs_text(fitted.fit)[:6],
+def recording_view(results: Results, trial: Trial) -> RecordingView | str:
+    """Return the view of a trial, or the reason why there is none."""
+    if trial.video is None:
+        name = trial.track.name if trial.track is not None else "a table"
+        return f"{trial.name} came as a track ({name}): there is no recording to show, only the positions of its edge."
+    if not trial.video.exists():
+        return f"The recording of {trial.name}, {trial.video.name}, no longer exists; its track is shown instead."
+    try:
+        axis = read_json(results.analysed(trial.name)).get("axis")
+        table = read_result(results.track(trial.name))
+    except ResultsError as error:
+        return str(error)
+    if not axis:
+        return f"The position of the axis of {trial.name} in its picture was not stored: run snakemake again."
+    line = axis_from_entry(axis)
+    width = axis.get("width_px")
+    return RecordingView(
+        path=trial.video,
+        axis=line,
+        half_width_px=0.75 * float(width) if width else 0.05 * line.length_px,
+        time_s=table["time_s"].to_numpy(dtype=float),
+        edge_px=table["edge_px"].to_numpy(dtype=float),
+        lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
+        shake_px=shake_along(axis, len(table)),
+        by_hand=hand_corrected(table["flag"]),
     )
 
 
-def _cosine_grid(diagnosis: Diagnosis) -> tuple[list[str], list[list[tuple[str, str]]]]:
-    """The titles of the likeliest candidates and the cosines between their effects; none for fewer than two."""
-    known, cosines = diagnosis.rounds[0].cosine_names, diagnosis.rounds[0].cosines
-    pairs = [(abs(cosines[i][k]), name, other) for i, name in enumerate(known) for k, other in enumerate(known[:i])]
-    tied = sorted((pair for pair in pairs if pair[0] >= TIED_COSINE), key=lambda pair: -pair[0])
-    likely = [name for name in suspects(diagnosis) if name in known]
-    # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
-    names = list(dict.fromkeys([*likely, *(name for _, *pair in tied for name in pair)]))[:8]
-    if len(names) < 2:
-        return [], []
-    place = [known.index(name) for name in names]
-    return [spaced_name(name) for name in names], [[_cosine_cell(cosines[i][k]) for k in place] for i in place]
+@dataclass(frozen=True)
+class Film:
+    """Decoded frames of a recording as JPEG, with the number of their pixels per pixel of the recording."""
+
+    frames: Sequence[bytes]
+    scale: float
+
+    def picture(self, frame: int) -> NDArray[np.uint8]:
+        """Return the grey levels of one frame."""
+        data = np.frombuffer(self.frames[frame], dtype=np.uint8)
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
-def _cosine_cell(cosine: float) -> tuple[str, str]:
-    """A cosine and its style: blue if it is positive, vermillion if negative, the deeper the larger."""
-    if not math.isfinite(cosine):
-        return "–", ""
-    strength = min(abs(cosine), 1.0) ** 2
-    colour = f"rgba({'0,114,178' if cosine > 0 else '213,94,0'},{strength:.2f})"
-    return f"{cosine:+.2f}", f"background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}"
+def decode(path: Path, watch: Callable[[tuple[int, float]], None]) -> Film:
+    """Decode a recording as far as it can be decoded; `watch` gets the number of frames so far, and their share."""
+    max_width_px = 960  # Chosen: as wide as the page shows a recording
+    frames: list[bytes] = []
+    scale, reason = 1.0, "no frame could be decoded"
+    try:
+        recording = inspect_recording(path)
+        for luma in iterate_frames(recording):
+            scale = min(max_width_px / luma.shape[1], 1.0)
+            frames.append(jpeg(luma, max_width_px, 2.0**recording.bit_depth - 1))
+            # Frames between two reports of progress; chosen: several reports a second
+            if len(frames) % 10 == 1:
+                watch((len(frames), len(frames) / (recording.declared_frames or math.inf)))
+    except (RecordingError, OSError) as error:
+        reason = str(error)
+    if not frames:
+        raise UserError(reason)
+    return Film(frames, scale)
 
 
-def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
-    """Return the next experiment of the diagnosis, as HTML."""
-    advice = None if diagnosis is None else diagnosis.next_experiment or {}
-    separations = (advice or {}).get("separation_sigma") or {}
-    return panel(
-        "next",
-        advice=advice,
-        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
-        trials=[_trial_row(trial) for trial in (advice or {}).get("trials", ())],
-        separations=[
-            (spaced_name(pair.replace(" | ", " from ")), f"{sigma:.2g} σ")
-            for pair, sigma in separations.items()
-            if sigma is not None
-        ],
-    )
+class FilmPanel:
+    """Shows one trial at a time; calls `instant` with the time of the frame, s since release."""
 
+    def __init__(self, campaign: Campaign, document: Document, instant: Callable[[str, float], None]) -> None:
+        self.campaign, self._document, self._instant = campaign, document, instant
+        self._now: Prediction | None = None
+        self._reference: Prediction | None = None
+        self._film: Film | None = None
+        self._job: Job[tuple[int, float], Film] | None = None
+        self._view: RecordingView | None = None
+        self._no_view = ""
+        self._playing: Any = None
+        names = [aligned.name for aligned in campaign.trials]
+        common: dict[str, Any] = {"stylesheets": [stylesheet()], "margin": 0}
+        self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial", **common)
+        self.play = button("▶ play", "film_play", self._toggle_play, width=84)
+        self.frame = Slider(
+            start=0,
+            end=1,
+            value=0,
+            step=1,
+            title="frame",
+            sizing_mode="stretch_width",
+            name="film_frame",
+            stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; min-width: 180px; flex: 1 1 180px; }")],
+            margin=0,
+        )
+        self.caption = html_div(name="film_caption")
+        self._picture = ColumnDataSource({"image": []}, name="film_picture")
+        self._edges = ColumnDataSource({"xs": [], "ys": [], "colour": [], "dash": []}, name="film_edges")
+        self.figure = self._draw()
+        self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
+        self.frame.on_change("value", lambda _attr, _old, new: self._show_frame(int(new)))
+        controls = side_by_side(
+            self.trial_select,
+            self.play,
+            self.frame,
+            css=":host { flex-wrap: wrap; gap: 6px; align-items: end; }",
+            sizing_mode="stretch_width",
+        )
+        self.root = stacked(controls, self.figure, self.caption, name="film")
 
-def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:
-    """One condition in the units of the sheet, with what differs from the present rig."""
-    size = f"{_cell(trial.get('diameter_mm'))} mm × {_cell(trial.get('thickness_um'))} µm"
-    changed = trial.get("changed") or ()
-    other = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in changed and trial.get(key)]
-    return (
-        f"{size}{' (new)' if trial.get('new_vine') else ''}",
-        f"{_cell(trial.get('pressure_kPa'))} kPa",
-        f"{_cell(trial.get('payload_g') or 0)} g",
-        _cell(trial.get("replicates", 1)),
-        ", ".join(other),
-    )
+    def _draw(self) -> Any:
+        fig = figure(
+            sizing_mode="scale_width",
+            aspect_ratio=3.0,
+            tools="",
+            toolbar_location=None,
+            x_range=Range1d(0, 1),
+            y_range=Range1d(1, 0),
+            visible=False,
+            name="film_figure",
+            min_border=0,
+            margin=(6, 0, 4, 0),
+        )
+        fig.axis.visible = False
+        fig.grid.visible = False
+        self._mapper = LinearColorMapper(palette=list(Greys256), low=0, high=255)
+        self._image = fig.image(
+            "image", source=self._picture, x=-0.5, y=-0.5, dw=1, dh=1, color_mapper=self._mapper, level="image"
+        )
+        fig.multi_line("xs", "ys", source=self._edges, line_color="black", line_width=4.5, line_alpha=0.45)
+        fig.multi_line("xs", "ys", source=self._edges, line_color="colour", line_width=2.6, line_dash={"field": "dash"})
+        return fig
 
+    def set_predictions(self, now: Prediction, reference: Prediction | None) -> None:
+        """Set the predictions of the current model and of the model for comparison."""
+        self._now, self._reference = now, reference
+        self._draw_edges()
+        if self._job is None:
+            self._update_caption(int(self.frame.value))
 
-def _cell(value: Any) -> str:
-    return "–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+    def show_trial(self, name: str) -> None:
+        """Show another trial: decode its recording, or show why there is none."""
+        self._stop()
+        self.close()
+        if self.trial_select.value != name:
+            self.trial_select.value = name
+            return
+        self.figure.visible = False
+        view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
+        if isinstance(view, str):
+            self._show_track(view)
+            return
+        self._view, self._no_view = view, ""
+        self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
+        soon = self._document.add_next_tick_callback
+        decoding, decoded = partial(self._decoding, view), partial(self._decoded, view)
+        self._job = Job(partial(decode, view.path), lambda done: soon(partial(decoding, *done)), decoded, soon)
 
+    def _show_track(self, reason: str) -> None:
+        """Show the positions alone, and why there is no recording."""
+        self._view, self._no_view = None, reason
+        data = self._shown.data
+        last = max(data.time_s.size - 1, 1)
+        self.frame.update(start=0, end=last, value=(data.n_rest + last) // 2)
+        self._update_caption(int(self.frame.value))
 
-def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
-    """Return the effects worth trying first, best first."""
-    if diagnosis is None:
-        return ()
-    ranked = [candidate.effect for candidate in diagnosis.ranking if math.isfinite(candidate.delta_chi2)]
-    return tuple(dict.fromkeys([*diagnosis.answer_set, *ranked]))
+    def _decoding(self, view: RecordingView, count: int, share: float) -> None:
+        if view is self._view and self._job is not None:
+            self.caption.text = progress_bar(share, f"decoding {view.path.name}: {count} frames")
+
+    def _decoded(self, view: RecordingView, film: Film | None, reason: str) -> None:
+        if view is not self._view:
+            return
+        self._job, self._film = None, film
+        if film is None:
+            self._show_track(reason)
+            return
+        height, width = film.picture(0).shape
+        self.figure.x_range.update(start=-0.5, end=width - 0.5)
+        self.figure.y_range.update(start=height - 0.5, end=-0.5)
+        self._image.glyph.update(dw=width, dh=height)
+        self.figure.update(aspect_ratio=width / height, visible=True)
+        # The frame shown first is half-way along the motion.
+        known = np.flatnonzero(np.isfinite(view.edge_px))
+        last = len(film.frames) - 1
+        moving = int(min(known[known.size // 2], last)) if known.size else 0
+        self.frame.update(start=0, end=max(last, 1))
+        if self.frame.value != moving:
+            self.frame.value = moving
+        else:
+            self._show_frame(moving)
+
+    def _show_frame(self, frame: int) -> None:
+        if self._film is not None and frame < len(self._film.frames):
+            self._picture.data = {"image": [self._film.picture(frame)]}
+            self._draw_edges()
+        self._update_caption(frame)
+
+    def _time_s(self, frame: int) -> float:
+        """Time of a frame on the clock of the track."""
+        times = self._shown.data.time_s if self._view is None else self._view.time_s
+        return float(times[min(frame, times.size - 1)])
+
+    @property
+    def _shown(self) -> ExplorerTrial:
+        return self.campaign.trial(self.trial_select.value)
+
+    def _positions(self, frame: int) -> Floats:
+        """Position of each of `EDGES` in a frame, m; NaN if unknown. Shape (3,)."""
+        time_s, aligned = self._time_s(frame), self._shown
+        measured_m = aligned.data.lead_position_m if self._view is None else self._view.lead_position_m
+        positions_m = np.full(3, math.nan)
+        positions_m[0] = measured_m[frame] if frame < measured_m.size else math.nan
+        for k, prediction in enumerate((self._reference, self._now), 1):
+            if prediction is not None:
+                # The model is defined between the first and the last frame of the fit.
+                predicted_m = prediction.trials[self.campaign.trials.index(aligned)].predicted_position_m
+                positions_m[k] = np.interp(time_s, aligned.data.time_s, predicted_m, math.nan, math.nan)
+        return positions_m
+
+    def _draw_edges(self) -> None:
+        view, film = self._view, self._film
+        if view is None or film is None:
+            return
+        frame = int(self.frame.value)
+        drawn = [
+            (view.across(float(px), frame), colour, dash)
+            for (name, colour, dash), px in zip(EDGES, view.along_px(self._positions(frame)), strict=True)
+            if math.isfinite(px) and not (name == "comparison" and self._reference is self._now)
+        ]
+        half = 0.5 * (1 - film.scale)
+        self._edges.data = {
+            "xs": [[film.scale * x - half for x in xs] for (xs, _), _, _ in drawn],
+            "ys": [[film.scale * y - half for y in ys] for (_, ys), _, _ in drawn],
+            "colour": [colour for _, colour, _ in drawn],
+            "dash": [dash for _, _, dash in drawn],
+        }
+
+    def _update_caption(self, frame: int) -> None:
+        aligned, view = self._shown, self._view
+        since_s = self._time_s(frame) - aligned.release_s
+        positions_text = [
+            f'<span style="border-bottom:3px solid {colour}">{name} {1e3 * (m - aligned.origin_m):.1f} mm</span>'
+            for (name, colour, _), m in zip(EDGES, self._positions(frame), strict=True)
+            if math.isfinite(m)
+        ]
+        if view is not None and frame < view.by_hand.size and view.by_hand[frame]:
+            positions_text.append("corrected by hand")
+        notice = f"<p>{escaped(self._no_view)}</p>" if self._no_view else ""
+        when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
+        self.caption.text = f"{notice}<p>{when} · {' · '.join(positions_text)}</p>"
+        self._instant(aligned.name, since_s)
+
+    def _toggle_play(self) -> None:
+        if self._playing is not None:
+            self._stop()
+            return
+        self.play.label = "❚❚ pause"
+        # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
+        self._playing = self._document.add_periodic_callback(self._next_frame, 70)
+
+    def _next_frame(self) -> None:
+        step = max(int(self.frame.end) // 150, 1)
+        following = int(self.frame.value) + step
+        self.frame.value = following if following <= self.frame.end else 0
+
+    def _stop(self) -> None:
+        if self._playing is not None:
+            self._document.remove_periodic_callback(self._playing)
+            self._playing = None
+        self.play.label = "▶ play"
+
+    def close(self) -> None:
+        """Stop decoding, and let the recording go."""
+        if self._job is not None:
+            self._job.cancel()
+        self._job = self._film = self._view = None

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError
 from vinetrack.core.records import Correction, Trial
-from vinetrack.core.tables import list_recordings, parse_yaml, read_table, safe_join, with_value
+from vinetrack.core.tables import parse_yaml, read_table, safe_join, with_value
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
 from vinetrack.experiment.folder import SETTINGS, check_experiment, read_corrections
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import in_sheet_units, read_experiment_settings
-from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, read_row
+from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read_row
 from vinetrack.figures.style import page_frame
 from vinetrack.pages.draft_files import (
     Draft,
@@ -60,14 +60,7 @@ from vinetrack.tracks.importers import TrackError, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import find_board
 from vinetrack.video.curved_axis import axis_entry, axis_through
-from vinetrack.video.frames import (
-    Frames,
-    Recording,
-    RecordingError,
-    inspect_recording,
-    iterate_frames,
-    read_frames,
-)
+from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording, iterate_frames, read_frames
 from vinetrack.video.survey import given_axis, measure_recording, proposed_axis, size_problems, tracked_facts
 from vinetrack.video.track import Tracking, track_frames, track_recording
 
@@ -90,8 +83,7 @@ def decoded_clip(path: Path, _changed_ns: int) -> tuple[tuple[bytes, ...], dict[
         found["no_axis"] = str(error)
     top = float(np.quantile(frames.luma[0], 0.999)) if frames.luma.dtype != np.uint8 else 255.0
     pictures = tuple(jpeg(luma, white=top) for luma in frames.luma)
-    size = {"frames": len(pictures), "width": width, "height": height}
-    return pictures, {**size, **found, "notes": list(frames.notes)}
+    return pictures, {"frames": len(pictures), "width": width, "height": height, **found}
 
 
 def first_frame(path: Path) -> NDArray[Any]:
@@ -125,20 +117,14 @@ def axis_json(axis: Axis) -> dict[str, Any]:
     return {**entry, "width_px": _rounded(axis.width_px, 2)}
 
 
-def _points(text: str) -> list[list[float]]:
-    """The points of `x,y;x,y`."""
-    return [[float(value) for value in point.split(",")] for point in text.split(";")]
-
-
 def track_row(folder: Path, index: int) -> dict[str, Any]:
     """Track the recording of one row, which may be incomplete: strip, edge and notes. Without a scale positions are in
     pixels, without a rate times are in frames, see `scaled` and `timed`.
     """
     settings = read_experiment_settings(folder / SETTINGS)
     table = in_sheet_units(read_table(folder / SHEET), SHEET)[0]
-    trial = _trial_of(read_row(table, index, settings).values, folder)
-    given = read_corrections(folder)[0].get(table.rows[index].get("trial", ""), ())
-    trial = replace(trial, corrections=given)
+    trial = make_trial(read_row(table, index, settings), folder, settings)
+    trial = replace(trial, corrections=read_corrections(folder)[0].get(trial.name, ()))
     timed = math.isfinite(trial.capture_fps)
     scaled = settings.calibration is not None or math.isfinite(trial.m_per_px)
     if not timed and trial.video is not None:
@@ -179,18 +165,6 @@ def warm_up() -> None:
     except RecordingError:
         # Only the compilation matters.
         return
-
-
-def _trial_of(values: dict[str, Any], folder: Path) -> Trial:
-    """A trial made of the readable cells; the others keep their defaults."""
-    fields: dict[str, Any] = {}
-    for name, value in values.items():
-        column = COLUMNS[name]
-        if column.kind == "path":
-            fields[column.field] = safe_join(folder, value)
-        else:
-            fields[column.field] = column.to_si(float(value)) if column.kind in ("number", "choice") else value
-    return Trial(**{"name": "trial", **fields})
 
 
 def _track_json(tracking: Tracking) -> dict[str, Any]:
@@ -240,30 +214,21 @@ def _rounded(value: float, digits: int) -> float | None:
 # ------------------------------------------------------------------------------
 # Data exchanged between page and files: available columns, cells, settings, and problems with their fields.
 
-# Columns that the page always shows, whether or not the sheet has them
-OFFERED_COLUMNS = (
-    "capture_fps",
-    *REQUIRED_COLUMNS,
-    "payload_g",
-    "growth_angle_deg",
-    "chamber_l",
-    "exposure_us",
-    "pressure_trace",
-)
-
 
 def page_state(folder: Path) -> dict[str, Any]:
     """Return the initial state of the page, of JSON types."""
     draft, present = open_draft(folder), read_sheet(folder)
     content = parse_yaml(draft.settings, SETTINGS).content
     sheet = draft.sheet
+    # Columns that the page shows whether or not the sheet has them
+    optional = ["payload_g", "growth_angle_deg", "chamber_l", "exposure_us", "pressure_trace"]
     return {
         "name": folder.resolve().name,
         "folder": str(folder),
         "stamp": draft.stamp,
         "known": {name: _column_json(name) for name in COLUMNS if name not in ("trial", "video")},
         "units": {key: unit.text for key, unit in UNITS.items()},
-        "offered": list(OFFERED_COLUMNS),
+        "offered": ["capture_fps", *REQUIRED_COLUMNS, *optional],
         "sheet": {"columns": list(sheet.columns), "rows": list(sheet.rows), "decimal": sheet.decimal},
         "kept": list(present.columns) if present.rows else ["trial", "video"],
         "unsaved": not (folder / SETTINGS).exists() or not present.rows or cells_of(present) != cells_of(sheet),
@@ -274,7 +239,6 @@ def page_state(folder: Path) -> dict[str, Any]:
             trial: [vars(point) | {"edge_px": _rounded(point.edge_px, 2)} for point in given]
             for trial, given in draft.corrections.items()
         },
-        "recordings": list_recordings(folder),
         "pictures": list_pictures(folder),
         "traces": list_tables(folder),
     }
@@ -283,8 +247,7 @@ def page_state(folder: Path) -> dict[str, Any]:
 def _column_json(name: str) -> dict[str, Any]:
     column, units = COLUMNS[name], [split_unit(name)[1], *other_units(name).values()]
     told = {key: getattr(column, key) for key in ("kind", "meaning", "measured", "default", "shared")}
-    several = len(units) > 1
-    return {**told, "quantity": quantity(name), "units": units if several else [], "unit": units[0] if several else ""}
+    return {**told, "quantity": quantity(name), "units": units if len(units) > 1 else []}
 
 
 def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
@@ -327,10 +290,8 @@ def _scale_missing(draft: Draft) -> list[Problem]:
     has_scale = content.get("calibration") is not None or content.get("mm_per_px") is not None
     if has_scale or not any(row.get("video") and not row.get("mm_per_px") for row in draft.sheet.rows):
         return []
-    message, remedy = (
-        "is missing: no recording has a scale",
-        "click two marks on a ruler, or choose a picture of a printed board",
-    )
+    remedy = "click two marks on a ruler, or choose a picture of a printed board"
+    message = "is missing: no recording has a scale"
     return [Problem("missing", message, "calibration", file=SETTINGS, remedy=remedy)]
 
 
@@ -424,10 +385,10 @@ ANSWERS: dict[str, Callable[[SetupServer, Mapping[str, Any]], bytes | Mapping[st
     # 220: width of the pictures in the list; chosen: as wide as its column
     "GET /api/thumbnail": lambda server, given: server.picture(given["recording"], 220),
     "GET /api/picture": lambda server, given: server.picture(given["picture"]),
-    "GET /api/curve": lambda _, given: axis_json(axis_through(_points(given["points"]))),
+    "GET /api/curve": lambda _, given: axis_json(axis_through([p.split(",") for p in given["points"].split(";")])),
     "GET /api/board": lambda server, given: board_in(safe_join(server.folder, given["picture"]), given["picture"]),
     "POST /api/check": SetupServer.check,
-    "POST /api/paste": lambda _, given: vars(place_block(**given)),
+    "POST /api/paste": lambda _, given: dict(zip(("cells", "notes"), place_block(**given), strict=True)),
     "POST /api/track": SetupServer.track,
     "POST /api/save": SetupServer.save,
 }

@@ -30,5 +30,9 @@ function paint() {
   }
 }
 
+// A recording keeps its greys, and the edges their colours over them.
 paint();
 asked.addEventListener("change", paint);
+
+// A swipe over a figure scrolls the page, as it does elsewhere.
+for (const plot of [...plots, film]) Bokeh.index.find_one(plot)?.canvas_view?.events_el?.style.setProperty("touch-action", "pan-y");

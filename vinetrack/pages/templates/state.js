@@ -1,7 +1,7 @@
 // State of the page, requests to the server, and creation of elements.
 export const state = {
   known: {}, units: {}, offered: [], sheet: {columns: [], rows: []}, kept: [], shared: {}, calibration: null, axis: null, corrections: {},
-  recordings: [], pictures: [], traces: [], stamp: "", chosen: 0, problems: [], dirty: false, compared: false, clip: null,
+  pictures: [], traces: [], stamp: "", chosen: 0, problems: [], dirty: false, compared: false, clip: null,
 };
 
 export const $ = (id) => document.getElementById(id);

@@ -20,7 +20,7 @@ function head(columns) {
     const unit = known && known.units.length > 1
       ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => setUnit(name, event.target.value)},
         ...known.units.map((key) => el("option", {value: key, selected: name.endsWith(`_${key}`) && unitOf(name) === key}, state.units[key])))
-      : el("span", {class: "unit"}, known?.unit ? state.units[known.unit] : "");
+      : el("span", {class: "unit"});
     return el("th", {scope: "col"}, label, unit);
   });
   return el("thead", {}, el("tr", {}, el("th"), el("th", {scope: "col"}, "trial", el("span", {class: "unit"}, "recording")), ...cells));
