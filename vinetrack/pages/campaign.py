@@ -164,7 +164,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     floors_m: dict[str, float] = {}
     if not fitted.refused:
         table = read_result(results.comparison).astype({"condition": str, "replicate_floor_m": float})
-        floors_m = table.set_index("condition")["replicate_floor_m"].to_dict()
+        floors_m = dict(zip(table["condition"], table["replicate_floor_m"], strict=True))
     compared = {name: read_result(results.trajectories(name)) for name in floors_m}
     effects = {**catalogue(), **user_effects}
     return Campaign(

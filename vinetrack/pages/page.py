@@ -414,7 +414,6 @@ class Page:
         self.shown = first
         self._selection_changed()
         self._update_text()
-        self.film.set_predictions(first, first)
         worst = max(first.errors_m, key=lambda name: first.errors_m[name])
         self.film.show_trial(self.campaign.trials[self.campaign.indices_of_condition(worst)[0]].name)
         as_fitted = self.last is not None and self.choice is self.last.choice

@@ -16,6 +16,7 @@ export async function showRecording() {
   state.clip = null;
   view.source = "";
   view.words = "";
+  Object.assign(curve, {key: "", path_px: null, drawn: curve.asked});
   drawSources();
   $("three").replaceChildren();
   $("stage").replaceChildren(el("p", {class: "busy tool"}, recording ? `Decoding ${recording} …` : "No recording in this row."));
