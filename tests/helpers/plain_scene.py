@@ -116,15 +116,16 @@ def moving(plan: Plan, n_frames: int) -> np.ndarray:
     return (later > plan.start_px) & (travel(plan, np.arange(n_frames, dtype=float)) < plan.end_px)
 
 
-def developed(plan: Plan, picture: np.ndarray, frame: int, phase: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A picture as the camera keeps it: blurred, shaken, in flickering light, with grain."""
+def developed(
+    plan: Plan, picture: np.ndarray, frame: int, phase: np.ndarray, rng: np.random.Generator, light: float = 1.0
+) -> np.ndarray:
+    """A picture as the camera keeps it: blurred, shaken, in this light, with grain."""
     picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
     if plan.shake:
         dx, dy = plan.shake * np.sin(0.55 * frame + phase[0]), plan.shake * np.sin(0.37 * frame + phase[1])
         move, size = np.array([[1, 0, dx], [0, 1, dy]], np.float32), picture.shape[::-1]
         picture = cv2.warpAffine(picture, move, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    if plan.flicker:
-        picture = picture * (1 + plan.flicker * np.sin(0.9 * frame + phase[2]))
+    picture = picture * light
     white = rng.standard_normal(picture.shape).astype(np.float32)
     grain = white * plan.noise * np.sqrt(np.clip(picture, 1, None) / 100)
     return np.clip(np.rint(picture + grain), 0, 255).astype(np.uint8)
@@ -163,7 +164,7 @@ def plain_scene(plan: Plan) -> Scene:
         if plan.payload and edge[i] > 0.75 * plan.end_px:
             ahead = edge[i] + 3.0 * (edge[i] - 0.75 * plan.end_px)
             picture = np.where((np.abs(along - ahead) < 12) & (np.abs(across) < 10), 230.0, picture)
-        frames[i] = developed(plan, picture, i, phase[1:], rng)
+        frames[i] = developed(plan, picture, i, phase[1:], rng, light=1 + plan.flicker * np.sin(0.9 * i + phase[3]))
     return Scene(plan, frames, edge, moving(plan, n_frames))
 
 
