@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -56,7 +56,7 @@ class Law:
     @property
     def variables(self) -> tuple[str, ...]:
         """The variables that it depends on: growth, speed, time or pressure; none for a constant."""
-        variables = {VARIABLE_OF_KIND[kind] for kind in (self.kind, self.factor) if kind in VARIABLE_OF_KIND}
+        variables = {FORMS[kind].variable for kind in (self.kind, self.factor) if kind}
         return tuple(name for name in ("growth", "speed", "time", "pressure") if name in variables)
 
     @property
@@ -68,8 +68,8 @@ class Law:
     def unit_force(self, motion: FittedMotion) -> Floats:
         """The force of each unit amplitude along a motion. Shape (n_times, n_amplitudes)."""
         size = (motion.trial.area_m2 / self.reference_area_m2 if self.reference_area_m2 else 1.0) / self.peak
-        force = size * _EXPRESSIONS[self.kind](self, motion)
-        return force * _EXPRESSIONS[self.factor](self, motion) if self.factor else force
+        force = size * FORMS[self.kind].along(self, motion).reshape(motion.time_s.size, -1)
+        return force * FORMS[self.factor].along(self, motion)[:, None] if self.factor else force
 
     def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
         """Describe the law with its size."""
@@ -79,7 +79,7 @@ class Law:
 def _patch(law: Law, motion: FittedMotion) -> Floats:
     edge = EDGE_FRACTION * (law.high - law.low)
     y = motion.lead_position_m
-    return (0.5 * (np.tanh((y - law.low) / edge) - np.tanh((y - law.high) / edge)))[:, None]
+    return np.asarray(0.5 * (np.tanh((y - law.low) / edge) - np.tanh((y - law.high) / edge)))
 
 
 def _periodic(law: Law, motion: FittedMotion) -> Floats:
@@ -87,42 +87,95 @@ def _periodic(law: Law, motion: FittedMotion) -> Floats:
     return np.column_stack([np.sin(phase), np.cos(phase)])
 
 
-_EXPRESSIONS = {
-    "constant": lambda _, m: np.ones((m.time_s.size, 1)),
-    "position": lambda _, m: m.tail_position_m[:, None],
-    "speed": lambda _, m: m.tail_velocity_m_s[:, None],
-    "speed_squared": lambda _, m: m.tail_velocity_m_s[:, None] ** 2,
-    "position_squared": lambda _, m: m.tail_position_m[:, None] ** 2,
-    "beyond_a_place": lambda law, m: np.maximum(m.lead_position_m - law.scale, 0.0)[:, None],
-    "speed_cubed": lambda _, m: m.tail_velocity_m_s[:, None] ** 3,
-    "beyond_a_speed": lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0)[:, None],
-    "squared_beyond_a_speed": lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0)[:, None] ** 2,
-    "pressure": lambda _, m: m.pressure_Pa[:, None],
-    "time": lambda _, m: m.time_s[:, None],
-    "inverse_speed": lambda law, m: 1 / np.maximum(m.tail_velocity_m_s, law.scale)[:, None],
-    "falling_with_speed": lambda law, m: np.exp(-m.tail_velocity_m_s / law.scale)[:, None],
-    "fading_in_time": lambda law, m: np.exp(-m.time_s / law.scale)[:, None],
-    "fading_along": lambda law, m: np.exp(-m.lead_position_m / law.scale)[:, None],
-    "patch": _patch,
-    "periodic": _periodic,
-}
-# The variable that each kind but the constant depends on
-VARIABLE_OF_KIND = {
-    **dict.fromkeys(("position", "position_squared", "beyond_a_place", "fading_along", "patch", "periodic"), "growth"),
-    **dict.fromkeys(("speed", "speed_squared", "speed_cubed", "beyond_a_speed", "squared_beyond_a_speed"), "speed"),
-    **dict.fromkeys(("inverse_speed", "falling_with_speed"), "speed"),
-    **dict.fromkeys(("time", "fading_in_time"), "time"),
-    "pressure": "pressure",
-}
+@dataclass(frozen=True)
+class LawForm:
+    """How a kind of law is computed along motions, and how it is written in an effect file: its size (name, symbol,
+    exponents of its unit in N, m, s and Pa), its shape as code and as a formula, and its shape parameters (name,
+    symbol, unit). `variable` is what it depends on, `times` what it is also tried multiplied by.
+    """
+
+    along: Callable[[Law, FittedMotion], Floats]
+    variable: str
+    size: tuple[str, str, tuple[int, int, int, int]]
+    code: str
+    formula: str
+    shapes: tuple[tuple[str, str, str], ...] = ()
+    times: tuple[str, ...] = ()
 
 
-# Products in the grid (chosen)
-_PRODUCTS = {
-    **dict.fromkeys(("position", "position_squared", "fading_along", "beyond_a_place"), ("speed", "pressure")),
-    **dict.fromkeys(("speed", "speed_squared", "inverse_speed"), ("pressure",)),
-    "speed_squared": ("position", "pressure"),
-    "falling_with_speed": ("pressure",),
-}
+_FORCE = ("F", "F", (1, 0, 0, 0))
+_V_0, _V_1 = (("v_0", "v₀", "m/s"),), (("v_1", "v₁", "m/s"),)
+_BY_BOTH, _BY_PRESSURE = ("speed", "pressure"), ("pressure",)
+FORMS = {
+    "constant": LawForm(lambda _, m: np.ones(m.time_s.size), "", _FORCE, "1.0", "F"),
+    "position": LawForm(
+        lambda _, m: m.tail_position_m, "growth", ("k", "k", (1, -1, 0, 0)), "s.tail_position", "k x", times=_BY_BOTH
+    ),
+    "speed": LawForm(
+        lambda _, m: m.tail_velocity_m_s,
+        "speed", ("b", "b", (1, -1, 1, 0)), "s.tail_velocity", "b ẋ", times=_BY_PRESSURE,
+    ),
+    "speed_squared": LawForm(
+        lambda _, m: m.tail_velocity_m_s**2,
+        "speed", ("c", "c", (1, -2, 2, 0)), "s.tail_velocity * s.tail_velocity", "c ẋ²", times=("position", "pressure"),
+    ),
+    "position_squared": LawForm(
+        lambda _, m: m.tail_position_m**2,
+        "growth", ("q", "q", (1, -2, 0, 0)), "s.tail_position * s.tail_position", "q x²", times=_BY_BOTH,
+    ),
+    "beyond_a_place": LawForm(
+        lambda law, m: np.maximum(m.lead_position_m - law.scale, 0.0),
+        "growth", ("k", "k", (1, -1, 0, 0)), "np.maximum(s.lead_position - y_0, 0.0)", "k max(0, y − y₀)",
+        (("y_0", "y₀", "m"),), _BY_BOTH,
+    ),
+    "speed_cubed": LawForm(
+        lambda _, m: m.tail_velocity_m_s**3,
+        "speed", ("c", "c", (1, -3, 3, 0)), "s.tail_velocity * s.tail_velocity * s.tail_velocity", "c ẋ³",
+    ),
+    "beyond_a_speed": LawForm(
+        lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0),
+        "speed", ("b", "b", (1, -1, 1, 0)), "np.maximum(s.tail_velocity - v_1, 0.0)", "b max(0, ẋ − v₁)", _V_1,
+    ),
+    "squared_beyond_a_speed": LawForm(
+        lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0) ** 2,
+        "speed", ("c", "c", (1, -2, 2, 0)), "np.maximum(s.tail_velocity - v_1, 0.0) ** 2", "c max(0, ẋ − v₁)²", _V_1,
+    ),
+    "pressure": LawForm(lambda _, m: m.pressure_Pa, "pressure", ("a", "a", (1, 0, 0, -1)), "s.pressure", "a P"),
+    "time": LawForm(lambda _, m: m.time_s, "time", ("r", "r", (1, 0, -1, 0)), "s.time", "r t"),
+    "inverse_speed": LawForm(
+        lambda law, m: 1 / np.maximum(m.tail_velocity_m_s, law.scale),
+        "speed", _FORCE, "v_0 / np.maximum(s.tail_velocity, v_0)", "F v₀/max(ẋ, v₀)", _V_0, _BY_PRESSURE,
+    ),
+    "falling_with_speed": LawForm(
+        lambda law, m: np.exp(-m.tail_velocity_m_s / law.scale),
+        "speed", _FORCE, "np.exp(-s.tail_velocity / v_0)", "F exp(−ẋ/v₀)", _V_0, _BY_PRESSURE,
+    ),
+    "fading_in_time": LawForm(
+        lambda law, m: np.exp(-m.time_s / law.scale),
+        "time", _FORCE, "np.exp(-s.time / t_0)", "F exp(−t/t₀)", (("t_0", "t₀", "s"),),
+    ),
+    "fading_along": LawForm(
+        lambda law, m: np.exp(-m.lead_position_m / law.scale),
+        "growth", _FORCE, "np.exp(-s.lead_position / reach)", "F exp(−y/ℓ)", (("reach", "ℓ", "m"),), _BY_BOTH,
+    ),
+    "patch": LawForm(
+        _patch,
+        "growth",
+        _FORCE,
+        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE_FRACTION} * width))"
+        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE_FRACTION} * width)))",
+        f"½F (tanh((y − y₁)/{EDGE_FRACTION}w) − tanh((y − y₁ − w)/{EDGE_FRACTION}w))",
+        (("y_1", "y₁", "m"), ("width", "w", "m")),
+    ),
+    "periodic": LawForm(
+        _periodic,
+        "growth",
+        _FORCE,
+        "np.sin(2.0 * np.pi * s.lead_position / period + phi)",
+        "F sin(2π y/Λ + φ)",
+        (("period", "Λ", "m"), ("phi", "φ", "rad")),
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -160,7 +213,7 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     # 0.6, 0.04: as parts of the growth (derived)
     for period in np.geomspace(0.04, 0.6, 24) * visited.growth_m:
         laws.append(Law("periodic", n_amplitudes=2, n_shapes=1, scale=float(period)))
-    laws += [replace(law, factor=factor) for law in laws for factor in _PRODUCTS.get(law.kind, ())]
+    laws += [replace(law, factor=factor) for law in laws for factor in FORMS[law.kind].times]
     areas = [motion.trial.area_m2 for motion in motions]
     # 1.02: ratio of cross-sections up to which two vines count as equally wide (chosen)
     if max(areas) > 1.02 * min(areas):

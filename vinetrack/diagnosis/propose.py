@@ -30,7 +30,7 @@ from vinetrack.diagnosis.candidate_fits import (
     start_values,
 )
 from vinetrack.diagnosis.force_inversion import uniform_splines
-from vinetrack.diagnosis.force_laws import EDGE_FRACTION, VARIABLES, Domain
+from vinetrack.diagnosis.force_laws import FORMS, VARIABLES, Domain
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
 from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce, variables_in_words
 from vinetrack.diagnosis.likelihood_ratio import (
@@ -332,63 +332,6 @@ def proposed_table(
         return ProposedTable(learned, effect, ratio, left_out(after).rms_m)
 
 
-@dataclass(frozen=True)
-class _Expression:
-    """How a law is written: its size parameter, its shape as code and as a formula, and its shape parameters. The size
-    has a name, a symbol and a unit, the unit given by its exponents of N, m, s and Pa.
-    """
-
-    size: tuple[str, str, tuple[int, int, int, int]]
-    code: str
-    formula: str
-    shapes: tuple[tuple[str, str, str], ...] = ()
-
-
-_SPEED, _TIME, _LENGTH = ("v_0", "v₀", "m/s"), ("t_0", "t₀", "s"), ("reach", "ℓ", "m")
-_THRESHOLD = ("v_1", "v₁", "m/s")
-_FORCE = ("F", "F", (1, 0, 0, 0))
-_EXPRESSIONS = {
-    "constant": _Expression(_FORCE, "1.0", "F"),
-    "position": _Expression(("k", "k", (1, -1, 0, 0)), "s.tail_position", "k x"),
-    "speed": _Expression(("b", "b", (1, -1, 1, 0)), "s.tail_velocity", "b ẋ"),
-    "speed_squared": _Expression(("c", "c", (1, -2, 2, 0)), "s.tail_velocity * s.tail_velocity", "c ẋ²"),
-    "position_squared": _Expression(("q", "q", (1, -2, 0, 0)), "s.tail_position * s.tail_position", "q x²"),
-    "beyond_a_place": _Expression(
-        ("k", "k", (1, -1, 0, 0)),
-        "np.maximum(s.lead_position - y_0, 0.0)",
-        "k max(0, y − y₀)",
-        (("y_0", "y₀", "m"),),
-    ),
-    "speed_cubed": _Expression(
-        ("c", "c", (1, -3, 3, 0)), "s.tail_velocity * s.tail_velocity * s.tail_velocity", "c ẋ³"
-    ),
-    "beyond_a_speed": _Expression(
-        ("b", "b", (1, -1, 1, 0)), "np.maximum(s.tail_velocity - v_1, 0.0)", "b max(0, ẋ − v₁)", (_THRESHOLD,)
-    ),
-    "squared_beyond_a_speed": _Expression(
-        ("c", "c", (1, -2, 2, 0)), "np.maximum(s.tail_velocity - v_1, 0.0) ** 2", "c max(0, ẋ − v₁)²", (_THRESHOLD,)
-    ),
-    "pressure": _Expression(("a", "a", (1, 0, 0, -1)), "s.pressure", "a P"),
-    "time": _Expression(("r", "r", (1, 0, -1, 0)), "s.time", "r t"),
-    "inverse_speed": _Expression(_FORCE, "v_0 / np.maximum(s.tail_velocity, v_0)", "F v₀/max(ẋ, v₀)", (_SPEED,)),
-    "falling_with_speed": _Expression(_FORCE, "np.exp(-s.tail_velocity / v_0)", "F exp(−ẋ/v₀)", (_SPEED,)),
-    "fading_in_time": _Expression(_FORCE, "np.exp(-s.time / t_0)", "F exp(−t/t₀)", (_TIME,)),
-    "fading_along": _Expression(_FORCE, "np.exp(-s.lead_position / reach)", "F exp(−y/ℓ)", (_LENGTH,)),
-    "patch": _Expression(
-        _FORCE,
-        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE_FRACTION} * width))"
-        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE_FRACTION} * width)))",
-        f"½F (tanh((y − y₁)/{EDGE_FRACTION}w) − tanh((y − y₁ − w)/{EDGE_FRACTION}w))",
-        (("y_1", "y₁", "m"), ("width", "w", "m")),
-    ),
-    "periodic": _Expression(
-        _FORCE,
-        "np.sin(2.0 * np.pi * s.lead_position / period + phi)",
-        "F sin(2π y/Λ + φ)",
-        (("period", "Λ", "m"), ("phi", "φ", "rad")),
-    ),
-}
-
 # What a law may be multiplied by: code, symbol, and the change of the unit of the size
 _FACTORS = {
     "position": ("s.tail_position", "x", (0, -1, 0, 0)),
@@ -539,7 +482,7 @@ def effect_text(detected: DetectedLaw, remark: str = "") -> str:
     """Source of an effect file that holds a law: docstring, parameters with units and bounds, function,
     worked example.
     """
-    law, expression = detected.law, _EXPRESSIONS[detected.law.kind]
+    law, expression = detected.law, FORMS[detected.law.kind]
     factor_code, factor_symbol, factor_unit = _FACTORS.get(law.factor, ("", "", (0, 0, 0, 0)))
     unit = _unit([a + b for a, b in zip(expression.size[2], factor_unit, strict=True)])
     size, shapes = _values(detected)
@@ -596,7 +539,7 @@ def _values(detected: DetectedLaw) -> tuple[float, tuple[float, ...]]:
         return rounded(amplitude[0] / law.peak)[0], rounded(law.low, law.high - law.low)
     if law.kind == "inverse_speed":
         return rounded(amplitude[0] / law.peak / law.scale)[0], rounded(law.scale)
-    return rounded(amplitude[0] / law.peak)[0], rounded(law.scale) if _EXPRESSIONS[law.kind].shapes else ()
+    return rounded(amplitude[0] / law.peak)[0], rounded(law.scale) if FORMS[law.kind].shapes else ()
 
 
 def _force_N(detected: DetectedLaw) -> float:
