@@ -720,8 +720,7 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
 # Check of stated pressures against measured speeds, for errors of unit.
 #
 # The damping coefficient that a trial implies, B = (P − P_y) A / (2 ẏ)ⁿ with the printed n, is compared with the
-# scaling prior. A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by
-# even more.
+# scaling prior. A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by even more.
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
