@@ -601,25 +601,32 @@ class _Search(DesignInformation):
         return order
 
 
-def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, chosen: Sequence[int]) -> FurtherTrials:
-    """The plan with as many of these trials as needed, and the power after each."""
-    unique = list(dict.fromkeys(chosen))
-    tests = tests_with_conditions(design, [search.conditions[k] for k in unique], design.candidates)
+def tests_of_designs(
+    design: CampaignDesign, conditions: Sequence[Condition]
+) -> Callable[[Sequence[Condition]], MisfitTests]:
+    """Return a function that gives the misfit tests of the trials so far and trials of these conditions, of which one
+    each is simulated.
+    """
+    unique = list({condition.trial.name: condition for condition in conditions}.values())
+    tests = tests_with_conditions(design, unique, design.candidates)
     index_of = {trial.name: k for k, trial in enumerate(tests.fit.trials)}
     so_far = [index_of[trial.name] for trial in design.trials if trial.name in index_of]
+    return lambda added: with_trials(tests, [*so_far, *(index_of[condition.trial.name] for condition in added)])
+
+
+def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, chosen: Sequence[int]) -> FurtherTrials:
+    """The plan with as many of these trials as needed, and the power after each."""
+    conditions = [search.conditions[k] for k in chosen for _ in range(REPLICATES)]
+    tests_with = tests_of_designs(design, conditions)
     trials: list[AddedTrial] = []
     power, probability = plan.power, plan.before
-    for count, k in enumerate(chosen, 1):
-        condition = search.conditions[k]
-        added = [index_of[search.conditions[j].trial.name] for j in chosen[:count] for _ in range(REPLICATES)]
-        power = effect_power(with_trials(tests, [*so_far, *added]), plan.effect) or power
+    while len(trials) < len(conditions) and probability < plan.target:
+        power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), plan.effect) or power
         assert power is not None
         probability = power.probability_at(plan.value)
-        for _ in range(REPLICATES):
+        for condition in conditions[len(trials) : len(trials) + REPLICATES]:
             trial = replace(condition.trial, name=f"added_{len(trials) + 1}")
             trials.append(AddedTrial(trial, condition.changed, condition.effort == NEW_VINE, probability))
-        if probability >= plan.target:
-            break
     assert power is not None
     endless = search.first_information((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
     ratio = math.sqrt(endless / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
@@ -668,18 +675,9 @@ def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | No
     if not search.expected_discoveries(after)[0] > search.expected_discoveries(before)[0]:
         return None
     groups = [k for k in chosen for _ in range(min(REPLICATES, limits.trials))]
-    return InformativeTrials(
-        trial_entries(search.conditions, groups), power, _power_with(design, [search.conditions[k] for k in groups])
-    )
-
-
-def _power_with(design: CampaignDesign, added: Sequence[Condition]) -> Power:
-    """Power of the trials so far and of trials of these conditions, some of which are the same."""
-    unique = list({condition.trial.name: condition for condition in added}.values())
-    tests = tests_with_conditions(design, unique, design.candidates)
-    index_of = {trial.name: k for k, trial in enumerate(tests.fit.trials)}
-    names = [*(trial.name for trial in design.trials), *(condition.trial.name for condition in added)]
-    return power_of(with_trials(tests, [index_of[name] for name in names if name in index_of]), nonlinear=True)
+    added = [search.conditions[k] for k in groups]
+    then = power_of(tests_of_designs(design, added)(added), nonlinear=True)
+    return InformativeTrials(trial_entries(search.conditions, groups), power, then)
 
 
 class _InformativeTrialsSearch(DesignInformation):

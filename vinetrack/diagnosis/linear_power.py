@@ -6,7 +6,8 @@ The diagnosis calls a candidate missing when its score, in standard errors, exce
     z_j ~ N(μ_j(a), 1),   μ_j(a) = I_jk a / √I_jj,   corr(z_i, z_j) = I_ij / √(I_ii I_jj)
 
 where k is the shape of the effect and I the information between shapes, with free parameters and trial effects
-projected out. A size is therefore detected with probability p at a_p = σ (c + Φ⁻¹(p)), σ = 1/√I_kk. Refinements:
+projected out. A size is therefore detected with probability p at a_p = σ (c + Φ⁻¹(p)), σ = 1/√I_kk; refined for finite
+sizes (`score_ratios`), scatter of single trials (`_required_means`), and misfit taken for scatter (`error_inflation`).
 """
 
 from __future__ import annotations
@@ -430,8 +431,8 @@ def _size_with_mean(means: Floats, sizes: Floats, mean: float) -> float:
 
 
 def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats:
-    """For each draw of the noise, the mean that the score of a shape needs to exceed both thresholds. Derivation at the
-    head of the module; p_i is the share of trial i in the information about the shape.
+    """For each draw of the noise, the mean that the score of a shape needs to exceed both thresholds: that of the noise
+    model, and that of Student's t with the standard error found from the scatter of single trials.
     """
     scores = tests.scores
     limit = tests.family.threshold(tests.sensitivities.effects[index])
@@ -457,9 +458,9 @@ def error_inflation(tests: MisfitTests) -> Floats:
     between-trial standard deviations of pressure and B are estimated without the effect. Multiplied by f_P and f_B they
     are those that minimise
 
-        Σ_s ν (ln f_s² + 1 / f_s²) + x² I(f_P, f_B) / I(1, 1),
+        Σ_s ν (ln f_s² + 1 / f_s²) + x² I(f_P, f_B) / I(1, 1)
 
-    Returns for an effect whose score at the true standard deviations would be `SCORE_GRID`; 1 where they are not
+    for an effect whose score x at the true standard deviations would be one of `SCORE_GRID`; 1 where they are not
     estimated. Shape (n_scores, n_shapes).
     """
     fit, scores = tests.fit, tests.scores
