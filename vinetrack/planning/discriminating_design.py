@@ -379,14 +379,13 @@ def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, .
     """Likelihood of the trials so far at every scatter that a refit may estimate; new parameters have only priors."""
     state, problem = fit.solution.state, fit.solution.problem
     reduced = marginal(fit.solution.cross_products, problem, state)
+    fitted = np.maximum(state.spread, LEAST_BETWEEN_TRIAL_SD)
+    may_grow = np.array(fit.solution.estimable) & (np.array(state.spread) > LEAST_BETWEEN_TRIAL_SD)
     levels: dict[tuple[float, float], ScatterLevel] = {}
     as_fitted = 0.0
     for factors in SCATTER_FACTORS:
-        spread = tuple(
-            min(s * factor, most) if can and s > LEAST_BETWEEN_TRIAL_SD else s
-            for s, factor, most, can in zip(state.spread, factors, LARGEST_SPREAD, fit.solution.estimable, strict=True)
-        )
-        pair = _at_least(spread)
+        pressure, damping = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted).tolist()
+        pair = (pressure, damping)
         if pair in levels:
             continue
         of_old, gradient_of_old, square, log_det = normal_equations(reduced, problem, state, pair)
@@ -395,15 +394,10 @@ def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, .
         information[:old, :old] = of_old
         information[range(old, size), range(old, size)] = precision_of_new
         as_fitted = as_fitted if levels else square + log_det
-        fitted = _at_least(state.spread)
-        ratios = (pair[0] / fitted[0], pair[1] / fitted[1])
+        ratios = (pressure / float(fitted[0]), damping / float(fitted[1]))
         gradient = np.concatenate([gradient_of_old, np.zeros(size - old)])
         levels[pair] = ScatterLevel(pair, ratios, information, gradient, square + log_det - as_fitted)
     return tuple(levels.values())
-
-
-def _at_least(spread: Sequence[float]) -> tuple[float, float]:
-    return max(spread[0], LEAST_BETWEEN_TRIAL_SD), max(spread[1], LEAST_BETWEEN_TRIAL_SD)
 
 
 # ------------------------------------------------------------------------------

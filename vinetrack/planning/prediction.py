@@ -231,7 +231,7 @@ class VinePrediction:
         """The final speed: of the payload as it leaves, else of the leading edge at `at_fraction`. Where the tail may
         go slack, the payload moves on its own and is not simulated: then that of the leading edge.
         """
-        return self[final_name(self.inputs)]
+        return self[EJECTION if told_by_payload(self.inputs.trial) else EDGE]
 
     def __getitem__(self, name: str) -> Quantity:
         """Return the quantity of that name; KeyError where there is none."""
@@ -248,11 +248,6 @@ class VinePrediction:
 def told_by_payload(trial: Trial) -> bool:
     """Return whether the final speed is that of a payload, which a slack tail would let move on its own."""
     return trial.payload_kg > 0 and trial.tail_slack != "free"
-
-
-def final_name(inputs: PredictiveInputs) -> str:
-    """Return the name of the final speed of this trial."""
-    return EJECTION if told_by_payload(inputs.trial) else EDGE
 
 
 def predict_vine(
@@ -293,13 +288,18 @@ def predict_vine(
     along = np.union1d(ALONG, [at_fraction])
     runs = run(inputs, along * length_m, samples, seed)
     place = int(np.searchsorted(along, at_fraction))
-    # 400: draws for the band of one uncertainty alone (derived)
+    contributions = []
+    for uncertainty in inputs.uncertainties:
+        # 400: draws for the band of one uncertainty alone (derived)
+        alone = drawn_final_speeds(inputs, at_fraction, min(samples, 400), seed, [uncertainty.name])
+        low, _, high = band(alone).tolist()
+        contributions.append(Contribution(uncertainty.name, uncertainty.words, low, high))
     return VinePrediction(
         inputs=inputs,
         at_fraction=at_fraction,
         quantities=tuple(_quantities(inputs, runs, along, place)),
         curve=_curve(inputs, runs, along),
-        shares=_contributions(inputs, at_fraction, min(samples, 400), seed),
+        shares=tuple(sorted(contributions, key=lambda share: share.low - share.high)),
         arrives=float(np.mean(np.isfinite(runs.end_s))),
         slack=float(np.mean(runs.slack)),
         samples=samples,
@@ -349,15 +349,6 @@ def _curve(inputs: PredictiveInputs, runs: Runs, along: Floats) -> pd.DataFrame:
     tail_velocity, pressure_kPa = inputs.trial.travel_ratio * speed[0], pressure[0] / 1e3
     columns = (condition, along, runs.places_m, *time, *speed, tail_velocity, *tension, pressure_kPa)
     return pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True)))
-
-
-def _contributions(inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int) -> tuple[Contribution, ...]:
-    """Band of the final speed with one uncertain input each, widest first."""
-    contributions = []
-    for uncertainty in inputs.uncertainties:
-        low, _, high = band(drawn_final_speeds(inputs, at_fraction, samples, seed, [uncertainty.name]))
-        contributions.append(Contribution(uncertainty.name, uncertainty.words, float(low), float(high)))
-    return tuple(sorted(contributions, key=lambda share: share.low - share.high))
 
 
 # ------------------------------------------------------------------------------
