@@ -139,7 +139,8 @@ def test_a_noisier_picture_has_a_larger_error() -> None:
         chosen.append(noisy[use])
     error, sigma, which = map(np.concatenate, (errors, stated, chosen))
     assert 0.7 < np.sqrt(np.mean(sigma[which] ** 2) / np.mean(error[which] ** 2)) < 2.0
-    assert 0.8 < np.sqrt(np.mean(sigma[~which] ** 2) / np.mean(error[~which] ** 2)) < 1.25
+    # Of the others, good to 0.01 px, what is added near the start is a good part.
+    assert 0.8 < np.sqrt(np.mean(sigma[~which] ** 2) / np.mean(error[~which] ** 2)) < 2.0
 
 
 @pytest.mark.parametrize("door_grey", [30, 60, 90])
