@@ -56,7 +56,7 @@ BUDGETS = {
     "kinematics": (2254, 6, 22),
     "laboratory": (1890, 6, 16),
     "narrative": (1748, 3, 23),
-    "pages": (3491, 8, 33),
+    "pages": (3486, 8, 33),
     "paper": (899, 3, 18),
     "pipeline": (3478, 11, 16),
     "planning": (2528, 5, 32),

@@ -10,6 +10,7 @@ import threading
 import time
 import urllib.request
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -162,31 +163,23 @@ def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campa
     assert overall_m(back.prediction.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
 
 
-class RecordedCallbacks:
-    """Records the callbacks of a job."""
-
-    def __init__(self) -> None:
-        self.steps: list[Step] = []
-        self.ends: list[tuple[Fitted | None, str]] = []
-
-    def job(self, work: object) -> Job:
-        return Job(work, self.steps.append, lambda *end: self.ends.append(end))  # type: ignore[arg-type]
-
-
 @pytest.mark.slow
 def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted) -> None:
-    recorded = RecordedCallbacks()
-    job = recorded.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
+    steps: list[Step] = []
+    ends: list[tuple[Fitted | None, str]] = []
+    job = Job(partial(fit_choice, campaign, first.fit, first.choice), steps.append, lambda *end: ends.append(end))
     job.wait(60)
-    assert recorded.steps
-    ((fitted, reason),) = recorded.ends
+    assert steps
+    ((fitted, reason),) = ends
     assert fitted is not None
     assert fitted.fit.model.names == first.fit.model.names
     assert reason == ""
 
 
 def test_a_cancelled_job_calls_no_callback() -> None:
-    recorded, started = RecordedCallbacks(), threading.Event()
+    steps: list[Step] = []
+    ends: list[tuple[Fitted | None, str]] = []
+    started = threading.Event()
 
     def endless(watch: Watch) -> Fitted:
         started.set()
@@ -194,14 +187,14 @@ def test_a_cancelled_job_calls_no_callback() -> None:
             watch(Step(1, {}, 1.0))
             time.sleep(0.01)
 
-    job = recorded.job(endless)
+    job = Job(endless, steps.append, lambda *end: ends.append(end))
     started.wait(10)
     job.cancel()
     job.wait(10)
-    count = len(recorded.steps)
+    count = len(steps)
     time.sleep(0.05)
-    assert len(recorded.steps) == count
-    assert not recorded.ends
+    assert len(steps) == count
+    assert not ends
 
 
 @pytest.mark.slow
@@ -268,15 +261,14 @@ def test_positions_of_the_model_are_mapped_to_pixels_by_the_track() -> None:
 
 
 def test_an_edge_is_drawn_across_the_axis() -> None:
-    assert view().across(20.0) == ((120.0, 120.0), (60.0, 40.0))
-    (xs, ys) = view(angle=np.pi / 2).across(20.0)
+    assert view().across(20.0, 4) == ((120.0, 120.0), (60.0, 40.0))
+    (xs, ys) = view(angle=np.pi / 2).across(20.0, 4)
     np.testing.assert_allclose(xs, (90.0, 110.0))
     np.testing.assert_allclose(ys, (70.0, 70.0))
 
 
 def test_an_edge_follows_a_shaken_picture() -> None:
-    assert view().across(20.0, 3) == view().across(22.0)
-    assert view().across(20.0, 4) == view().across(20.0)
+    assert view().across(20.0, 3) == view().across(22.0, 4)
 
 
 def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campaign, tmp_path: Path) -> None:
@@ -303,7 +295,7 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
     results.analysed(trial.name).write_text(json.dumps({"axis": bent}))
     found = recording_view(results, trial)
     assert isinstance(found, RecordingView)
-    (x0, x1), (y0, y1) = found.across(0.5 * found.axis.length_px)
+    (x0, x1), (y0, y1) = found.across(0.5 * found.axis.length_px, 0)
     middle, direction = found.axis.points(0.5 * found.axis.length_px), np.array([y0 - y1, x1 - x0]) / 30
     assert np.allclose([(x0 + x1) / 2, (y0 + y1) / 2], middle)
     assert np.allclose(direction, found.axis.direction_at(0.5 * found.axis.length_px), atol=1e-9)

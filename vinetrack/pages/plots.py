@@ -342,9 +342,7 @@ class Plots:
             "ys": [1e3 * (model.predicted_position_m - trial.origin_m)[trial.rows] for trial, model in drawn],
         }
 
-    def _error_bars(
-        self, now_m: Errors, before_m: Errors, floors_m: Errors, conditions: Sequence[str]
-    ) -> dict[str, list[Any]]:
+    def _error_bars(self, now_m: Errors, before_m: Errors, floors_m: Errors, conditions: Sequence[str]) -> Columns:
         """One row per condition, the first at the bottom, mm; those not in `conditions` are faint."""
         names = list(reversed(self.campaign.conditions))
         errors = {"now": now_m, "before": before_m, "floor": floors_m}
@@ -409,7 +407,6 @@ class Plots:
 # A recording is decoded once, in the background, and its frames are kept as JPEG no wider than the page shows them: one
 # second of a high-speed camera takes a few tens of megabytes.
 
-
 # Name, colour over a grey picture, and line of each edge that is drawn
 EDGES = (("tracked", "#56B4E9", "solid"), ("comparison", "#E69F00", "dotted"), ("model", "#D55E00", "dashed"))
 
@@ -443,11 +440,9 @@ class RecordingView:
         outside = (lead_position_m < position[0]) | (lead_position_m > position[-1])
         return np.where(outside, offset + scale * lead_position_m, np.interp(lead_position_m, position, along))
 
-    def across(self, along_px: float, frame: int | None = None) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return the ends of a line across the vine at a position along the axis; with `frame`, in that picture.
-        Returns xs, ys : of both ends, px.
-        """
-        if frame is not None and frame < self.shake_px.size:
+    def across(self, along_px: float, frame: int) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return xs and ys of the ends of a line across the vine at a position along the axis, px of one picture."""
+        if frame < self.shake_px.size:
             along_px += float(self.shake_px[frame])
         half = self.half_width_px
         (x0, y0), (x1, y1) = self.axis.points(np.full(2, along_px), np.array([half, -half]))
@@ -572,9 +567,9 @@ class FilmPanel:
         )
         fig.axis.visible = False
         fig.grid.visible = False
-        self._mapper = LinearColorMapper(palette=list(Greys256), low=0, high=255)
+        greys = LinearColorMapper(palette=list(Greys256), low=0, high=255)
         self._image = fig.image(
-            "image", source=self._picture, x=-0.5, y=-0.5, dw=1, dh=1, color_mapper=self._mapper, level="image"
+            "image", source=self._picture, x=-0.5, y=-0.5, dw=1, dh=1, color_mapper=greys, level="image"
         )
         fig.multi_line("xs", "ys", source=self._edges, line_color="black", line_width=4.5, line_alpha=0.45)
         fig.multi_line("xs", "ys", source=self._edges, line_color="colour", line_width=2.6, line_dash={"field": "dash"})
