@@ -1,4 +1,4 @@
-"""The controls of one page: the trials shown, the effects in the model with their sizes, and saving."""
+"""The controls of one page: the trials shown, the effects in the model with their sizes, and the proposal of one."""
 
 from __future__ import annotations
 
