@@ -15,12 +15,11 @@ import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.simulate import SimulationError, simulate
-from vinetrack.inference import solving
 from vinetrack.inference.fit import fit_subset
 from vinetrack.inference.fit_data import FitError, prepare_trial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import MATTERS, film_influence, film_messages
-from vinetrack.inference.optimiser import FixedTerms, Solution, Step, make_problem, solve
+from vinetrack.inference.optimiser import Step
 from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.inference.sensitivity import Predictor
 
@@ -57,27 +56,6 @@ def ball(seed: int, first_frame: int = 0, count: int = 120) -> tuple[Trial, Trac
     time_s = np.arange(first_frame, first_frame + count) / 240
     fallen = 0.5 * 9.80665 * np.maximum(time_s - 0.0513, 0) ** 2
     return trial, as_track(time_s, 0.02 + fallen + 2e-4 * draw.standard_normal(count))
-
-
-def test_misfit_absorbed_as_slow_noise_is_recovered_by_the_likelihood(
-    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Parameters are slightly wrong and the whole misfit is absorbed as slow noise: not a maximum of the likelihood."""
-    fit, pairs, _ = campaign
-
-    def stuck(predictor: Predictor, *_: object, **__: object) -> Solution:
-        off = fit.solution.state.theta + 0.001
-        variance = np.full(len(pairs), (2e-3) ** 2 * (1 - 0.9998**2))
-        state = replace(fit.solution.state, theta=off, spread=(1e-5, 1e-5), rho=0.9998, variance=variance)
-        slow = FixedTerms(spread=(1e-5, 1e-5), noise=(0.9998, variance))
-        solution = solve(predictor, make_problem(predictor, state.trial_effects), state, slow, most_iterations=0)
-        assert not solving.is_poor_fit(predictor, solution)
-        return solution
-
-    monkeypatch.setattr(solving, "solve_from", stuck)
-    again = vt.fit(vt.base_model(), pairs, profile=False)
-    assert again.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.1)
-    assert again.noise_correlation == pytest.approx(fit.noise_correlation, abs=0.01)
 
 
 def test_the_parameters_of_a_campaign_are_estimated_within_their_errors(campaign: Campaign) -> None:
@@ -509,16 +487,6 @@ def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(whole: Fit, pairs
     other = next(pair for pair in pairs if pair[0].vine != stays)
     with pytest.raises(FitError):
         vt.predict(alone, [other])
-
-
-def test_a_fixed_parameter_stays(whole: Fit, pairs: Pairs) -> None:
-    stays = pairs[0][0].vine
-    names = [trial.name for trial in whole.trials if trial.trial.vine == stays]
-    held = fit_subset(whole, names, held=["eversion_damping.n", f"yield_pressure.P_y[{stays}]"])
-    assert held["n"].value == whole["n"].value
-    assert held[f"yield_pressure.P_y[{stays}]"].value == whole[f"yield_pressure.P_y[{stays}]"].value
-    free = fit_subset(whole, names)
-    assert held[f"eversion_damping.B[{stays}]"].sigma < 0.8 * free[f"eversion_damping.B[{stays}]"].sigma
 
 
 def test_variance_components_can_be_fixed(whole: Fit) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from vinetrack.inference import trial_effects
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.solving import log_likelihood
 from vinetrack.inference.trial_effects import (
     products_at_releases,
     residuals_in,
@@ -49,7 +47,7 @@ def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion:
     own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
     elsewhere = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms(), warm=True)
     found = vt.refit(replace(only_in_motion, solution=elsewhere))
-    assert log_likelihood(found.solution) == pytest.approx(log_likelihood(solution), abs=0.5)
+    assert found.solution.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
     assert np.isfinite(found["n"].sigma)
 
 
@@ -89,10 +87,10 @@ def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motio
     theta = solution.state.theta.copy()
     theta[0] += 0.3
     start = replace(solution.state, theta=theta)
-    led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, shortfall=lambda *_: 0.0)
+    led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, goal=solution.log_likelihood() - 1)
     assert led.converged
-    assert log_likelihood(led) == pytest.approx(log_likelihood(solution), abs=0.5)
-    given_up = solve(predictor, solution.problem, start, FixedTerms(), warm=True, shortfall=lambda *_: math.inf)
+    assert led.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
+    given_up = solve(predictor, solution.problem, start, FixedTerms(), warm=True, goal=1e9)
     assert not given_up.converged
     assert given_up.iterations < led.iterations
 

@@ -33,7 +33,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, Fit
-from vinetrack.inference.trial_effects import subset_predictor, subset_problem, subset_state
+from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.discriminating_design import (
     NEW_VINE,
     OTHER_RIG,
@@ -483,12 +483,11 @@ def _prior_precision(tests: MisfitTests, n_effects: int) -> Floats:
 def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:
     """The same tests for some of the trials, which may be repeated."""
     rows, fit, solution = np.array(indices), tests.fit, tests.fit.solution
-    places = np.arange(solution.problem.prior_mean.size)
-    predictor = subset_predictor(fit.predictor, rows, places)
+    predictor, problem, (state,) = subset(fit.predictor, solution.problem, rows, solution.state, every_parameter=True)
     solution = replace(
         solution,
-        state=subset_state(solution.state, rows, places),
-        problem=subset_problem(solution.problem, predictor.layout, rows, places),
+        state=state,
+        problem=problem,
         cross_products=solution.cross_products[rows],
         columns=tuple(solution.columns[row] for row in rows),
     )

@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +28,10 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
-from vinetrack.inference.marginal_likelihood import FitState, inverse_of_block, trial_deviation_sd
+from vinetrack.inference.marginal_likelihood import FitState, inverse_of_block, matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import MOST_ITERATIONS, POOR_FIT, FixedTerms, Solution, Watch, solve
 from vinetrack.inference.position_errors import pool, position_shapes, student, trial_information
-from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA, matrix_root
+from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -53,13 +53,7 @@ from vinetrack.inference.solving import (
     trial_fit,
     with_fitted_trace_errors,
 )
-from vinetrack.inference.trial_effects import (
-    Indices,
-    parameters_of_trials,
-    subset_predictor,
-    subset_problem,
-    subset_state,
-)
+from vinetrack.inference.trial_effects import Indices, subset
 from vinetrack.inference.whitening import all_products, at_correlation, whiten
 
 if TYPE_CHECKING:
@@ -73,36 +67,30 @@ if TYPE_CHECKING:
 #
 #     e = M (X δθ + X u + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
 #
-# δθ is the error of the shared parameters, u the difference of the trial's parameters from those (`inference.pooling`),
-# d
-# its deviations of pressure and B, s errors that replicates do not show (smooth errors of position, 30 Pa of a set
-# pressure) and ε noise of covariance K, which includes the misfit of the model along each trial, since the noise of a
-# fit
-# is that of its residuals. The variance at a time is the diagonal of
+# δθ is the error of the shared parameters, u the difference of the trial's parameters from those
+# (`position_errors.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
+# position, 30 Pa of a set pressure) and ε noise of covariance K, which includes the misfit of the model along each
+# trial, since the noise of a fit is that of its residuals. The variance at a time is the diagonal of
+#
+#     M (X Cov(δθ + u) Xᵀ + Z Cov(d) Zᵀ + S Sᵀ + K) Mᵀ + δ² ℓ²
 #
 # with ℓ the travel of the trial. δ is the discrepancy of the model between trials (Kennedy & O'Hagan, J. R. Stat. Soc.
-# B
-# 63, 425, 2001), one standard deviation along the whole motion. It is chosen so that the trials of the fit, each left
-# out
-# in turn to first order, have the residuals that their bands predict (Paule & Mandel, J. Res. NBS 87, 377, 1982); 0
-# where
-# they have less.
+# B 63, 425, 2001), one standard deviation along the whole motion. It is chosen so that the trials of the fit, each left
+# out in turn to first order, have the residuals that their bands predict (Paule & Mandel, J. Res. NBS 87, 377, 1982);
+# 0 where they have less.
 
 # A trial counts as covered where this part of its positions is, and a band has to cover this part of trials (chosen)
 COVERED_POSITIONS, COVERAGE = 0.9, 0.95
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Calibration of the bands by the trials of a fit, each predicted from the others. `discrepancy` is δ, relative to
-    the travel; `reach` the half width of the band in standard deviations; `degrees` are Student's; `trials` is the
-    number of trials that could be predicted.
+class Calibration(NamedTuple):
+    """Calibration of the bands by the trials of a fit, each predicted from the others: δ, relative to the travel; the
+    half width of the band in standard deviations; Student's degrees of freedom.
     """
 
     discrepancy: float
     reach: float
     degrees: float
-    trials: int
 
 
 @dataclass(frozen=True)
@@ -120,7 +108,7 @@ class _Basis:
 def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
     """Predicted trials with the half width of their 95 % bands. Shape (n_points,)."""
     basis = _pooled_basis(fit)
-    calibration_of_fit = _calibrated(fit, basis)
+    calibration = _calibrated(fit, basis)
     banded = []
     for trial_data, trial in zip(data, predicted, strict=True):
         try:
@@ -128,9 +116,9 @@ def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]
         except SimulationError:
             banded.append(trial)
             continue
-        discrepancy_variance = (calibration_of_fit.discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
+        discrepancy_variance = (calibration.discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
         sigma = np.sqrt(np.sum(loadings**2, axis=1) + random + discrepancy_variance)
-        reach = max(calibration_of_fit.reach, _simultaneous(loadings / sigma[:, None], calibration_of_fit.degrees))
+        reach = max(calibration.reach, _simultaneous(loadings / sigma[:, None], calibration.degrees))
         banded.append(replace(trial, band_m=reach * sigma))
     return banded
 
@@ -147,16 +135,9 @@ def _simultaneous(loadings: Floats, degrees: float) -> float:
     return float(np.quantile(np.quantile(curves, COVERED_POSITIONS, axis=0), COVERAGE))
 
 
-def calibration(fit: Fit) -> Calibration:
-    """Calibration of the prediction bands by the trials of a fit, each predicted from the others."""
-    return _calibrated(fit, _pooled_basis(fit))
-
-
 def _pooled_basis(fit: Fit) -> _Basis:
-    count = len(fit.numbers)
-    pooled = None
-    if fit.between is not None and fit.between.any():
-        pooled = pool(fit.predictor, fit.solution, count)
+    disagree = fit.between is not None and fit.between.any()
+    pooled = pool(fit.predictor, fit.solution, len(fit.numbers)) if disagree else None
     if pooled is not None:
         return _Basis(pooled.solution, pooled.information, pooled.scores, pooled.between)
     size = fit.solution.problem.prior_mean.size
@@ -170,7 +151,7 @@ def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
     predictable = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
     if not predictable:
         # 1.96: derived: standard normal quantile of 0.975
-        return Calibration(0.0, 1.96, math.inf, 0)
+        return Calibration(0.0, 1.96, math.inf)
     square = np.array([np.mean(residual**2) for _, residual, _ in predictable])
     mean_variance = np.array([np.mean(variance) for *_, variance in predictable])
     travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in predictable])
@@ -187,7 +168,7 @@ def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
     )
     enough = min(math.ceil(COVERAGE * (len(predictable) + 1)), len(predictable))
     reach = max(float(student(np.array([degrees]))[0]), float(reaches[enough - 1]))
-    return Calibration(math.sqrt(delta2), reach, degrees, len(predictable))
+    return Calibration(math.sqrt(delta2), reach, degrees)
 
 
 def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
@@ -222,7 +203,8 @@ def _leave_one_out(basis: _Basis, trial_data: FitTrial, i: int, fit_correlation:
     design = _design_matrix(columns, problem.index[i], size)
     shift = covariance @ (basis.scores[i] - basis.scores.mean(axis=0))
     residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
-    own_loadings = _deviation_loadings(_deviation_sd(solution, i), columns, trial_data)
+    own_sd = trial_deviation_sd(problem, state.spread)[i] * problem.has_deviation[i]
+    own_loadings = _deviation_loadings(own_sd, columns, trial_data)
     loadings = np.column_stack([design @ matrix_root(covariance + basis.between), own_loadings])
     noise = float(state.variance[i]) / (1 - state.rho**2)
     aligned, random, residual = _with_release_and_origin_fitted(
@@ -236,13 +218,6 @@ def _design_matrix(columns: Floats, index: np.ndarray, size: int) -> Floats:
     design = np.zeros((len(columns), size + 1))
     np.add.at(design.T, index, columns[:, N_TRIAL_EFFECTS:-1].T)
     return design[:, :size]
-
-
-def _deviation_sd(solution: Solution, i: int) -> Floats:
-    """Standard deviations of the deviations of pressure and ln B of one trial, shape (2,), 0 where it has none."""
-    return np.asarray(
-        trial_deviation_sd(solution.problem, solution.state.spread)[i] * solution.problem.has_deviation[i]
-    )
 
 
 def _deviation_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floats:
@@ -362,28 +337,17 @@ def fit_subset(
     fit: Fit,
     keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_],
     *,
-    held: Iterable[str] = (),
     hold_spreads: bool = False,
     hold_noise: bool = False,
     most_iterations: int = MOST_ITERATIONS,
 ) -> Fit:
     """Fit the same model to some of the trials of a fit, starting from its solution."""
     rows = _rows(fit, keep)
-    places = parameters_of_trials(fit.predictor.layout, rows)
-    predictor = subset_predictor(fit.predictor, rows, places)
-    state = subset_state(fit.state, rows, places)
-    problem = subset_problem(fit.solution.problem, predictor.layout, rows, places)
-    names = set(held)
-    free = [not names & {number.name, number.key} for number in predictor.layout.free]
-    problem = replace(problem, free=problem.free & np.array(free, dtype=bool))
-    # The numbers of a fit include their change by smooth errors of position; its state does not.
-    reported = {number.name: number.value for number in fit.numbers}
-    theta_with_fixed = [
-        number.to_scaled(reported[number.name]) if not is_free and number.name in reported else theta
-        for number, is_free, theta in zip(predictor.layout.free, free, state.theta, strict=True)
-    ]
-    state = replace(state, theta=np.array(theta_with_fixed, dtype=float))
-    fixed_terms = _fixed_terms_of(fit, rows)
+    predictor, problem, (state,) = subset(fit.predictor, fit.solution.problem, rows, fit.state)
+    fixed_terms: FixedTerms = fit.options.get("held", FixedTerms())
+    if fixed_terms.noise is not None:
+        rho, variance = fixed_terms.noise
+        fixed_terms = replace(fixed_terms, noise=(rho, variance[rows]))
     fixed_terms = FixedTerms(
         state.spread if hold_spreads else fixed_terms.spread,
         (state.rho, state.variance) if hold_noise else fixed_terms.noise,
@@ -411,15 +375,6 @@ def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) ->
     if not rows.size:
         raise FitError("No trial is left to fit: keep one at least.")
     return rows
-
-
-def _fixed_terms_of(fit: Fit, rows: Indices) -> FixedTerms:
-    """The variance components that the user fixed, for these trials."""
-    fixed_terms: FixedTerms = fit.options.get("held", FixedTerms())
-    if fixed_terms.noise is None:
-        return fixed_terms
-    rho, variance = fixed_terms.noise
-    return replace(fixed_terms, noise=(rho, variance[rows]))
 
 
 # ------------------------------------------------------------------------------
@@ -451,7 +406,7 @@ def _predicted(
     predictor: Predictor, trial_effects: Floats, square: Floats, rho: float, variance: float
 ) -> list[TrialFit]:
     try:
-        trajectories = predictor.run(predictor.jobs(np.empty(0), trial_effects))
+        trajectories = predictor.trajectories_at(np.empty(0), trial_effects)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     sigma = np.zeros((len(predictor.data), N_TRIAL_EFFECTS))
@@ -626,23 +581,24 @@ def fit(
 
 def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
     """Refuse a model in which no trial is driven: it has no trajectories to compare with the tracks."""
-    trajectories = predictor.run(predictor.jobs(solution.state.theta, solution.state.trial_effects))
+    trajectories = predictor.trajectories_at(solution.state.theta, solution.state.trial_effects)
     # 1e-9: travel below which a simulated trial counts as standing still (derived)
     if any(float(np.ptp(trajectory.observed_position_m)) > 1e-9 for trajectory in trajectories):
         return
     model = " + ".join(predictor.layout.model.names)
-    angles = sorted({round(math.degrees(trial_data.trial.growth_angle_rad)) for trial_data in predictor.data})
-    pressures = sorted({round(trial_data.trial.pressure_Pa / 1e3, 1) for trial_data in predictor.data})
-    angle, pressure = (_range_in_words(values) for values in (angles, pressures))
+    trials = [trial_data.trial for trial_data in predictor.data]
+    angle, pressure = (
+        f"{min(values):g}" if min(values) == max(values) else f"{min(values):g} to {max(values):g}"
+        for values in (
+            [round(math.degrees(trial.growth_angle_rad)) for trial in trials],
+            [round(trial.pressure_Pa / 1e3, 1) for trial in trials],
+        )
+    )
     raise FitError(
         f"The model {model} moves no trial: at a growth angle of {angle}° and {pressure} kPa nothing in it drives"
         " them. Check growth_angle_deg (0 is straight down), pressure_kPa and yield_pressure_kPa, or add the effect"
         " that drives them to `model:`."
     )
-
-
-def _range_in_words(values: Sequence[float]) -> str:
-    return f"{values[0]:g}" if values[0] == values[-1] else f"{values[0]:g} to {values[-1]:g}"
 
 
 def refit(
@@ -748,35 +704,18 @@ def refit(
         previous_state.spread if hold_spreads else None,
         (previous_state.rho, previous_state.variance) if hold_noise else None,
     )
+    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch, "search": not thorough}
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))
-            solution = solve_from(
-                predictor,
-                theta,
-                trial_effects,
-                fixed_terms,
-                most_iterations=most_iterations,
-                watch=watch,
-                search=not thorough,
-            )
+            solution = solve_from(predictor, theta, trial_effects, fixed_terms, **how)
         else:
-            solution = solve_onward(
-                predictor,
-                before.solution,
-                theta,
-                fixed_terms,
-                most_iterations=most_iterations,
-                watch=watch,
-                search=not thorough,
-            )
+            solution = solve_onward(predictor, before.solution, theta, fixed_terms, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
     if led:
         solution = solve_again(predictor, solution, fixed_terms, watch, thorough=thorough, goal=goal)
-    predictor, solution = with_fitted_trace_errors(
-        predictor, solution, fixed_terms, most_iterations=most_iterations, watch=watch, search=not thorough
-    )
+    predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, **how)
     fitted = assemble(
         predictor,
         solution,

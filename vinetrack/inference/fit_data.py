@@ -324,6 +324,8 @@ def pairs_of(
     trial).
     """
     from vinetrack.experiment.folder import Experiment, read_experiment
+    from vinetrack.tracks.frame_timing import correct_frames
+    from vinetrack.tracks.importers import TrackError, load_track
 
     if isinstance(experiment, (str, Path)):
         experiment = read_experiment(experiment)
@@ -334,24 +336,14 @@ def pairs_of(
         if tracks is not None and trial.name in tracks:
             pairs.append((trial, tracks[trial.name]))
             continue
+        if trial.track is None:
+            left_out[trial.name] = "its recording has not been tracked: run snakemake, or give its track"
+            continue
         try:
-            pairs.append((trial, _read(trial)))
-        except FitError as error:
+            pairs.append((trial, correct_frames(load_track(trial))))
+        except TrackError as error:
             left_out[trial.name] = str(error)
     return pairs, left_out
-
-
-def _read(trial: Trial) -> Track:
-    """The track of an experiment, with repeated and dropped frames corrected."""
-    from vinetrack.tracks.frame_timing import correct_frames
-    from vinetrack.tracks.importers import TrackError, load_track
-
-    if trial.track is None:
-        raise FitError("its recording has not been tracked: run snakemake, or give its track")
-    try:
-        return correct_frames(load_track(trial))
-    except TrackError as error:
-        raise FitError(str(error)) from error
 
 
 # ------------------------------------------------------------------------------

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -128,7 +129,17 @@ class ParameterMap:
 
     def values(self, theta: Floats) -> Floats:
         """Values, SI, of scaled parameters. Shapes: theta (n_free,) → (n_free,)."""
-        return np.array([number.from_scaled(float(scaled)) for number, scaled in zip(self.free, theta, strict=True)])
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta * self.scales)
+
+    @cached_property
+    def logarithmic(self) -> NDArray[np.bool_]:
+        """Free parameters that are scaled as logarithms, shape (n_free,)."""
+        return np.array([number.logarithmic for number in self.free], dtype=bool)
+
+    @cached_property
+    def scales(self) -> Floats:
+        """Scales of the free parameters, shape (n_free,)."""
+        return np.array([number.scale for number in self.free])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
         """Model parameters and yield pressures of every trial for scaled parameters. Returns rows, yields (naN where
@@ -212,7 +223,12 @@ def make_layout(
     for term in between:
         members = [group for group in dict.fromkeys(term.groups) if group]
         place = {group: len(numbers) + i for i, group in enumerate(members)} | {"": -1}
-        numbers += [_between_coefficient(term, group) for group in members]
+        numbers += [
+            FreeParameter(
+                term.key, group, term.symbol, term.unit, 0.0, -math.inf, math.inf, term.scale, prior_sd=term.prior_sd
+            )
+            for group in members
+        ]
         keys, index = [*keys, term.key], np.column_stack([index, [place[group] for group in term.groups]])
     return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base, tuple(between))
 
@@ -231,20 +247,6 @@ def group_names(trials: Sequence[Trial], shared: str) -> list[str]:
     """Names of the groups of trials that share a parameter."""
     names = list(dict.fromkeys(groups_of(trials, shared)))
     return sorted(names, key=lambda name: (len(name), name)) if shared == "day" else names
-
-
-def _between_coefficient(term: BetweenTerm, group: str) -> FreeParameter:
-    return FreeParameter(
-        key=term.key,
-        vine=group,
-        symbol=term.symbol,
-        unit=term.unit,
-        start=0.0,
-        lower=-math.inf,
-        upper=math.inf,
-        scale=term.scale,
-        prior_sd=term.prior_sd,
-    )
 
 
 def _find_name(name: str, names: Sequence[str]) -> str:
@@ -309,6 +311,14 @@ def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[FreePa
     return numbers, column
 
 
+NUMBER_KEYS = {
+    "parameter": "key", "vine": "vine", "symbol": "symbol", "unit": "unit", "value": "value", "sigma": "sigma",
+    "low_95": "low", "high_95": "high", "interval": "method", "bound": "bound", "lower_bound": "lower",
+    "upper_bound": "upper",
+}  # fmt: skip
+"""Keys of a number in the files, and the fields that they hold."""
+
+
 @dataclass(frozen=True)
 class Number:
     """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval. `vine` is blank if the
@@ -342,20 +352,7 @@ class Number:
 
     def to_json(self) -> dict[str, Any]:
         """As `fit.json` and `diagnosis.json` hold it, SI."""
-        return {
-            "parameter": self.key,
-            "vine": self.vine,
-            "symbol": self.symbol,
-            "unit": self.unit,
-            "value": self.value,
-            "sigma": self.sigma,
-            "low_95": self.low,
-            "high_95": self.high,
-            "interval": self.method,
-            "bound": self.bound,
-            "lower_bound": self.lower,
-            "upper_bound": self.upper,
-        }
+        return {key: getattr(self, name) for key, name in NUMBER_KEYS.items()}
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Number:
@@ -442,8 +439,20 @@ class TrialFit:
 class NumberTable:
     """Access to the numbers of a fit and their covariance, common to a fit in memory and one read from a file."""
 
+    names: tuple[str, ...]
     numbers: tuple[Number, ...]
     covariance: Floats
+    messages: tuple[str, ...]
+    trials: Collection[Any]
+
+    @property
+    def heading(self) -> str:
+        """The model and the number of trials, in words."""
+        return f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
+
+    def _repr_html_(self) -> str:
+        head = ("", "value", "standard error", "95 % interval", "unit")
+        return html_table(head, [number_row(number) for number in self.numbers], self.heading, self.messages)
 
     def __getitem__(self, name: str) -> Number:
         """The number of this name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique."""
@@ -510,7 +519,7 @@ class Fit(NumberTable):
         return {trial.name: trial for trial in self.trials}[name]
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the effects of the model, in order."""
         return self.model.names
 
@@ -539,15 +548,9 @@ class Fit(NumberTable):
     def __repr__(self) -> str:
         return f"Fit({' + '.join(self.model.names)}; {len(self.trials)} trials)"
 
-    def _repr_html_(self) -> str:
-        title = f"{' + '.join(self.model.names)}, fitted to {len(self.trials)} trials"
-        head = ("", "value", "standard error", "95 % interval", "unit")
-        return html_table(head, [number_row(number) for number in self.numbers], title, self.messages)
-
     def __str__(self) -> str:
         points = sum(trial.time_s.size for trial in self.trials)
-        head = f"{' + '.join(self.model.names)}, fitted to {len(self.trials)} trials ({points} positions)"
-        return "\n".join([head, *numbers_text(self)])
+        return "\n".join([f"{self.heading} ({points} positions)", *numbers_text(self)])
 
 
 def numbers_text(fit: Any) -> list[str]:
@@ -627,23 +630,15 @@ def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
         }
         if steady and B and n_steady is not None:
             difference = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
-            row["z"] = _deviate(difference, _steady_covariance(damping, vine) + _trajectory_covariance(fit, B.name))
+            # Covariances of n and ln B of the vine.
+            names = damping["covariance"]["parameters"]
+            k = [names.index("n"), names.index(f"ln B {vine}")]
+            of_steady = np.array(damping["covariance"]["matrix"], dtype=float)[np.ix_(k, k)]
+            k, slopes = [fit.numbers.index(n), fit.numbers.index(B)], np.array([1.0, 1 / B.value])
+            of_trajectories = fit.covariance[np.ix_(k, k)] * slopes[:, None] * slopes
+            row["z"] = _deviate(difference, of_steady + of_trajectories)
         rows.append(row)
     return pd.DataFrame(rows, columns=list(CHECK_COLUMNS))
-
-
-def _steady_covariance(damping: Mapping[str, Any], vine: str) -> Floats:
-    """Covariance of n and ln B of one vine from steady windows."""
-    names = damping["covariance"]["parameters"]
-    k = [names.index("n"), names.index(f"ln B {vine}")]
-    return np.array(damping["covariance"]["matrix"], dtype=float)[np.ix_(k, k)]
-
-
-def _trajectory_covariance(fit: Fit, name: str) -> Floats:
-    """Covariance of n and ln B from the trajectories."""
-    k = [fit.numbers.index(fit[EXPONENT]), fit.numbers.index(fit[name])]
-    slopes = np.array([1.0, 1 / fit[name].value])
-    return np.asarray(fit.covariance[np.ix_(k, k)] * slopes[:, None] * slopes)
 
 
 def _deviate(difference: Floats, covariance: Floats) -> float:

@@ -1,6 +1,6 @@
 """The summary of a fit that `fit.json` stores: all quoted results, without the data and state behind them.
 
-`vinetrack.inference.fit_summary` makes it from a fit in memory and `FitSummary.from_json` from a file, so that the
+`summary_of` makes it from a fit in memory and `FitSummary.from_json` from a file, so that the
 keys of the file are defined here alone.
 """
 
@@ -17,9 +17,9 @@ from vinetrack.core.notebook import html_table
 from vinetrack.core.records import Floats
 from vinetrack.core.units import display_unit, or_nan
 from vinetrack.dynamics.model import Value, values_by_key
-from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, number_row, numbers_text
+from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, numbers_text
 from vinetrack.inference.position_errors import with_smooth_errors
-from vinetrack.inference.robust_covariance import FILM_ERROR, film_errors, parameter_shifts
+from vinetrack.inference.robust_covariance import FILM_ERROR, film_errors, sandwich
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,7 +61,7 @@ def film_influence(fit: Fit) -> Floats:
     if FILM in fit.model:
         return np.zeros(len(fit.numbers))
     errors = film_errors(fit.predictor, fit.solution, fit.trials)
-    moved = parameter_shifts(fit.predictor, with_smooth_errors(fit), errors)[: len(fit.numbers)]
+    moved = sandwich(fit.predictor, with_smooth_errors(fit), errors)[2][: len(fit.numbers)]
     free = fit.predictor.layout.free
     slopes = np.array([each.derivative(number.value) for each, number in zip(free, fit.numbers, strict=True)])
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)
@@ -88,6 +88,10 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[str, ...]:
     )
 
 
+SCALARS = ("noise_m", "noise_correlation", "chi2_per_dof", "log_likelihood")
+KEYS = {"names": "model", "between": "between_trials"}  # Where a key of the file is not the name of the field
+
+
 @dataclass(frozen=True)
 class TrialEstimates:
     """What a fit estimated for one trial; deviations are relative, of the set pressure and of the vine's B."""
@@ -110,8 +114,11 @@ class FitSummary(NumberTable):
     """
 
     names: tuple[str, ...]
+    refused: str = ""
     numbers: tuple[Number, ...] = ()
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    between: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    moved_by_film: Floats = field(default_factory=lambda: np.empty(0))
     spreads: Mapping[str, BetweenTrialSpread] = field(default_factory=dict)
     noise_m: float = math.nan
     noise_correlation: float = math.nan
@@ -122,9 +129,6 @@ class FitSummary(NumberTable):
     warnings: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
     trials: Mapping[str, TrialEstimates] = field(default_factory=dict)
-    refused: str = ""
-    between: Floats = field(default_factory=lambda: np.empty((0, 0)))
-    moved_by_film: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def fitted_values(self) -> dict[str, Value]:
@@ -145,17 +149,10 @@ class FitSummary(NumberTable):
         content: dict[str, Any] = {"model": list(self.names), "refused": self.refused or None}
         if self.refused:
             return content
+        content |= {KEYS.get(entry.name, entry.name): getattr(self, entry.name) for entry in fields(self)[2:]}
         return content | {
             "numbers": [number.to_json() for number in self.numbers],
-            "covariance": self.covariance,
-            "between_trials": self.between,
-            "moved_by_film": self.moved_by_film,
             "spreads": {name: asdict(spread) for name, spread in self.spreads.items()},
-            "noise_m": self.noise_m,
-            "noise_correlation": self.noise_correlation,
-            "chi2_per_dof": self.chi2_per_dof,
-            "log_likelihood": self.log_likelihood,
-            "converged": self.converged,
             "messages": list(self.messages),
             "warnings": list(self.warnings),
             "left_out": dict(self.left_out),
@@ -166,23 +163,23 @@ class FitSummary(NumberTable):
     def from_json(cls, content: Mapping[str, Any]) -> FitSummary:
         """Read what `to_json` wrote; unknown numbers are NaN."""
         numbers = tuple(Number.from_json(entry) for entry in content.get("numbers") or ())
-        matrix, between = (
-            [[or_nan(cell) for cell in row] for row in content.get(key) or ()]
+        covariance, between = (
+            np.array([[or_nan(cell) for cell in row] for row in content.get(key) or ()], dtype=float)
             for key in ("covariance", "between_trials")
         )
         keys = [entry.name for entry in fields(TrialEstimates)]
         return cls(
             names=tuple(content.get("model") or ()),
+            refused=str(content.get("refused") or ""),
             numbers=numbers,
-            covariance=np.array(matrix, dtype=float) if matrix else np.full((len(numbers), len(numbers)), math.nan),
+            covariance=covariance if covariance.size else np.full((len(numbers), len(numbers)), math.nan),
+            between=between if between.size else np.empty((0, 0)),
+            moved_by_film=np.array([or_nan(cell) for cell in content.get("moved_by_film") or ()]),
             spreads={
                 str(name): BetweenTrialSpread(or_nan(spread["value"]), bool(spread["estimated"]))
                 for name, spread in (content.get("spreads") or {}).items()
             },
-            noise_m=or_nan(content.get("noise_m")),
-            noise_correlation=or_nan(content.get("noise_correlation")),
-            chi2_per_dof=or_nan(content.get("chi2_per_dof")),
-            log_likelihood=or_nan(content.get("log_likelihood")),
+            **{name: or_nan(content.get(name)) for name in SCALARS},
             converged=bool(content.get("converged")),
             messages=tuple(content.get("messages") or ()),
             warnings=tuple(content.get("warnings") or ()),
@@ -191,9 +188,6 @@ class FitSummary(NumberTable):
                 str(name): TrialEstimates(*(or_nan(estimates.get(key)) for key in keys))
                 for name, estimates in (content.get("trials") or {}).items()
             },
-            refused=str(content.get("refused") or ""),
-            between=np.array(between, dtype=float) if between else np.empty((0, 0)),
-            moved_by_film=np.array([or_nan(cell) for cell in content.get("moved_by_film") or ()]),
         )
 
     def __repr__(self) -> str:
@@ -203,15 +197,12 @@ class FitSummary(NumberTable):
     def _repr_html_(self) -> str:
         if self.refused:
             return html_table((), (), f"{' + '.join(self.names)} was not fitted: {self.refused}")
-        head = ("", "value", "standard error", "95 % interval", "unit")
-        title = f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
-        return html_table(head, [number_row(number) for number in self.numbers], title, self.messages)
+        return super()._repr_html_()
 
     def __str__(self) -> str:
         if self.refused:
             return f"{' + '.join(self.names)} was not fitted: {self.refused}"
-        head = f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
-        return "\n".join([head, *numbers_text(self)])
+        return "\n".join([self.heading, *numbers_text(self)])
 
 
 # ------------------------------------------------------------------------------
@@ -226,16 +217,13 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
         names=tuple(fit.model.names),
         numbers=fit.numbers,
         covariance=fit.covariance,
+        between=np.zeros_like(fit.covariance) if fit.between is None else fit.between,
+        moved_by_film=moved,
         spreads=fit.spreads,
-        noise_m=fit.noise_m,
-        noise_correlation=fit.noise_correlation,
-        chi2_per_dof=fit.chi2_per_dof,
-        log_likelihood=fit.log_likelihood,
+        **{name: getattr(fit, name) for name in SCALARS},
         converged=fit.converged,
         messages=(*fit.messages, *film_messages(fit.numbers, moved), *further_messages),
         warnings=tuple(warnings),
         left_out=fit.left_out,
         trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
-        between=np.zeros_like(fit.covariance) if fit.between is None else fit.between,
-        moved_by_film=moved,
     )

@@ -163,20 +163,18 @@ def _with_rounding(places: Floats, values_Pa: Floats) -> Readings:
 
 
 def _resolution(pressure_Pa: Floats) -> float:
-    """Resolution of pressures, Pa: the largest step of which they are all multiples; 0 without one."""
-    return _common_divisor(pressure_Pa, EXACT_TOLERANCE * float(np.max(np.abs(pressure_Pa))))
-
-
-def _common_divisor(values: Floats, exact: float) -> float:
-    """Largest number that divides all differences of values to within `exact`, by Euclid's algorithm; 0 if none."""
-    remainders = np.unique(np.abs(values - values[0]))
-    remainders = remainders[remainders > exact]
+    """Resolution of pressures, Pa: the largest step of which they are all multiples, to within EXACT_TOLERANCE, by
+    Euclid's algorithm; 0 without one.
+    """
+    exact_Pa = EXACT_TOLERANCE * float(np.max(np.abs(pressure_Pa)))
+    remainders = np.unique(np.abs(pressure_Pa - pressure_Pa[0]))
+    remainders = remainders[remainders > exact_Pa]
     while remainders.size > 1:
         smallest = remainders[0]
         remainder = np.mod(remainders, smallest)
         remainder = np.unique(np.minimum(remainder, smallest - remainder))
-        remainders = np.concatenate([remainder[remainder > exact], [smallest]])
-    return float(remainders[0]) if remainders.size and remainders[0] > 2 * exact else 0.0
+        remainders = np.concatenate([remainder[remainder > exact_Pa], [smallest]])
+    return float(remainders[0]) if remainders.size and remainders[0] > 2 * exact_Pa else 0.0
 
 
 def _straight_runs(values: Floats, reach: float) -> NDArray[np.intp]:
@@ -539,12 +537,11 @@ class DenoisedTrace:
         end = curves[-1] + slope * EXTRAPOLATED_PART * span_s
         # A falling gauge pressure does not fall below zero.
         end[0] = max(end[0], min(curves[-1, 0], 0.0))
-        return DenoisedTrace(
-            np.append(self.time_s, last_s + EXTRAPOLATED_PART * span_s),
-            np.append(self.pressure_Pa, end[0]),
-            self.mean_error_Pa,
-            np.vstack([self.errors_Pa, end[1:]]),
-            self.is_curve,
+        return replace(
+            self,
+            time_s=np.append(self.time_s, last_s + EXTRAPOLATED_PART * span_s),
+            pressure_Pa=np.append(self.pressure_Pa, end[0]),
+            errors_Pa=np.vstack([self.errors_Pa, end[1:]]),
         )
 
 
@@ -588,11 +585,11 @@ class _Recorded:
         grown = (self.growth.at(where + offset) - seen_m[0]) / np.ptp(seen_m)
         return polynomial_along(t, grown, *GROWTH_DEGREES[kind - LARGEST_DEGREE - 1])
 
-    def criteria(self, exponents: Sequence[float] | None = None) -> Floats:
-        """BIC of every kind of curve, infinite where its residual is more than noise. Of shape (n_kinds,), or
-        (n_exponents, n_kinds) for several exponents of the emptying chamber.
+    def criteria(self, exponents: Sequence[float]) -> Floats:
+        """BIC of every kind of curve for several exponents of the emptying chamber, infinite where its residual is more
+        than noise. Shape (n_exponents, n_kinds).
         """
-        recorded = [self] if exponents is None else [replace(self, exponent=exponent) for exponent in exponents]
+        recorded = [replace(self, exponent=exponent) for exponent in exponents]
         y = whitened(np.column_stack([each._linearised(self.readings.values_Pa) for each in recorded]), self.noise.rho)
         size, degrees = len(y), self.noise.degrees
         polynomials = _polynomials(size, min(LARGEST_DEGREE + EXTRA_DEGREES, size // 3))
@@ -612,7 +609,7 @@ class _Recorded:
                     value[kind] = (
                         (degrees + size) * math.log1p(relative_squares) + math.log(size) * numbers + clock_cost
                     )
-        return values[0] if exponents is None else values
+        return values
 
     def averaged(self, weights: Floats) -> tuple[Floats, float, Floats]:
         """As `curve`, averaged over kinds with these weights; the differences between kinds are errors of the average.
@@ -622,10 +619,8 @@ class _Recorded:
         kinds = np.flatnonzero(weights)
         if not kinds.size:
             return self.curve(None)
-        smooth_Pa, of_mean_Pa, errors_Pa = self.curve(int(np.argmax(weights)))
+        _, of_mean_Pa, errors_Pa = self.curve(int(np.argmax(weights)))
         all_errors_Pa = [errors_Pa, *self._clock_and_exponent_errors(int(np.argmax(weights)))]
-        if kinds.size == 1:
-            return smooth_Pa, of_mean_Pa, _principal_errors(np.column_stack(all_errors_Pa))
         shares = weights[kinds] / weights[kinds].sum()
         curves_Pa = np.column_stack([self.curve(int(kind))[0] for kind in kinds])
         mean_Pa = curves_Pa @ shares
@@ -702,46 +697,37 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
     frequency of each kind of curve in the campaign enters as a prior: where all other pressures are constant, a bend
     that a single trace shows by chance counts as noise.
     """
-    times: dict[int, Floats] = {}
-    recorded: list[tuple[Floats, Growth | None]] = []
+    denoised: list[DenoisedTrace | None] = [None] * len(tracks)
+    growths: dict[int, Growth | None] = {}
     for i, track in enumerate(tracks):
-        if track.pressure_Pa is None:
+        known = np.zeros(0, dtype=bool)
+        if track.pressure_Pa is not None:
+            known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
+        if track.pressure_Pa is None or np.count_nonzero(known) < 2:
             continue
-        known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
-        if np.count_nonzero(known) < 2:
-            continue
-        times[i] = track.time_s[known].astype(float)
+        time_s, pressure_Pa = track.time_s[known].astype(float), track.pressure_Pa[known].astype(float)
+        denoised[i] = DenoisedTrace(time_s, pressure_Pa, 0.0, np.zeros((time_s.size, 0)))
         in_track = track.usable & np.isfinite(track.lead_position_m) & np.isfinite(track.time_s)
-        growth = None
+        growths[i] = None
         if np.count_nonzero(in_track) > 1:
-            grown_m = np.interp(times[i], track.time_s[in_track], track.lead_position_m[in_track])
-            growth = Growth(grown_m, float(np.median(np.diff(times[i]))))
-        recorded.append((track.pressure_Pa[known].astype(float), growth))
-    denoised = dict(zip(times, _denoised(recorded), strict=True))
-    return [DenoisedTrace(times[i], *denoised[i]) if i in times else None for i in range(len(tracks))]
-
-
-def _denoised(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Floats, float, Floats, bool]]:
-    """For traces with the growth in each: everything of a `DenoisedTrace` but the times."""
-    read = gauge_readings([pressure_Pa for pressure_Pa, _ in traces])
+            grown_m = np.interp(time_s, track.time_s[in_track], track.lead_position_m[in_track])
+            growths[i] = Growth(grown_m, float(np.median(np.diff(time_s))))
+    raw = {i: trace for i, trace in enumerate(denoised) if trace is not None}
+    read = gauge_readings([trace.pressure_Pa for trace in raw.values()])
     rho = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
     noises = noise_of_traces(read, rho)
-    growths = [growth for _, growth in traces]
-    clocks = gauge_clocks(read, growths, noises)
-    noisy = {
-        i: _Recorded(readings, traces[i][0].size, noise, growth, clock)
-        for i, (readings, noise, growth, clock) in enumerate(zip(read, noises, growths, clocks, strict=True))
-        if noise.sigma_Pa > 0
-    }
-    noisy = _with_common_exponent(noisy)
-    criteria = np.array([recorded.criteria() for recorded in noisy.values()])
-    weights = dict(zip(noisy, _weights(criteria), strict=True)) if noisy else {}
-    denoised = []
-    for i, (pressure_Pa, _) in enumerate(traces):
-        if i in noisy:
-            denoised.append((*noisy[i].averaged(weights[i]), bool(np.any(weights[i]))))
-        else:
-            denoised.append((pressure_Pa, 0.0, np.zeros((pressure_Pa.size, 0)), False))
+    clocks = gauge_clocks(read, list(growths.values()), noises)
+    noisy = _with_common_exponent(
+        {
+            i: _Recorded(readings, raw[i].time_s.size, noise, growths[i], clock)
+            for i, readings, noise, clock in zip(raw, read, noises, clocks, strict=True)
+            if noise.sigma_Pa > 0
+        }
+    )
+    if noisy:
+        weights = _weights(np.array([recorded.criteria([recorded.exponent])[0] for recorded in noisy.values()]))
+        for (i, recorded), weight in zip(noisy.items(), weights, strict=True):
+            denoised[i] = DenoisedTrace(raw[i].time_s, *recorded.averaged(weight), bool(np.any(weight)))
     return denoised
 
 

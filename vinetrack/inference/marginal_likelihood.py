@@ -277,6 +277,15 @@ def sum_vector_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
     return np.asarray(np.bincount(problem.places.ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
 
 
+def by_parameter(blocks: Floats, problem: MixedProblem) -> Floats:
+    """The vector block of each trial at the entries of its free parameters. Shapes: blocks (n_trials, n_keys) →
+    (n_trials, n_free).
+    """
+    single = np.zeros((len(blocks), problem.prior_mean.size + 1))
+    np.add.at(single, (np.arange(len(blocks))[:, None], problem.places), blocks)
+    return single[:, :-1]
+
+
 def inverse_of_block(square: Floats, places: NDArray[np.int_]) -> Floats:
     """Pseudo-inverse of the block of a symmetric matrix at these places, 0 elsewhere. Shapes: square (n, n)
     → (n, n).
@@ -374,9 +383,9 @@ def levenberg_marquardt_step(
 
 def trial_effect_step(
     cross_products: Floats, problem: MixedProblem, state: FitState, *, fixed_release: bool = False
-) -> Floats:
-    """Gauss–Newton step of the trial effects at fixed parameters. Shapes: cross_products (n_trials, 3, k, k) →
-    (n_trials, 4).
+) -> tuple[Floats, Floats]:
+    """Gauss–Newton step of the trial effects at fixed parameters, and the decrease of each trial's penalised sum of
+    squares that it predicts. Shapes: cross_products (n_trials, 3, k, k) → (n_trials, 4), (n_trials,).
     """
     white = _with_prior_gradient(cross_products, problem, state)
     square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
@@ -384,7 +393,8 @@ def trial_effect_step(
     if fixed_release:
         square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
         square[:, RELEASE, RELEASE] = 1.0
-    return solve_per_trial(square, slope)[:, :, 0]
+    step = solve_per_trial(square, slope)[:, :, 0]
+    return step, np.sum(step * slope[:, :, 0], axis=1)
 
 
 def _with_prior_gradient(cross_products: Floats, problem: MixedProblem, state: FitState) -> Floats:
@@ -539,6 +549,21 @@ def estimate_between_trial_sd(
         cost, start, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-3}
     )
     return at(minimum.x)
+
+
+def log_likelihood(
+    cross_products: Floats, problem: MixedProblem, state: FitState, estimable: tuple[bool, bool]
+) -> float:
+    """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare models."""
+    part = marginal(cross_products, problem, state)
+    spread = estimate_between_trial_sd(part, problem, state, estimable, restricted=False)
+    return -0.5 * deviance(part, problem, state, spread, restricted=False)
+
+
+def matrix_root(square: Floats) -> Floats:
+    """A matrix R with R Rᵀ equal to a symmetric positive semidefinite matrix. Shapes: square (n, n) → (n, n)."""
+    values, vectors = np.linalg.eigh(square)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
 
 def estimate_noise(

@@ -19,9 +19,11 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
+    deviance,
     estimate_between_trial_sd,
     estimate_noise,
     levenberg_marquardt_step,
+    log_likelihood,
     marginal,
     shared_penalty,
 )
@@ -123,11 +125,8 @@ def estimable(problem: MixedProblem) -> tuple[bool, bool]:
     # 3: A between-trial standard deviation is estimated where it applies to this many more trials than there are
     # parameters without a prior (chosen)
     needed = np.count_nonzero(problem.prior_precision == 0) + 3
-    has_estimated_sd = problem.has_deviation & np.column_stack(
-        [problem.gauge_error == 0, np.ones(problem.gauge_error.size, dtype=bool)]
-    )
-    pressure, damping = (bool(np.count_nonzero(has_estimated_sd[:, k]) >= needed) for k in range(2))
-    return pressure, damping
+    pressure = np.count_nonzero(problem.has_deviation[:, 0] & (problem.gauge_error == 0))
+    return bool(pressure >= needed), bool(np.count_nonzero(problem.has_deviation[:, 1]) >= needed)
 
 
 # ------------------------------------------------------------------------------
@@ -139,7 +138,7 @@ POOR_FIT = 3.0
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone. Noise
-    below the accuracy of the integrator is replaced by that accuracy, see `fit_problem.variance_floor`.
+    below the accuracy of the integrator is replaced by that accuracy, see `variance_floor`.
     """
     data = predictor.data
     rho = track_correlation(data)
@@ -208,6 +207,15 @@ class Solution:
     converged: bool
     iterations: int
 
+    def deviance(self, *, restricted: bool = True) -> float:
+        """−2 ln of the (restricted) likelihood at the state."""
+        part = marginal(self.cross_products, self.problem, self.state)
+        return deviance(part, self.problem, self.state, self.state.spread, restricted=restricted)
+
+    def log_likelihood(self) -> float:
+        """`marginal_likelihood.log_likelihood` at the state."""
+        return log_likelihood(self.cross_products, self.problem, self.state, self.estimable)
+
 
 @dataclass(frozen=True)
 class Step:
@@ -223,9 +231,6 @@ class Step:
 
 Watch = Callable[[Step], None]  # Called with every step; an exception that it raises ends the fit
 
-# By how much −2 ln L still exceeds the target, given cross products, problem, state and penalised sum of squares
-Shortfall = Callable[[Floats, MixedProblem, FitState, float], float]
-
 
 def solve(
     predictor: Predictor,
@@ -239,11 +244,12 @@ def solve(
     columns: Sequence[Floats] | None = None,
     least_decrease: float = CONVERGED_DECREASE,
     search: bool = False,
-    shortfall: Shortfall | None = None,
+    goal: float = -math.inf,
 ) -> Solution:
     """Iterate the mixed-effects fit to convergence. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
-    Levenberg–Marquardt damping where a full step fails. Shapes: columns (n_points, 4 + n_keys + 1).
+    Levenberg–Marquardt damping where a full step fails. A fit that can no longer reach the ln L of a `goal` is
+    abandoned. Shapes: columns (n_points, 4 + n_keys + 1).
     """
     # Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
     first_iterations, most_first_iterations, far_from_optimum = 3, 9, 1e3
@@ -266,7 +272,7 @@ def solve(
         first_phase = first_phase and not (iteration > first_iterations and close)
         # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
-        state = _update_variances(
+        state = update_variances(
             predictor, problem, cross_products, state, estimable_sd, fixed_terms, first_phase=first_phase
         )
         variances_moved = variance_change(before, state)
@@ -276,7 +282,8 @@ def solve(
         )
         is_full_instead = damping_before > damping
         if watch is not None:
-            watch(_step_report(predictor, state, iteration, predicted_decrease))
+            values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
+            watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
         small_step = predicted_decrease < least_decrease or at_corner
         at_corner = False
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
@@ -300,12 +307,11 @@ def solve(
             reached = Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
             if is_poor_fit(predictor, reached):
                 break
-        if shortfall is not None and iteration > first_iterations:
+        if math.isfinite(goal) and iteration > first_iterations:
+            part = marginal(cross_products, problem, state)
+            shortfall = deviance(part, problem, state, state.spread, restricted=False) + 2 * goal
             expected_later = (most_iterations - iteration) * _decrease_per_step(deviances)
-            if (
-                shortfall(cross_products, problem, state, penalised_squares)
-                > _largest_decrease(problem, penalised_squares, predicted_decrease) + expected_later
-            ):
+            if shortfall > _largest_decrease(problem, penalised_squares, predicted_decrease) + expected_later:
                 break
         # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
         accepted, damping = _accepted_step(
@@ -388,14 +394,7 @@ def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Flo
     return columns, predictor.products(columns)
 
 
-def _step_report(predictor: Predictor, state: FitState, iteration: int, predicted_decrease: float) -> Step:
-    values = predictor.layout.values(state.theta).tolist()
-    return Step(
-        iteration, dict(zip([number.name for number in predictor.layout.free], values, strict=True)), predicted_decrease
-    )
-
-
-def _update_variances(
+def update_variances(
     predictor: Predictor,
     problem: MixedProblem,
     cross_products: Floats,
@@ -403,12 +402,17 @@ def _update_variances(
     estimable_sd: tuple[bool, bool],
     fixed_terms: FixedTerms,
     *,
-    first_phase: bool,
+    first_phase: bool = False,
+    largest_rho: float = math.inf,
 ) -> FitState:
-    """Estimate noise and between-trial standard deviations; in the first phase only the size of the noise."""
+    """Estimate noise, up to a largest correlation, and between-trial standard deviations; in the first phase only the
+    size of the noise.
+    """
     if fixed_terms.noise is None:
         fixed_rho = state.rho if first_phase or fixed_terms.correlation is not None else None
         rho, variance = estimate_noise(cross_products, problem, state, fixed_rho)
+        if rho > largest_rho:
+            rho, variance = estimate_noise(cross_products, problem, state, largest_rho)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
     if not first_phase and any(estimable_sd):
         spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)
@@ -439,53 +443,34 @@ def _accepted_step(
     first, then ever more damping: in a curved valley a step that is too long has the right direction, and damping would
     turn it across the valley. `penalised_squares` is that of the current state.
     """
+
+    def lowered(step: Floats, effect_step: Floats, *, reject_by_prediction: bool = False) -> FitState | None:
+        # A step is rejected without simulating the new trial effects where their linear prediction cannot make up for
+        # it.
+        theta = np.clip(state.theta + step, problem.lower, problem.upper)
+        try:
+            effects = limited_step(predictor, state.trial_effects, effect_step)
+            reached = replace(state, theta=theta, trial_effects=effects)
+            largest_cost = penalised_squares - shared_penalty(problem, reached)
+            reached, costs = optimise_trial_effects(
+                predictor, problem, reached, largest_cost if reject_by_prediction else math.inf
+            )
+        except SimulationError:
+            return None
+        return reached if float(np.sum(costs)) < largest_cost else None
+
     # (1.0, 0.4, 0.15), 11: fractions of a step that a line search tries, and how many times the damping is then
     # increased (chosen)
     for fraction in (1.0, 0.4, 0.15):
-        candidate = _candidate_state(
-            predictor,
-            problem,
-            state,
-            fraction * step,
-            fraction * effect_step,
-            penalised_squares,
-            reject_by_prediction=True,
-        )
+        candidate = lowered(fraction * step, fraction * effect_step, reject_by_prediction=True)
         if candidate is not None:
             return candidate, damping * 0.1 if damping > 1e-6 else 0.0
     for _ in range(11):
         damping = max(10 * damping, 1e-4)
-        step, effect_step, _ = levenberg_marquardt_step(cross_products, problem, state, damping)
-        candidate = _candidate_state(predictor, problem, state, step, effect_step, penalised_squares)
+        candidate = lowered(*levenberg_marquardt_step(cross_products, problem, state, damping)[:2])
         if candidate is not None:
             return candidate, damping * 0.1
     return None, 0.0
-
-
-def _candidate_state(
-    predictor: Predictor,
-    problem: MixedProblem,
-    state: FitState,
-    step: Floats,
-    effect_step: Floats,
-    penalised_squares: float,
-    *,
-    reject_by_prediction: bool = False,
-) -> FitState | None:
-    """The state after a step and new trial effects, if it lowers the penalised sum of squares; else None. With
-    `reject_by_prediction`, a step is rejected without simulating the new trial effects where their linear prediction
-    cannot make up for it.
-    """
-    theta = np.clip(state.theta + step, problem.lower, problem.upper)
-    try:
-        reached = replace(state, theta=theta, trial_effects=limited_step(predictor, state.trial_effects, effect_step))
-        largest_cost = penalised_squares - shared_penalty(problem, reached)
-        reached, costs = optimise_trial_effects(
-            predictor, problem, reached, largest_cost if reject_by_prediction else math.inf
-        )
-    except SimulationError:
-        return None
-    return reached if float(np.sum(costs)) < largest_cost else None
 
 
 def cost(

@@ -27,12 +27,14 @@ from vinetrack.inference.marginal_likelihood import (
     FitState,
     Marginal,
     MixedProblem,
+    by_parameter,
     deviance,
-    estimate_between_trial_sd,
     estimate_noise,
     inverse_of_block,
     levenberg_marquardt_step,
+    log_likelihood,
     marginal,
+    matrix_root,
     normal_equations,
     trial_effect_step,
     trial_effects_eliminated,
@@ -42,6 +44,7 @@ from vinetrack.inference.optimiser import (
     FixedTerms,
     Solution,
     solve,
+    update_variances,
     variance_change,
     variance_floor,
 )
@@ -80,15 +83,10 @@ class Precision:
     insensitive: np.ndarray
     collinear: np.ndarray
 
-
-def first_parameters(precision_of_all: Precision, count: int) -> Precision:
-    """The precision of the first `count` parameters, the others integrated out."""
-    return Precision(
-        precision_of_all.covariance[:count, :count],
-        precision_of_all.degrees[:count],
-        precision_of_all.insensitive[:count],
-        precision_of_all.collinear[:count],
-    )
+    def first(self, count: int) -> Precision:
+        """The same of the first `count` parameters, the others integrated out."""
+        covariance = self.covariance[:count, :count]
+        return Precision(covariance, self.degrees[:count], self.insensitive[:count], self.collinear[:count])
 
 
 def precision(solution: Solution) -> Precision:
@@ -203,7 +201,7 @@ def profile_interval(
     """
     problem, state = solution.problem, solution.state
     held = FixedTerms(state.spread, (state.rho, state.variance))
-    best = _deviance(solution)
+    best = solution.deviance(restricted=False)
     ends = []
     for side, bound in ((-1, problem.lower[place]), (1, problem.upper[place])):
         value, evaluated = float(state.theta[place]), [(0.0, 0.0)]
@@ -221,11 +219,6 @@ def profile_interval(
             distance = _next_distance(evaluated, reach)
         ends.append(value + side * min(distance, abs(bound - value)))
     return ends[0], ends[1]
-
-
-def _deviance(solution: Solution) -> float:
-    part = marginal(solution.cross_products, solution.problem, solution.state)
-    return deviance(part, solution.problem, solution.state, solution.state.spread, restricted=False)
 
 
 def _deviance_increase(
@@ -249,7 +242,7 @@ def _deviance_increase(
         )
     except SimulationError:
         return 1e6
-    return _deviance(constrained) - best
+    return constrained.deviance(restricted=False) - best
 
 
 def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
@@ -270,7 +263,6 @@ class SmoothErrors:
     solution: Solution
     gain: float
     whitened: tuple[Floats, ...]
-    displacement_m: tuple[Floats, ...]
 
 
 def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
@@ -297,27 +289,16 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
     """Fit the smooth errors of position along with the parameters of a fit, to first order; None where
     there are none.
     """
-    grown = [
-        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
-        for trial_data, trial_effects, columns in zip(
-            predictor.data, solution.state.trial_effects, solution.columns, strict=True
-        )
-    ]
-    shapes = position_shapes(predictor, grown)
+    shapes = _shapes(predictor, solution)
     count = shapes[0].shape[1]
     if not count:
         return None
-    extended = [
-        np.column_stack([columns[:, :-1], shape, columns[:, -1]])
-        for columns, shape in zip(solution.columns, shapes, strict=True)
-    ]
+    extended = _with_shapes(solution.columns, shapes, np.zeros(count))
     held = held or FixedTerms()
     fixed_insensitive = replace(solution.problem, free=solution.problem.free & _sensitive(solution))
     problem = with_shapes(fixed_insensitive, count)
     start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
-    state, cross_products, moved, log_likelihood = _newton_on_fixed_columns(
-        predictor, solution, extended, problem, start, held
-    )
+    state, cross_products, moved, level = _newton_on_fixed_columns(predictor, solution, extended, problem, start, held)
     # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
     # shapes, so it is subtracted.
     without_shapes = _newton_on_fixed_columns(
@@ -330,14 +311,15 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
             state=state,
             problem=with_shapes(solution.problem, count),
             cross_products=cross_products,
-            columns=tuple(_with_residual(extended, residuals)),
+            columns=tuple(
+                np.column_stack([block[:, :-1], left]) for block, left in zip(extended, residuals, strict=True)
+            ),
         ),
-        gain=max(log_likelihood - without_shapes, 0.0),
+        gain=max(level - without_shapes, 0.0),
         whitened=tuple(
             whiten(values, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
             for values, trial_data, variance in zip(residuals, predictor.data, state.variance, strict=True)
         ),
-        displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
     )
 
 
@@ -368,32 +350,27 @@ def _newton_on_fixed_columns(
     converged_decrease_smooth, most_steps = 1e-2, 15
     cross_products = predictor.products(columns)
     total_change = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
-    state = _variances(predictor, problem, cross_products, state, solution, held)
-    level = _log_likelihood(cross_products, problem, state, solution)
+
+    def with_variances(products: Floats, state: FitState) -> FitState:
+        # Noise of correlation near 1 would make anything likely.
+        largest_rho = solution.state.rho
+        return update_variances(predictor, problem, products, state, solution.estimable, held, largest_rho=largest_rho)
+
+    state = with_variances(cross_products, state)
+    level = log_likelihood(cross_products, problem, state, solution.estimable)
     for _ in range(most_steps):
         step, own_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, 0.0)
         change = np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
         products = _products_after_step(cross_products, change)
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
-        after = _variances(predictor, problem, products, before, solution, held)
-        new_level = _log_likelihood(products, problem, after, solution)
+        after = with_variances(products, before)
+        new_level = log_likelihood(products, problem, after, solution.estimable)
         if new_level < level - converged_decrease_smooth:
             break
         cross_products, total_change, state, level = products, total_change + change, after, new_level
         if predicted_decrease < converged_decrease_smooth and variance_change(before, state) < CONVERGED_VARIANCES:
             break
     return state, cross_products, total_change, level
-
-
-def _log_likelihood(cross_products: Floats, problem: MixedProblem, state: FitState, solution: Solution) -> float:
-    """Marginal ln L at a state, maximised over the between-trial standard deviations."""
-    part = marginal(cross_products, problem, state)
-    spread = estimate_between_trial_sd(part, problem, state, solution.estimable, restricted=False)
-    return -0.5 * deviance(part, problem, state, spread, restricted=False)
-
-
-def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> list[Floats]:
-    return [np.column_stack([block[:, :-1], left]) for block, left in zip(columns, residual, strict=True)]
 
 
 def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
@@ -411,30 +388,6 @@ def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
         free=np.append(problem.free, np.ones(count, dtype=bool)),
         random=np.append(problem.random, np.zeros(count, dtype=bool)),
     )
-
-
-def _variances(
-    predictor: Predictor,
-    problem: MixedProblem,
-    cross_products: Floats,
-    state: FitState,
-    solution: Solution,
-    held: FixedTerms,
-) -> FitState:
-    """Estimate noise and between-trial standard deviations, unless they are fixed. The noise correlation may not exceed
-    that of the fit: noise of correlation near 1 would make anything likely.
-    """
-    estimable = solution.estimable
-    if held.noise is None:
-        rho, variance = estimate_noise(cross_products, problem, state, held.correlation)
-        if rho > solution.state.rho:
-            rho, variance = estimate_noise(cross_products, problem, state, solution.state.rho)
-        state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-    if any(estimable):
-        state = replace(
-            state, spread=estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable)
-        )
-    return state
 
 
 def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
@@ -499,7 +452,8 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
             replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(extended)),
             shared,
         )
-        step = pooled.covariance @ _gradient(pooled, problem, state)
+        pull = problem.prior_precision * (state.theta - problem.prior_mean)
+        step = pooled.covariance @ (pooled.scores.sum(axis=0) - pull)
         scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
         longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
         errors = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
@@ -536,10 +490,6 @@ def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Flo
     ]
 
 
-def _gradient(pooled: Pooled, problem: MixedProblem, state: FitState) -> Floats:
-    return np.asarray(pooled.scores.sum(axis=0) - problem.prior_precision * (state.theta - problem.prior_mean))
-
-
 def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitState:
     """The state after a step, with the effects of the trials following to first order."""
     problem = solution.problem
@@ -548,7 +498,7 @@ def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitS
     moved_products = solution.cross_products.copy()
     # The residual after the step: r − X δ.
     moved_products[..., -1] -= np.einsum("nsik,nk->nsi", solution.cross_products[..., N_TRIAL_EFFECTS:-1], change)
-    trial_effects = state.trial_effects + trial_effect_step(moved_products, problem, state)
+    trial_effects = state.trial_effects + trial_effect_step(moved_products, problem, state)[0]
     return replace(state, theta=theta, trial_effects=trial_effects)
 
 
@@ -604,11 +554,9 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     size, p = problem.prior_mean.size, problem.index.shape[1]
     blocks = trial_effects_eliminated(solution.cross_products, p, problem, solution.state)
     information = np.zeros((len(blocks), size + 1, size + 1))
-    scores = np.zeros((len(blocks), size + 1))
-    for i, (block, places) in enumerate(zip(blocks, problem.index, strict=True)):
-        np.add.at(information[i], (places[:, None], places[None, :]), block[:p, :p])
-        np.add.at(scores[i], places, block[:p, p])
-    return information[:, :size, :size], scores[:, :size]
+    rows = np.arange(len(blocks))[:, None, None]
+    np.add.at(information, (rows, problem.places[:, :, None], problem.places[:, None, :]), blocks[:, :p, :p])
+    return information[:, :size, :size], by_parameter(blocks[:, :p, p], problem)
 
 
 def _typical_root(covariance: Floats, information: Floats, shared: int) -> Floats:
@@ -616,8 +564,7 @@ def _typical_root(covariance: Floats, information: Floats, shared: int) -> Float
     informative_trials = np.count_nonzero(np.einsum("nkk->nk", information) > 0, axis=0).astype(float)
     informative_trials[shared:] = 0.0
     factor = np.sqrt(informative_trials)
-    values, vectors = np.linalg.eigh(covariance * factor[:, None] * factor)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return matrix_root(covariance * factor[:, None] * factor)
 
 
 def _maximise_likelihood(deviance: Callable[[float], float]) -> float:

@@ -8,7 +8,7 @@ ever widen an error.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,13 +16,17 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import TrialFit
-from vinetrack.inference.marginal_likelihood import inverse_of_block, sum_matrix_blocks, trial_effects_eliminated
+from vinetrack.inference.marginal_likelihood import (
+    by_parameter,
+    inverse_of_block,
+    matrix_root,
+    sum_matrix_blocks,
+    trial_effects_eliminated,
+)
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor, position_change
-from vinetrack.inference.whitening import products
 
 # ------------------------------------------------------------------------------
 # Systematic errors of a campaign: payloads, set pressures, film mass, position errors of the camera, gauge noise.
@@ -84,27 +88,23 @@ def systematics_of(
     film: bool = False,
 ) -> Systematics:
     """All systematic errors of a fit."""
-    points = [trial.time_s.size for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
-    dense = [_tracker_errors(predictor, trials)] + ([position_shapes(predictor, grown)] if positions else [])
     recorded = recorded_pressures(predictor, solution)
     parts = [
-        _payload_errors(predictor, solution, trials),
+        _payload_errors(predictor, solution),
         _set_pressure_errors(predictor, solution),
         recorded,
         *([film_errors(predictor, solution, trials)] if film else []),
-        *(_of_every_trial(columns) for columns in dense),
+        _of_every_trial(_tracker_errors(predictor, grown)),
+        *([_of_every_trial(position_shapes(predictor, grown))] if positions else []),
     ]
-    columns = [np.empty((size, sum(part.n_columns for part in parts))) for size in points]
-    places = np.empty((len(points), sum(part.n_columns for part in parts)), dtype=int)
-    count, begin, total = 0, 0, sum(part.count for part in parts)
-    for part in parts:
-        own_columns = slice(begin, begin + part.n_columns)
-        places[:, own_columns] = np.where(part.places < part.count, count + part.places, total)
-        for column, errors in zip(columns, part.columns, strict=True):
-            column[:, own_columns] = errors
-        count, begin = count + part.count, begin + part.n_columns
-    return Systematics(columns, places, total, recorded.estimated_m)
+    *begins, total = np.cumsum([0, *(part.count for part in parts)]).tolist()
+    places = [
+        np.where(part.places < part.count, begin + part.places, total)
+        for part, begin in zip(parts, begins, strict=True)
+    ]
+    columns = [np.hstack(of_trial) for of_trial in zip(*(part.columns for part in parts), strict=True)]
+    return Systematics(columns, np.hstack(places), total, recorded.estimated_m)
 
 
 def _of_every_trial(columns: list[Floats]) -> Systematics:
@@ -113,75 +113,81 @@ def _of_every_trial(columns: list[Floats]) -> Systematics:
     return Systematics(columns, np.tile(np.arange(count), (len(columns), 1)), count)
 
 
-def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
+def _one_per_group(predictor: Predictor, moved_m: Mapping[int, Floats], names: Mapping[int, Hashable]) -> Systematics:
+    """One error for each group of trials: displacements and names of the groups, by index of the trial."""
+    places = {name: k for k, name in enumerate(dict.fromkeys(names.values()))}
+    sizes = [trial_data.time_s.size for trial_data in predictor.data]
+    if not places:
+        return Systematics.none(sizes)
+    columns = [moved_m[i][:, None] if i in moved_m else np.zeros((size, 1)) for i, size in enumerate(sizes)]
+    of_trial = [places[names[i]] if i in names else len(places) for i in range(len(sizes))]
+    return Systematics(columns, np.array(of_trial)[:, None], len(places))
+
+
+def _payload_errors(predictor: Predictor, solution: Solution) -> Systematics:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
     payload_step = 1e-2  # Relative step of a payload's mass for its derivative (derived)
-    no_errors = Systematics.none([trial.time_s.size for trial in trials])
-    loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
-    if not loaded:
-        return no_errors
-    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
-    try:
-        plain = predictor.run([jobs[i] for i in loaded])
-        heavier = predictor.run([jobs[i]._replace(payload_factor=1 + payload_step) for i in loaded])
-    except SimulationError:
-        return no_errors
-    columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
-    for i, plain_trajectory, heavier_trajectory in zip(loaded, plain, heavier, strict=True):
-        # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
-        columns[i][:, 0] = 0.005 / payload_step * position_change(plain_trajectory, heavier_trajectory)
-    names = {i: round(trials[i].trial.payload_kg, 9) for i in loaded}
-    return _one_per_group(columns, [names.get(i) for i in range(len(trials))])
+    trials = [trial_data.trial for trial_data in predictor.data]
+    heavier = {
+        i: replace(trial, payload_kg=(1 + payload_step) * trial.payload_kg)
+        for i, trial in enumerate(trials)
+        if trial.payload_kg > 0 and trial.travel_ratio != 1
+    }
+    # 0.005: standard deviation of a payload's mass in addition to that of the sheet, relative
+    moved_m = {i: 0.005 / payload_step * change_m for i, change_m in _changes_of(predictor, solution, heavier).items()}
+    return _one_per_group(predictor, moved_m, {i: round(trials[i].payload_kg, 9) for i in moved_m})
 
 
-def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
+def film_errors(predictor: Predictor, solution: Solution, fits: Sequence[TrialFit]) -> Systematics:
     """Error of the film mass of each vine, `FILM_ERROR`."""
-    columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
-    with_film = [i for i, trial in enumerate(trials) if trial.trial.linear_density_kg_m > 0]
+    heavier = {
+        i: replace(fit.trial, film_density_kg_m3=(1 + FILM_ERROR) * fit.trial.film_density_kg_m3)
+        for i, fit in enumerate(fits)
+        if fit.trial.linear_density_kg_m > 0
+    }
+    moved_m = _changes_of(predictor, solution, heavier)
+    return _one_per_group(predictor, moved_m, {i: fits[i].trial.vine for i in moved_m})
+
+
+def _changes_of(predictor: Predictor, solution: Solution, changed: Mapping[int, Trial]) -> dict[int, Floats]:
+    """Changes of the positions of some trials, m, by index, if they were as given; none where one cannot be
+    simulated.
+    """
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
-    other = Predictor(predictor.layout, [_with_heavier_film(each) for each in predictor.data], predictor.host)
+    jobs = [jobs[i] for i in changed]
+    if not jobs:
+        return {}
+    data = [replace(each, trial=changed.get(i, each.trial)) for i, each in enumerate(predictor.data)]
     try:
-        plain, heavier = predictor.run(jobs), other.run(jobs)
+        plain, moved = predictor.run(jobs), Predictor(predictor.layout, data, predictor.host).run(jobs)
     except SimulationError:
-        with_film = []
-    for i in with_film:
-        columns[i][:, 0] = position_change(plain[i], heavier[i])
-    if not with_film:
-        return Systematics.none([trial.time_s.size for trial in trials])
-    return _one_per_group(columns, [trial.trial.vine if i in with_film else None for i, trial in enumerate(trials)])
-
-
-def _with_heavier_film(trial_data: FitTrial) -> FitTrial:
-    trial = trial_data.trial
-    return replace(trial_data, trial=replace(trial, film_density_kg_m3=(1 + FILM_ERROR) * trial.film_density_kg_m3))
+        return {}
+    return {i: position_change(one, other) for i, one, other in zip(changed, plain, moved, strict=True)}
 
 
 def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Systematics:
     """Error of the set pressure of each condition, shared by its replicates."""
-    data = [trial_data.trial for trial_data in predictor.data]
-    with_set_pressure = predictor.has_pressure_deviation & np.array(
-        [trial_data.trace is None for trial_data in predictor.data]
-    )
-    if not with_set_pressure.any():
-        return Systematics.none([len(sensitivities) for sensitivities in solution.columns])
-    columns = [np.zeros((len(sensitivities), 1)) for sensitivities in solution.columns]
-    for column, trial, sensitivities, applies in zip(columns, data, solution.columns, with_set_pressure, strict=True):
-        if applies:
-            column[:, 0] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
-    return _one_per_group(
-        columns, [trial.condition if applies else None for trial, applies in zip(data, with_set_pressure, strict=True)]
-    )
+    trials = {
+        i: trial_data.trial
+        for i, trial_data in enumerate(predictor.data)
+        if predictor.has_pressure_deviation[i] and trial_data.trace is None
+    }
+    moved_m = {
+        i: PRESSURE_ERROR_PA / trial.pressure_Pa * solution.columns[i][:, PRESSURE] for i, trial in trials.items()
+    }
+    return _one_per_group(predictor, moved_m, {i: trial.condition for i, trial in trials.items()})
 
 
 def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only: bool = False) -> Systematics:
     """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
     data = predictor.data
-    counts = [
-        0
+    errors_Pa = [
+        np.zeros((0, 0))
         if each.trace_errors_Pa is None or (curves_only and not each.trace_is_curve)
-        else each.trace_errors_Pa.shape[1]
+        else each.trace_errors_Pa
         for each in data
     ]
+    counts = [errors.shape[1] for errors in errors_Pa]
     n_columns = max(counts)
     no_errors = Systematics.none([trial_data.time_s.size for trial_data in data])
     if not n_columns:
@@ -194,40 +200,30 @@ def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only:
         plain = predictor.run(jobs)
         for k in range(n_columns):
             rows = [i for i, count in enumerate(counts) if count > k]
-            other = Predictor(predictor.layout, [_with_trace_error(each, k) for each in data], predictor.host)
+            varied = list(data)
+            for i in rows:
+                clock_s, pressure_Pa = data[i].trace or (np.zeros(0), np.zeros(0))
+                varied[i] = replace(data[i], trace=(clock_s, pressure_Pa + errors_Pa[i][:, k]))
+            other = Predictor(predictor.layout, varied, predictor.host)
             for i, perturbed in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
                 columns[i][:, k] = position_change(plain[i], perturbed)
                 places[i, k] = begins[i] + k
     except SimulationError:
         return no_errors
-    estimated_m = [np.zeros(trial_data.time_s.size) for trial_data in data]
-    for trial_estimate_m, column, trial_data in zip(estimated_m, columns, data, strict=True):
-        if trial_data.trace_error_sizes is not None:
-            trial_estimate_m += column[:, : trial_data.trace_error_sizes.size] @ trial_data.trace_error_sizes
+    estimated_m = [
+        np.zeros(trial_data.time_s.size)
+        if trial_data.trace_error_sizes is None
+        else column[:, : trial_data.trace_error_sizes.size] @ trial_data.trace_error_sizes
+        for column, trial_data in zip(columns, data, strict=True)
+    ]
     return Systematics(columns, places, sum(counts), estimated_m)
 
 
-def _with_trace_error(trial_data: FitTrial, k: int) -> FitTrial:
-    """A trial with its recorded pressure changed by one standard deviation of its k-th error, if it has that many."""
-    errors_Pa = trial_data.trace_errors_Pa
-    if trial_data.trace is None or errors_Pa is None or errors_Pa.shape[1] <= k:
-        return trial_data
-    clock_s, pressure_Pa = trial_data.trace
-    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa[:, k]))
-
-
-def _one_per_group(columns: list[Floats], names: Sequence[Hashable | None]) -> Systematics:
-    """Errors that are shared by the trials of a group; a trial with the name None has none."""
-    places = {name: k for k, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
-    return Systematics(columns, np.array([[places.get(name, len(places))] for name in names]), len(places))
-
-
-def _tracker_errors(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
+def _tracker_errors(predictor: Predictor, grown: Sequence[Floats]) -> list[Floats]:
     """Slow errors of positions from recordings, of the size that the tracks state; none for imported positions."""
     stated = [trial_data.slow_m for trial_data in predictor.data]
     if all(slow_m is None for slow_m in stated):
-        return [np.zeros((trial.time_s.size, 0)) for trial in trials]
-    grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
+        return [np.zeros((growth_m.size, 0)) for growth_m in grown]
     # With extreme parameters no trial moves, and all growth fractions are zero.
     largest_growth_m = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
     return [_slow_shapes(growth_m / largest_growth_m, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
@@ -283,25 +279,21 @@ def widened_covariance(
     systematic errors.
     """
     systematics = systematics_of(predictor, solution, trials, positions=extended is None)
-    plain, robust, moved = _sandwich(predictor, extended or solution, systematics)
-    diagonal = np.diag(plain)
-    estimated = diagonal > 0
-    ratio = np.ones(diagonal.size)
-    spare = len(trials) - np.count_nonzero(estimated)
+    plain, robust, moved = sandwich(predictor, extended or solution, systematics)
     at_most = model_precision.degrees
-    if pooled is not None:
-        diagonal = np.diag(pooled.covariance)
-        estimated = diagonal > 0
-        variance, few = _few_trial_variances(pooled.information, pooled.scores, extended or solution, pooled.covariance)
-        ratio[estimated] = np.sqrt(np.maximum(variance[estimated] / diagonal[estimated], 1.0))
-        at_most = np.where(np.diag(pooled.between) > 0, np.minimum(at_most, few), at_most)
-    elif len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
-        ratio[estimated] = np.sqrt(np.maximum(np.diag(robust)[estimated] / diagonal[estimated], 1.0))
+    spare = len(trials) - int(np.count_nonzero(np.diag(plain) > 0))
+    if pooled is None and len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
+        variance = np.diag(robust)
         clusters = len(set(coarsest_groups([trial_data.trial for trial_data in predictor.data])))
-        few = np.full(diagonal.size, float(min(int(spare), clusters - 1)))
-    else:
+        few = np.full(variance.size, float(min(spare, clusters - 1)))
+    elif pooled is None:
         variance, few = _few_trial_variances(*trial_information(extended or solution), extended or solution, plain)
-        ratio[estimated] = np.sqrt(np.maximum(variance[estimated] / diagonal[estimated], 1.0))
+    else:
+        plain = pooled.covariance
+        variance, few = _few_trial_variances(pooled.information, pooled.scores, extended or solution, plain)
+        at_most = np.where(np.diag(pooled.between) > 0, np.minimum(at_most, few), at_most)
+    diagonal = np.diag(plain)
+    ratio = np.sqrt(np.maximum(np.divide(variance, diagonal, out=np.ones_like(diagonal), where=diagonal > 0), 1.0))
     degrees = np.where(ratio > 1, np.minimum(at_most, few), at_most)
     covariance = (
         np.where(np.isfinite(model_precision.covariance), model_precision.covariance, 0.0) * ratio[:, None] * ratio
@@ -316,16 +308,7 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials. Returns
     plain, robust : arrays, shape (n_free, n_free).
     """
-    no_errors = Systematics.none([trial_data.time_s.size for trial_data in predictor.data])
-    plain, robust, _ = _sandwich(predictor, solution, no_errors)
-    return plain, robust
-
-
-def parameter_shifts(predictor: Predictor, solution: Solution, systematics: Systematics) -> Floats:
-    """Change of each free parameter by one standard deviation of each systematic error, to first order. Shape (n_free,
-    count).
-    """
-    return _sandwich(predictor, solution, systematics)[2]
+    return sandwich(predictor, solution, _one_per_group(predictor, {}, {}))[:2]
 
 
 def _few_trial_variances(
@@ -368,41 +351,24 @@ def _few_trial_variances(
     return variance, degrees
 
 
-def matrix_root(square: Floats) -> Floats:
-    """A matrix R with R Rᵀ equal to a symmetric positive semidefinite matrix. Shapes: square (n, n) → (n, n)."""
-    values, vectors = np.linalg.eigh(square)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
-    """Scores of the free parameters by trial, shape (n_trials, size), with the mean, that of the prior, subtracted."""
-    single = np.zeros((len(rows), size + 1))
-    for i, row in enumerate(rows):
-        np.add.at(single[i], index[i], row)
-    return np.asarray(single[:, :size] - single[:, :size].mean(axis=0))
-
-
-def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
-    """Model-based and cluster-robust covariance, shape (n_free, n_free) each, and `parameter_shifts`. Parameters at a
-    bound are fixed there.
+def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
+    """Model-based and cluster-robust covariance, shape (n_free, n_free) each, and the change of each free parameter by
+    one standard deviation of each systematic error, to first order, shape (n_free, count). Parameters at a bound are
+    fixed there.
     """
     problem, state = solution.problem, solution.state
     cross_products = solution.cross_products
     p, size = cross_products.shape[-1] - N_TRIAL_EFFECTS - 1, problem.prior_mean.size
     if systematics.n_columns:
-        both = zip(solution.columns, systematics.columns, predictor.data, strict=True)
-        cross_products = np.stack(
-            [
-                products(np.column_stack([sensitivities, systematic]), trial_data.first, trial_data.relative_sd)
-                for sensitivities, systematic, trial_data in both
-            ]
-        )
+        both = zip(solution.columns, systematics.columns, strict=True)
+        cross_products = predictor.products([np.column_stack(columns) for columns in both])
     blocks = trial_effects_eliminated(cross_products, p, problem, state)
     square = sum_matrix_blocks(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
     estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
     plain = inverse_of_block(square, estimated)
-    scores = _scores(blocks[:, :p, p], problem.index, size)
+    scores = by_parameter(blocks[:, :p, p], problem)
+    scores -= scores.mean(axis=0)
     trials = len(blocks)
     # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
     prior = np.diag(problem.prior_precision)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Trial
+from vinetrack.core.records import Floats
 from vinetrack.dynamics.equations import ENDED
 from vinetrack.dynamics.kernel import Batch, Trace, lay_out, starts_of
 from vinetrack.dynamics.model import Model, check_needs, trial_inputs, with_pressures
@@ -28,9 +28,8 @@ from vinetrack.dynamics.simulate import (
     simulate_many,
     trajectories,
 )
-from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, ParameterMap
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, ParameterMap
 from vinetrack.inference.whitening import all_products
 
 # ------------------------------------------------------------------------------
@@ -40,14 +39,13 @@ OBSERVED = 3  # Column of `Motions.rows` with the position of the edge as the ca
 
 
 class Job(NamedTuple):
-    """One trajectory to simulate: its trial, parameters, pressures and release, and a factor on its payload."""
+    """One trajectory to simulate: its trial, parameters, pressures and release."""
 
     trial: int
     row: Floats
     yield_pressure_Pa: float
     pressure_deviation: float
     release_s: float
-    payload_factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,6 @@ class Jobs:
     yield_pressure_Pa: Floats
     pressure_deviation: Floats
     release_s: Floats
-    payload_factor: Floats
 
     @classmethod
     def of(cls, jobs: Sequence[Job]) -> Jobs:
@@ -95,30 +92,6 @@ class Jobs:
     def _columns(self) -> tuple[NDArray[Any], ...]:
         return tuple(vars(self).values())
 
-    def distinct(self, identical_trials: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Indices of distinct jobs, and for each job its index among the distinct ones. Returns first, inverse. Shapes:
-        identical_trials (n_trials,) → (n_distinct,).
-        """
-        numbers = np.column_stack([identical_trials[self.trial].astype(float), *self._columns[1:]])
-        first: dict[bytes, int] = {}
-        trajectory_of = [first.setdefault(numbers[k].tobytes(), k) for k in range(len(numbers))]
-        return np.unique(trajectory_of, return_inverse=True)
-
-
-def first_identical_trials(
-    data: Sequence[FitTrial], inputs: Floats, bends: Sequence[Sequence[tuple[float, float, float]]]
-) -> NDArray[np.int_]:
-    """For each trial the first one with the same settings and times. Shapes: inputs (n_trials, n_fields of
-    `TrialInputs`) → (n_trials,).
-    """
-    first: dict[tuple[object, ...], int] = {}
-    identical_trials = np.arange(len(data))
-    for i, trial_data in enumerate(data):
-        if trial_data.trace is None:
-            key = (inputs[i].tobytes(), tuple(bends[i]), trial_data.time_s.tobytes(), trial_data.trial.travel_ratio)
-            identical_trials[i] = first.setdefault(key, i)
-    return identical_trials
-
 
 class Average(NamedTuple):
     """Weighted averages of positions over times around each point. `instants_s` are all times needed, increasing;
@@ -141,22 +114,14 @@ class Average(NamedTuple):
 
 @dataclass(frozen=True)
 class Motions:
-    """Simulated trajectories of jobs: `out` and `ends` as `Batch.run` returns them, one entry per distinct trajectory.
-    `ratios` are the travel ratios of their trials; `trajectory_of`, shape (n_jobs,), is the trajectory of each job.
+    """Simulated trajectories of jobs: `out` and `ends` as `Batch.run` returns them, and the travel ratios of their
+    trials.
     """
 
     batch: Batch
     out: Floats
     ends: Floats
     ratios: list[float]
-    trajectory_of: NDArray[np.int_]
-
-    @classmethod
-    def of(cls, batch: Batch, trials: Sequence[Trial], trajectory_of: NDArray[np.int_]) -> Motions:
-        """Integrate a batch. Shapes: trajectory_of (n_jobs,)."""
-        out, ends = batch.run()
-        check_completed(ends, [trial.name for trial in trials])
-        return cls(batch, out, ends, [trial.travel_ratio for trial in trials], trajectory_of)
 
     def averaged(self, averages: Sequence[Average]) -> Motions:
         """The motions at the requested points, their reported positions averaged over the times around them."""
@@ -177,25 +142,15 @@ class Motions:
         """Rows of `out` of jobs `first` up to `last`, concatenated. Returns position, velocity and acceleration of the
         tail, position of the edge as the camera reports it. Shape (n_times, 4).
         """
-        starts, trajectory_of = self.batch.starts, self.trajectory_of[first:last]
-        if (
-            trajectory_of.size
-            and trajectory_of[-1] - trajectory_of[0] == trajectory_of.size - 1
-            and np.all(np.diff(trajectory_of) == 1)
-        ):
-            return self.out[starts[trajectory_of[0]] : starts[trajectory_of[-1] + 1]]
-        return np.concatenate([self.out[starts[k] : starts[k + 1]] for k in trajectory_of])
+        return self.out[self.batch.starts[first] : self.batch.starts[last]]
 
     def stamps(self, job: int) -> Floats:
         """Times of a job since its release, s, on the camera's clock. Shape (n_times,)."""
-        return self.batch.stamps[
-            self.batch.starts[self.trajectory_of[job]] : self.batch.starts[self.trajectory_of[job] + 1]
-        ]
+        return self.batch.stamps[self.batch.starts[job] : self.batch.starts[job + 1]]
 
     def trajectories(self) -> list[Trajectory]:
         """One trajectory per job."""
-        distinct_trajectories = trajectories(self.batch, self.out, self.ends, self.ratios)
-        return [distinct_trajectories[k] for k in self.trajectory_of]
+        return trajectories(self.batch, self.out, self.ends, self.ratios)
 
 
 # ------------------------------------------------------------------------------
@@ -239,8 +194,6 @@ N_TRIAL_EFFECTS = 4  # Trial effects of each trial: release, s; origin, m; relat
 
 RELEASE_STEP_FRAMES = 0.1  # Step of the release (chosen)
 
-PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
-
 
 class Predictor:
     """Simulates the trials of a fit and differentiates their positions. `has_pressure_deviation`, shape (n_trials,),
@@ -276,8 +229,6 @@ class Predictor:
         self.averages = [Average.of(trial_data.time_s, *trial_data.window) for trial_data in data] if smoothed else []
         transformed |= smoothed
         self.release_is_shift = np.array([trial_data.trace is None and not transformed for trial_data in data])
-        self.identical_trials = first_identical_trials(data, self.inputs, self.bends)
-        self.any_identical = bool(np.any(self.identical_trials != np.arange(self.identical_trials.size)))
         self.ratios = [trial_data.trial.travel_ratio for trial_data in data]
         self.times_s = [np.asarray(trial_data.time_s, dtype=float) for trial_data in data]
         self.starts = starts_of(self.times_s)
@@ -300,16 +251,11 @@ class Predictor:
         return self._simulated(model, jobs, times_s).trajectories()
 
     def _simulated(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> Motions:
-        """Trajectories of the jobs; identical replicates of a planned campaign are simulated once."""
-        trajectory_of = np.arange(len(jobs))
-        if times_s is None and self.any_identical:
-            first, trajectory_of = jobs.distinct(self.identical_trials)
-            jobs = jobs.take(first)
+        """Trajectories of the jobs."""
         trials = jobs.trial
         inputs = with_pressures(
             self.inputs[trials], self.inputs[trials, 0] * (1 + jobs.pressure_deviation), jobs.yield_pressure_Pa
         )
-        inputs[:, PAYLOAD_COLUMN] *= jobs.payload_factor
         averages = [self.averages[i] for i in trials] if times_s is None and self.averages else []
         if times_s is None:
             times_s = [average.instants_s for average in averages] or [self.times_s[i] for i in trials]
@@ -324,7 +270,9 @@ class Predictor:
             parameters=jobs.row,
             host=self.host,
         )
-        motions = Motions.of(batch, [self.data[i].trial for i in trials], trajectory_of)
+        out, ends = batch.run()
+        check_completed(ends, [self.data[i].trial.name for i in trials])
+        motions = Motions(batch, out, ends, [self.ratios[i] for i in trials])
         return motions.averaged(averages) if averages else motions
 
     def _traces(self, jobs: Jobs) -> list[Trace | None]:
@@ -344,20 +292,10 @@ class Predictor:
     def job_arrays(self, theta: Floats, trial_effects: Floats) -> Jobs:
         """As `jobs`, in the form of arrays. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
         rows, yields = self.layout.rows(theta)
-        trial_effects = self._total_deviations(theta, trial_effects)
+        deviations = trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] + self.layout.shifts(theta)
         if self.damping_column >= 0:
-            rows[:, self.damping_column] *= np.exp(trial_effects[:, DAMPING_DEVIATION])
-        count = len(self.data)
-        pressure, release = trial_effects[:, PRESSURE], trial_effects[:, RELEASE]
-        return Jobs(np.arange(count), rows, yields, pressure, release, np.ones(count))
-
-    def _total_deviations(self, theta: Floats, trial_effects: Floats) -> Floats:
-        """Trial effects with the systematic differences between trials added to the deviations."""
-        if not self.layout.between:
-            return trial_effects
-        whole = trial_effects.copy()
-        whole[:, [PRESSURE, DAMPING_DEVIATION]] += self.layout.shifts(theta)
-        return whole
+            rows[:, self.damping_column] *= np.exp(deviations[:, 1])
+        return Jobs(np.arange(len(self.data)), rows, yields, deviations[:, 0], trial_effects[:, RELEASE])
 
     def trajectories_at(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
         """Trajectories at given parameters and trial effects. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
@@ -400,8 +338,8 @@ class Predictor:
         """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
         (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1).
         """
-        unperturbed, total = self.job_arrays(theta, trial_effects), self._total_deviations(theta, trial_effects)
-        perturbations = list(self._perturbations(unperturbed, theta, total, trial_effects_only))
+        unperturbed = self.job_arrays(theta, trial_effects)
+        perturbations = list(self._perturbations(unperturbed, theta, trial_effects, trial_effects_only))
         motions = self._simulated(
             self.layout.model, Jobs.concatenated([unperturbed, *(perturbed for _, _, perturbed in perturbations)])
         )
@@ -425,22 +363,38 @@ class Predictor:
                 change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
                 self._clip_after_end(change, motions, perturbed.trial, jobs)
             table[points, place] = change / np.repeat(steps, np.diff(self.starts)[perturbed.trial])
-        columns = self.by_trial(table)
-        self._copy_damping_column(columns)
-        self._fill_between_columns(columns)
+        if DAMPING in self.layout.keys:
+            # The sensitivity to ln B of the vine is also that to the deviation of ln B.
+            points = self._points_of(np.flatnonzero(self.has_damping_deviation))
+            table[points, DAMPING_DEVIATION] = table[points, N_TRIAL_EFFECTS + self.layout.keys.index(DAMPING)]
+        for term in self.layout.between:
+            if term.key in self.layout.keys:
+                # The sensitivity to a difference between trials is that to the deviation, times the regressor.
+                column, source = self.layout.keys.index(term.key), PRESSURE if term.pressure else DAMPING_DEVIATION
+                trials = np.flatnonzero(self.layout.index[:, column] >= 0)
+                points, regressor = (
+                    self._points_of(trials),
+                    np.repeat(term.regressor[trials], np.diff(self.starts)[trials]),
+                )
+                table[points, N_TRIAL_EFFECTS + column] = term.scale * regressor * table[points, source]
         if not (trial_effects_only or past_end):
-            self._adapt_steps(table)
-        return columns
+            # Steps for the next call, by how far these moved the trajectories.
+            responses = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
+            self.steps = _adapted_steps(np.max(responses[:, N_TRIAL_EFFECTS:-1], axis=0, initial=0.0), self.steps)
+            self.pressure_step = _adapted_steps(responses[:, PRESSURE], self.pressure_step)
+        return self.by_trial(table)
 
     def _points_of(self, trials: NDArray[np.int_]) -> slice | NDArray[np.int_]:
         """Rows of some trials among the concatenated points of all."""
         if trials.size == len(self.data):
             return slice(None)
-        return np.concatenate([np.arange(self.starts[i], self.starts[i + 1]) for i in trials])
+        chosen = np.zeros(len(self.data), dtype=bool)
+        chosen[trials] = True
+        return np.flatnonzero(np.repeat(chosen, np.diff(self.starts)))
 
     def _clip_after_end(self, change: Floats, motions: Motions, trials: NDArray[np.int_], jobs: slice) -> None:
-        """Set the changes of position after the end of growth, see `position_change.clip_at_end`."""
-        ends = motions.ends[motions.trajectory_of]
+        """Set the changes of position after the end of growth, see `clip_at_end`."""
+        ends = motions.ends
         if not np.any(ends[trials, 0] == ENDED):
             return
         starts = starts_of([self.times_s[i] for i in trials])
@@ -482,59 +436,18 @@ class Predictor:
             places = self.layout.index[trials_of_key, column]
             step = float(self.steps[column])
             steps = np.where(theta[places] + step > upper[places], -step, step)
-            perturbed = unperturbed.take(trials_of_key)
-            parameters = [self.layout.free[place] for place in places]
-            perturbed_theta = theta[places] + steps
-            if key == YIELD_PRESSURE:
-                perturbed.yield_pressure_Pa[:] = [
-                    number.from_scaled(x) for number, x in zip(parameters, perturbed_theta, strict=True)
-                ]
-            elif key == DAMPING:
-                perturbed_theta = perturbed_theta + trial_effects[trials_of_key, DAMPING_DEVIATION]
-                perturbed.row[:, self.damping_column] = [
-                    number.from_scaled(x) for number, x in zip(parameters, perturbed_theta, strict=True)
-                ]
-            else:
-                pairs = zip(parameters, theta[places], perturbed_theta, strict=True)
-                k = self.layout.model.parameter_names.index(key)
-                perturbed.row[:, k] += [number.from_scaled(x) - number.from_scaled(base) for number, base, x in pairs]
+            perturbed_theta = theta.copy()
+            perturbed_theta[places] = theta[places] + steps
+            perturbed = self.job_arrays(perturbed_theta, trial_effects).take(trials_of_key)
             yield N_TRIAL_EFFECTS + column, steps, perturbed
 
-    def _copy_damping_column(self, columns: list[Floats]) -> None:
-        """Copy the sensitivity to ln B to the deviation of ln B: they are the same."""
-        if DAMPING not in self.layout.keys:
-            return
-        column = self.layout.keys.index(DAMPING)
-        for i in np.flatnonzero(self.has_damping_deviation):
-            columns[i][:, DAMPING_DEVIATION] = columns[i][:, N_TRIAL_EFFECTS + column]
 
-    def _fill_between_columns(self, columns: list[Floats]) -> None:
-        """Sensitivities to coefficients of differences between trials: that to the deviation, times the regressor."""
-        for term in self.layout.between:
-            if term.key not in self.layout.keys:
-                continue
-            column, source = self.layout.keys.index(term.key), PRESSURE if term.pressure else DAMPING_DEVIATION
-            for i in np.flatnonzero(self.layout.index[:, column] >= 0):
-                columns[i][:, N_TRIAL_EFFECTS + column] = term.scale * term.regressor[i] * columns[i][:, source]
-
-    def _adapt_steps(self, table: Floats) -> None:
-        """Adapt the step sizes for the next call to how far these steps moved the trajectories."""
-        responses = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
-        for column in range(len(self.layout.keys)):
-            self.steps[column] = _adapted_step(
-                float(np.max(responses[:, N_TRIAL_EFFECTS + column])), float(self.steps[column])
-            )
-        for i in np.flatnonzero(self.has_pressure_deviation):
-            self.pressure_step[i] = _adapted_step(float(responses[i, PRESSURE]), float(self.pressure_step[i]))
-
-
-def _adapted_step(response: float, previous: float) -> float:
-    """Step that gives the target response, from the response to a unit step."""
-    if not response > 0:
-        return previous
+def _adapted_steps(response: Floats, previous: Floats) -> Floats:
+    """Steps that give the target response, from the responses to unit steps."""
     # 2e-3: finite differences use steps that move a trajectory by this fraction of its travel (derived)
     # 1e-5, 0.1: least and largest relative step of a finite difference (derived)
-    return float(np.clip(2e-3 / response, 1e-5, 0.1))
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        return np.where(response > 0, np.clip(2e-3 / response, 1e-5, 0.1), previous)
 
 
 # ------------------------------------------------------------------------------
@@ -580,18 +493,16 @@ def candidates(
         for number in layout.free
     ]
     combined = list(itertools.islice(itertools.product(*start_values), 12))
-    starts_found: list[tuple[Floats, Floats]] = []
+    scored = []
     for values in combined:
         theta = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
         starts = _scan_damping(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
-        starts_found += [(start, trial_effects) for start in starts]
-    scored = []
-    for theta, initial in starts_found:
-        try:
-            releases, misfit = align(data, predictor, theta, initial)
-        except SimulationError:
-            continue
-        scored.append((float(np.sum(misfit)), theta, releases))
+        for start in starts:
+            try:
+                releases, misfit = align(data, predictor, start, trial_effects)
+            except SimulationError:
+                continue
+            scored.append((float(np.sum(misfit)), start, releases))
     return sorted(scored, key=lambda scored_start: scored_start[0])
 
 
@@ -615,8 +526,10 @@ def _scan_damping(
     key = layout.keys.index(DAMPING)
     damping_index = layout.index[:, key]
     starts = []
+    names = layout.model.parameter_names
+    fixed_n = float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
     # (0.15, 0.37, 0.65, 1.0): exponents of the grid (chosen)
-    for n in (0.15, 0.37, 0.65, 1.0) if free_n else (_fixed_exponent(layout),):
+    for n in (0.15, 0.37, 0.65, 1.0) if free_n else (fixed_n,):
         values = theta.copy()
         values[free_n] = [layout.free[k].to_scaled(n) for k in free_n]
         guess = {
@@ -641,11 +554,6 @@ def _scan_damping(
             values[k] = B
         starts.append(values)
     return starts
-
-
-def _fixed_exponent(layout: ParameterMap) -> float:
-    names = layout.model.parameter_names
-    return float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
 
 
 def middle_speed(trial_data: FitTrial) -> float:

@@ -1,8 +1,8 @@
-"""Solve for the parameters from several starting values; where the solution is poor, again with fixed noise.
+"""Solve for the parameters; where the solution is poor, again with the noise correlation of the tracks.
 
 A fit estimates the noise together with its parameters. From poor starting values it may absorb the whole misfit as slow
 noise: the likelihood is then high and the parameters are wrong. `is_poor_fit` recognises such a solution by its
-residual relative to the growth; the fit is then repeated with the noise fixed at that of the tracks.
+residual relative to the growth; the fit is then repeated with the noise correlation fixed at that of the tracks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.core.units import display_unit
-from vinetrack.dynamics.model import Model, values_by_key
+from vinetrack.dynamics.model import values_by_key
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import (
@@ -30,24 +30,21 @@ from vinetrack.inference.fit_result import (
     TrialFit,
 )
 from vinetrack.inference.marginal_likelihood import (
-    RIDGE,
     FitState,
     MixedProblem,
     bounded_solve,
-    deviance,
-    estimate_between_trial_sd,
-    marginal,
+    eliminated,
     solve_per_trial,
     sum_matrix_blocks,
     sum_vector_blocks,
     trial_effect_prior,
     trial_effects_eliminated,
+    whitened_products,
+    with_diagonal,
 )
 from vinetrack.inference.optimiser import (
     MOST_ITERATIONS,
-    POOR_FIT,
     FixedTerms,
-    Shortfall,
     Solution,
     Watch,
     chi2_per_dof,
@@ -62,7 +59,6 @@ from vinetrack.inference.position_errors import (
     Pooled,
     Precision,
     SmoothErrors,
-    first_parameters,
     near_bound,
     pool,
     precision,
@@ -83,7 +79,7 @@ from vinetrack.inference.sensitivity import (
     initial_trial_effects,
 )
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, trial_costs
-from vinetrack.inference.whitening import at_correlation, whiten
+from vinetrack.inference.whitening import whiten
 
 # Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks (chosen)
 CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
@@ -91,59 +87,37 @@ CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
 
 SLOW_NOISE = 0.99  # Noise correlation above which a fit has absorbed misfit as noise (chosen)
 
-# Steps at the noise of the tracks, and χ² per degree of freedom after them above which the attempt is given up (chosen)
-TRACK_NOISE_ITERATIONS, GIVE_UP_CHI2 = 8, 30.0
-
-# Between-trial standard deviations of pressure and ln B that are fixed while the noise is (chosen)
-TRACK_CORRELATION_SD, TRACK_NOISE_SD = (5e-4, 1e-3), (0.01, 0.03)
+# Between-trial standard deviations of pressure and ln B that are fixed while the noise correlation is (chosen)
+TRACK_CORRELATION_SD = (5e-4, 1e-3)
 
 
 def solve_from_scratch(
     predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, thorough: bool
 ) -> Solution:
-    """Solve from the starting values of least misfit and return the best solution. Later starting values are tried only
-    until a fit converges; a poor best solution is repeated at the noise correlation of the tracks.
+    """Solve from the starting values of least misfit. A poor solution is repeated at the noise correlation of the
+    tracks, and from further starting values where `thorough`.
     """
-    solutions: list[Solution] = []
-    reason = ""
+    reason = "no trajectory could be simulated"
     # 3: maximum number of starting values (chosen)
     starts = candidates(predictor.layout, predictor.data, predictor)[:3]
+    most_iterations = MOST_ITERATIONS if thorough else CONTINUATION_ITERATIONS
     for _, theta, trial_effects in starts:
         try:
-            most_iterations = MOST_ITERATIONS if thorough else CONTINUATION_ITERATIONS
-            solutions.append(
-                solve_from(predictor, theta, trial_effects, fixed_terms, most_iterations=most_iterations, watch=watch)
+            free = solve_from(
+                predictor, theta, trial_effects, fixed_terms, most_iterations=most_iterations, watch=watch
             )
+            break
         except SimulationError as error:
             reason = str(error)
-            continue
-        if solutions[-1].converged or not thorough:
-            break
-    if not solutions:
-        raise FitError(
-            f"The model cannot be simulated from any starting values: {reason or 'no trajectory could be simulated'}"
-        )
-    best = min(solutions, key=_deviance)
-    if not is_poor_fit(predictor, best):
-        return _with_noise_refitted(predictor, best, fixed_terms, watch)
+    else:
+        raise FitError(f"The model cannot be simulated from any starting values: {reason}")
+    if not is_poor_fit(predictor, free):
+        return free
     at_track_correlation = [
         _solve_at_track_correlation(predictor, theta, trial_effects, fixed_terms, watch)
         for _, theta, trial_effects in (starts if thorough else starts[:1])
     ]
-    return _best_unabsorbed(predictor, best, [solution for solution in at_track_correlation if solution is not None])
-
-
-def _with_noise_refitted(
-    predictor: Predictor, best: Solution, fixed_terms: FixedTerms, watch: Watch | None
-) -> Solution:
-    """The solution, or a better one found at the noise of the tracks if its noise is slow. As long as parameters are
-    slightly wrong, all trials share a smooth misfit of a fraction of a per cent. Taken for slow noise, it stops the
-    parameters from moving on.
-    """
-    if best.state.rho < SLOW_NOISE:
-        return best
-    other = _solve_at_track_noise(predictor, best.state.theta, best.state.trial_effects, fixed_terms, watch)
-    return best if other is None else min((best, other), key=_deviance)
+    return _best_unabsorbed(predictor, free, [solution for solution in at_track_correlation if solution is not None])
 
 
 def _best_unabsorbed(predictor: Predictor, free: Solution, at_track_correlation: list[Solution]) -> Solution:
@@ -152,7 +126,7 @@ def _best_unabsorbed(predictor: Predictor, free: Solution, at_track_correlation:
     misfit has a high likelihood.
     """
     good = [solution for solution in at_track_correlation if not is_poor_fit(predictor, solution)]
-    return min(good or at_track_correlation or [free], key=_deviance)
+    return min(good or at_track_correlation or [free], key=lambda solution: solution.deviance())
 
 
 def _solve_at_track_correlation(
@@ -185,7 +159,7 @@ def _solve_at_track_correlation(
             most_iterations=TRACK_CORRELATION_ITERATIONS,
             watch=watch,
             search=not then_free,
-            shortfall=_shortfall_from(goal) if math.isfinite(goal) else None,
+            goal=goal,
         )
         if not then_free:
             return first
@@ -203,110 +177,31 @@ def _solve_at_track_correlation(
         return None
 
 
-def _shortfall_from(goal: float) -> Shortfall:
-    """−2 ln L of a fit, profiled over its shared parameters, minus that of the `goal` (a ln L)."""
-
-    def shortfall(cross_products: Floats, problem: MixedProblem, state: FitState, _: float) -> float:
-        reached = deviance(marginal(cross_products, problem, state), problem, state, state.spread, restricted=False)
-        return reached + 2 * goal
-
-    return shortfall
-
-
-def _shortfall_from_giving_up(_: Floats, problem: MixedProblem, __: FitState, penalised_squares: float) -> float:
-    """By how much −2 ln L must fall until χ² per point is GIVE_UP_CHI2, with the noise variance profiled out."""
-    points = float(np.sum(problem.points))
-    return points * math.log(max(penalised_squares, 1e-300) / (GIVE_UP_CHI2 * points))
-
-
-def _solve_at_track_noise(
-    predictor: Predictor,
-    theta: Floats,
-    trial_effects: Floats,
-    fixed_terms: FixedTerms,
-    watch: Watch | None,
-    *,
-    search: bool = False,
-) -> Solution | None:
-    """Solve with the noise fixed at that of the tracks, so that misfit cannot enlarge it, then with all terms free. For
-    parameters that are nearly right: otherwise trials whose pressure or B is far from the set value would be treated as
-    noise altogether. None if the fit stays poor.
-    """
-    if fixed_terms.noise is not None:
-        return None
-    state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
-    noise = FixedTerms(spread=fixed_terms.spread or TRACK_NOISE_SD, noise=(state.rho, state.variance))
-    try:
-        first = solve(
-            predictor,
-            problem,
-            state,
-            noise,
-            warm=True,
-            most_iterations=TRACK_NOISE_ITERATIONS,
-            watch=watch,
-            search=search,
-            shortfall=_shortfall_from_giving_up if search else None,
-        )
-        if chi2_per_dof(predictor, first) > GIVE_UP_CHI2:
-            return None
-        if not first.converged:
-            first = solve(
-                predictor, problem, first.state, noise, warm=True, most_iterations=CONTINUATION_ITERATIONS, watch=watch
-            )
-        if chi2_per_dof(predictor, first) > POOR_FIT:
-            return None
-        return solve(
-            predictor,
-            problem,
-            first.state,
-            fixed_terms,
-            warm=True,
-            most_iterations=CONTINUATION_ITERATIONS,
-            watch=watch,
-        )
-    except SimulationError:
-        return None
-
-
 def solve_from(
     predictor: Predictor,
     theta: Floats,
     trial_effects: Floats,
     fixed_terms: FixedTerms,
-    *,
-    most_iterations: int = MOST_ITERATIONS,
-    watch: Watch | None = None,
-    search: bool = False,
+    **how: Any,
 ) -> Solution:
-    """Solve from given parameters and trial effects, with the initial noise and standard deviations of `first_state`.
-    Shapes: theta (n_free,); trial_effects (n_trials, 4).
+    """Solve from given parameters and trial effects, with the initial noise and standard deviations of `first_state`;
+    `how` are options of `solve`. Shapes: theta (n_free,); trial_effects (n_trials, 4).
     """
     state = first_state(predictor.data, theta, trial_effects)
-    problem = make_problem(predictor, trial_effects)
-    return solve(predictor, problem, state, fixed_terms, most_iterations=most_iterations, watch=watch, search=search)
+    return solve(predictor, make_problem(predictor, trial_effects), state, fixed_terms, **how)
 
 
 def solve_onward(
-    predictor: Predictor,
-    before: Solution,
-    theta: Floats,
-    fixed_terms: FixedTerms,
-    *,
-    most_iterations: int = MOST_ITERATIONS,
-    watch: Watch | None = None,
-    search: bool = False,
+    predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, *, search: bool = False, **how: Any
 ) -> Solution:
-    """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution. Shapes:
-    theta (n_free,).
+    """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
+    are options of `solve`. Shapes: theta (n_free,).
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
     )
     state = start_at_fixed_noise(predictor, problem, replace(before.state, theta=theta), fixed_terms, search=search)
-    return solve(
-        predictor, problem, state, fixed_terms, warm=True, most_iterations=most_iterations, watch=watch, search=search
-    )
+    return solve(predictor, problem, state, fixed_terms, warm=True, search=search, **how)
 
 
 def solve_again(
@@ -318,7 +213,7 @@ def solve_again(
     thorough: bool,
     goal: float = -math.inf,
 ) -> Solution:
-    """The solution, or, if it is poor, one found from its parameters with the noise of the tracks."""
+    """The solution, or, if it is poor, one found from its parameters with the noise correlation of the tracks."""
     if not is_poor_fit(predictor, solution):
         return solution
     theta = solution.state.theta
@@ -326,22 +221,14 @@ def solve_again(
         trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
     except SimulationError:
         return solution
-    at_track_noise = _solve_at_track_noise(predictor, theta, trial_effects, fixed_terms, watch, search=not thorough)
-    if at_track_noise is not None and not is_poor_fit(predictor, at_track_noise):
-        return at_track_noise
-    at_track_correlation = _solve_at_track_correlation(
+    again = _solve_at_track_correlation(
         predictor, theta, trial_effects, fixed_terms, watch, then_free=thorough, goal=goal
     )
-    return solution if at_track_correlation is None else _best_unabsorbed(predictor, solution, [at_track_correlation])
-
-
-def _deviance(solution: Solution) -> float:
-    part = marginal(solution.cross_products, solution.problem, solution.state)
-    return deviance(part, solution.problem, solution.state, solution.state.spread)
+    return solution if again is None else _best_unabsorbed(predictor, solution, [again])
 
 
 def start_at_fixed_noise(
-    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, *, search: bool = False
+    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, *, search: bool
 ) -> FitState:
     """Starting values of a warm fit; where they are bad, the result of a descent with the noise fixed. With free noise,
     the misfit of bad starting values would be absorbed as noise and stall the optimiser.
@@ -376,17 +263,11 @@ MOST_ROUNDS, CONVERGED_SIGMAS = 4, 0.1
 
 
 def with_fitted_trace_errors(
-    predictor: Predictor,
-    solution: Solution,
-    held: FixedTerms,
-    *,
-    most_iterations: int = MOST_ITERATIONS,
-    watch: Watch | None = None,
-    search: bool = False,
+    predictor: Predictor, solution: Solution, held: FixedTerms, **how: Any
 ) -> tuple[Predictor, Solution]:
     """A solution with the errors of the recorded pressures estimated, and the predictor of the corrected pressures. A
     poor model would distort the pressures: its trials keep the recorded ones. So do trials whose trace is no curve: the
-    errors of local lines are not known in detail. Returns predictor, Solution.
+    errors of local lines are not known in detail. `how` are options of `solve`. Returns predictor, Solution.
     """
     if not any(_has_errors(trial_data) for trial_data in predictor.data):
         return predictor, solution
@@ -399,10 +280,7 @@ def with_fitted_trace_errors(
         corrected = [_corrected(trial_data, more) for trial_data, more in zip(predictor.data, step, strict=True)]
         corrected_predictor = Predictor(predictor.layout, corrected, predictor.host)
         try:
-            solution = solve_onward(
-                corrected_predictor, solution, solution.state.theta, held,
-                most_iterations=most_iterations, watch=watch, search=search,
-            )  # fmt: skip
+            solution = solve_onward(corrected_predictor, solution, solution.state.theta, held, **how)
         except SimulationError:
             break
         predictor = corrected_predictor
@@ -416,14 +294,6 @@ def trace_error_penalty(data: Sequence[FitTrial]) -> float:
         for trial_data in data
         if trial_data.trace_error_sizes is not None
     )
-
-
-def trace_correction_Pa(trial_data: FitTrial) -> Floats:
-    """Correction of the recorded pressure of a trial by a fit. Shape (n_samples,)."""
-    assert trial_data.trace is not None
-    if trial_data.trace_errors_Pa is None or trial_data.trace_error_sizes is None:
-        return np.zeros(trial_data.trace[0].size)
-    return trial_data.trace_errors_Pa @ trial_data.trace_error_sizes
 
 
 def as_recorded(trial_data: FitTrial) -> FitTrial:
@@ -468,16 +338,17 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     )
     p = solution.cross_products.shape[-1] - N_TRIAL_EFFECTS - 1
     blocks = trial_effects_eliminated(cross_products, p, problem, state)
-    # Normal equations with the errors eliminated as well, each with a standard normal prior.
-    square = blocks[:, p + 1 :, p + 1 :] + np.eye(errors.n_columns)
-    mixed, slope = blocks[:, p + 1 :, :p], blocks[:, p + 1 :, p] - sizes
-    solved = solve_per_trial(square, np.concatenate([mixed, slope[:, :, None]], axis=2))
-    information = sum_matrix_blocks(blocks[:, :p, :p] - np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
-    gradient = sum_vector_blocks(blocks[:, :p, p] - np.einsum("nek,ne->nk", mixed, solved[:, :, -1]), problem)
+    # The errors come first; they are eliminated as well, each with a standard normal prior.
+    order = [*range(p + 1, blocks.shape[-1]), *range(p + 1)]
+    blocks = blocks[:, order][:, :, order]
+    blocks[:, : errors.n_columns, -1] -= sizes
+    reduced, response = eliminated(blocks, np.ones_like(sizes))
+    information = sum_matrix_blocks(reduced[:, :-1, :-1], problem) + np.diag(problem.prior_precision)
+    gradient = sum_vector_blocks(reduced[:, :-1, -1], problem)
     gradient -= problem.prior_precision * (state.theta - problem.prior_mean)
-    step, _ = bounded_solve(information + np.diag(problem.prior_precision), gradient, problem, state.theta)
+    step, _ = bounded_solve(information, gradient, problem, state.theta)
     spread_out = np.append(step, 0.0)[problem.index]
-    return np.asarray(solved[:, :, -1] - np.einsum("nek,nk->ne", solved[:, :, :-1], spread_out))
+    return np.asarray(response[:, :, -1] - np.einsum("nek,nk->ne", response[:, :, :-1], spread_out))
 
 
 # ------------------------------------------------------------------------------
@@ -495,25 +366,14 @@ def fit_messages(
     between: Floats,
     chi2: float,
 ) -> tuple[str, ...]:
-    """All messages of a fit. Shapes: between (n_numbers, n_numbers)."""
-    return (
-        *_messages(predictor.layout, solution, numbers, precision, chi2),
-        *_disagreement_messages(numbers, between),
-        *_weighting_messages(predictor.data),
-        *_smoothing_messages(predictor.data),
-        *_pressure_messages(predictor.data),
-    )
-
-
-def _messages(
-    layout: ParameterMap, solution: Solution, numbers: Sequence[Number], precision: Precision, chi2: float
-) -> list[str]:
-    """Warnings on convergence, on each number, and on the size of the residuals."""
+    """Warnings on convergence, on each number, on the size of the residuals and on trials that disagree; notes on the
+    data. Shapes: between (n_numbers, n_numbers).
+    """
     messages = []
     if not solution.converged:
         messages.append(f"the fit did not converge in {solution.iterations} iterations: its values are not reliable")
     for k, number in enumerate(numbers):
-        free = layout.free[k]
+        free = predictor.layout.free[k]
         if precision.insensitive[k]:
             messages.append(
                 f"{number.title} ({number.key}) has no influence on the trajectories: it stays at {number.value:.4g}"
@@ -537,29 +397,6 @@ def _messages(
             f"{n.title} ({n.key})" for n, collinear in zip(numbers, precision.collinear, strict=True) if collinear
         ]
         messages.append(f"these data do not determine separate values of {', '.join(titles)}")
-    messages += _correlation_messages(numbers, precision)
-    for k, name in enumerate(SPREAD_NAMES):
-        if solution.problem.has_deviation[:, k].any() and not solution.estimable[k]:
-            messages.append(
-                f"the between-trial standard deviation of {name} is taken as {100 * solution.state.spread[k]:.2g} %"
-            )
-    # 2.0: χ² per degree of freedom from which the fit warns of misfit (chosen)
-    if chi2 > 2.0:
-        messages.append(
-            f"the residuals are {math.sqrt(chi2):.3g} times the noise of the tracks{_variation_allowed(solution)}:"
-            " an effect is missing, or the tracks have slow errors larger than their noise"
-        )
-    return messages
-
-
-def _variation_allowed(solution: Solution) -> str:
-    """Which of B and pressure may vary from trial to trial, as a clause; blank if the bodies have neither."""
-    varying = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.has_deviation[:, k].any()]
-    return f", although {' and '.join(varying)} may vary from trial to trial" if varying else ""
-
-
-def _correlation_messages(numbers: Sequence[Number], precision: Precision) -> list[str]:
-    pairs = []
     variance = np.diag(precision.covariance)
     usable = np.flatnonzero(np.isfinite(variance) & (variance > 0))
     for i, j in itertools.combinations(usable.tolist(), 2):
@@ -567,12 +404,20 @@ def _correlation_messages(numbers: Sequence[Number], precision: Precision) -> li
         # 0.98: correlation of two fitted numbers from which the fit warns (chosen)
         if abs(correlation) > 0.98:
             first, second = numbers[i].title, numbers[j].title
-            pairs.append(f"{first} and {second} are strongly correlated ({correlation:.3f})")
-    return pairs
-
-
-def _disagreement_messages(numbers: Sequence[Number], between: Floats) -> list[str]:
-    """A message naming the numbers on which trials disagree by more than the error of their mean."""
+            messages.append(f"{first} and {second} are strongly correlated ({correlation:.3f})")
+    for k, name in enumerate(SPREAD_NAMES):
+        if solution.problem.has_deviation[:, k].any() and not solution.estimable[k]:
+            messages.append(
+                f"the between-trial standard deviation of {name} is taken as {100 * solution.state.spread[k]:.2g} %"
+            )
+    # 2.0: χ² per degree of freedom from which the fit warns of misfit (chosen)
+    if chi2 > 2.0:
+        varying = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.has_deviation[:, k].any()]
+        although = f", although {' and '.join(varying)} may vary from trial to trial" if varying else ""
+        messages.append(
+            f"the residuals are {math.sqrt(chi2):.3g} times the noise of the tracks{although}:"
+            " an effect is missing, or the tracks have slow errors larger than their noise"
+        )
     sd = np.sqrt(np.diag(between))
     # 1.0: standard deviation between trials, in errors of the shared number, from which the fit says that trials
     # disagree
@@ -581,42 +426,39 @@ def _disagreement_messages(numbers: Sequence[Number], between: Floats) -> list[s
         for k, n in enumerate(numbers)
         if sd[k] > 1.0 * n.sigma and math.isfinite(n.sigma)
     ]
-    if not disagreements:
-        return []
-    return [f"trials disagree by more than their noise, in {', '.join(disagreements)}: they get nearly equal weights"]
+    if disagreements:
+        where = ", ".join(disagreements)
+        messages.append(f"trials disagree by more than their noise, in {where}: they get nearly equal weights")
+    return (*messages, *_notes_on_data(predictor.data))
 
 
-def _weighting_messages(data: Sequence[FitTrial]) -> list[str]:
-    """A note on points with unequal weights."""
+def _notes_on_data(data: Sequence[FitTrial]) -> list[str]:
+    """Notes on points with unequal weights, on positions that were smoothed before they were imported, and on recorded
+    pressures that the fit corrected.
+    """
+    notes = []
     weighted = [trial_data for trial_data in data if trial_data.relative_sd is not None]
-    if not weighted:
-        return []
-    if weighted[0].blur_s > 0:
+    if weighted and weighted[0].blur_s > 0:
         blur_us = 1e6 * weighted[0].blur_s
-        return [
+        notes.append(
             f"the noise of positions grows with speed, by {blur_us:.2g} µs × speed: points are weighted accordingly"
-        ]
-    return ["points are weighted by the standard deviations that their files state"]
-
-
-def _smoothing_messages(data: Sequence[FitTrial]) -> list[str]:
-    """Notes on positions that were smoothed before they were imported."""
-    return list(dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None))
-
-
-def _pressure_messages(data: Sequence[FitTrial]) -> list[str]:
-    """A note on recorded pressures that the fit corrected."""
-    corrections = [
-        float(np.max(np.abs(trace_correction_Pa(each)))) for each in data if each.trace_error_sizes is not None
+        )
+    elif weighted:
+        notes.append("points are weighted by the standard deviations that their files state")
+    notes += dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None)
+    corrections_Pa = [
+        each.trace_errors_Pa @ each.trace_error_sizes
+        for each in data
+        if each.trace_errors_Pa is not None and each.trace_error_sizes is not None
     ]
-    if not corrections:
-        return []
-    trials = f"{len(corrections)} trials" if len(corrections) > 1 else "one trial"
-    largest_kPa = max(corrections) / 1e3
-    return [
-        f"recorded pressures of {trials} are corrected by up to {largest_kPa:.2g} kPa, within the errors that the noise"
-        " of the gauge leaves, to agree with the motion"
-    ]
+    if corrections_Pa:
+        trials = f"{len(corrections_Pa)} trials" if len(corrections_Pa) > 1 else "one trial"
+        largest_kPa = max(float(np.max(np.abs(correction_Pa))) for correction_Pa in corrections_Pa) / 1e3
+        notes.append(
+            f"recorded pressures of {trials} are corrected by up to {largest_kPa:.2g} kPa, within the errors that the"
+            " noise of the gauge leaves, to agree with the motion"
+        )
+    return notes
 
 
 def assemble(
@@ -629,30 +471,39 @@ def assemble(
 ) -> Fit:
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
     layout, state = predictor.layout, solution.state
-    plain = log_likelihood(solution) - 0.5 * trace_error_penalty(predictor.data)
+    plain = solution.log_likelihood() - 0.5 * trace_error_penalty(predictor.data)
     smooth = smooth_errors(predictor, solution, options.get("held"))
     extended = smooth.solution if smooth else solution
     by_noise = precision(extended)
-    trials = _trial_fits(predictor, solution, first_parameters(by_noise, len(layout.free)))
+    trials = _trial_fits(predictor, solution, by_noise.first(len(layout.free)))
     pooled = _pooled_if_few(predictor, solution, options)
     if pooled is not None:
+        unknown = np.diag(~np.isfinite(np.diag(by_noise.covariance)))
         extended, by_noise = (
             pooled.solution,
-            replace(by_noise, covariance=_with_undetermined(pooled.covariance, by_noise)),
+            replace(by_noise, covariance=np.where(unknown, math.inf, pooled.covariance)),
         )
     if smooth is not None:
         trials = _with_smooth_errors_removed(trials, smooth)
     precision_of_fit = widened_covariance(predictor, solution, trials, by_noise, extended if smooth else None, pooled)
-    by_noise, precision_of_fit = (first_parameters(each, len(layout.free)) for each in (by_noise, precision_of_fit))
+    by_noise, precision_of_fit = (each.first(len(layout.free)) for each in (by_noise, precision_of_fit))
     numbers = _numbers(predictor, solution, extended.state.theta, by_noise, precision_of_fit, profile=profile)
-    between = _in_SI_units(layout, numbers, _between(pooled, len(numbers)))
+    count = len(numbers)
+    between = np.zeros((count, count)) if pooled is None else pooled.between[:count, :count]
+    between = _in_SI_units(layout, numbers, between)
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
     variance_state = smooth.solution.state if smooth else state
     variance = float(np.average(variance_state.variance, weights=weights)) / (1 - variance_state.rho**2)
     has_deviations = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
+    # Yield pressures belong to the trials and stay in the numbers.
+    values = [
+        (number.key, number.vine, number.value)
+        for number in numbers
+        if number.key != YIELD_PRESSURE and layout.term(number.key) is None
+    ]
     return Fit(
-        model=_fitted_model(layout, numbers),
+        model=layout.model.with_values(values_by_key(values)),
         numbers=numbers,
         covariance=_in_SI_units(layout, numbers, precision_of_fit.covariance),
         spreads={
@@ -706,33 +557,6 @@ def _pooled_if_few(predictor: Predictor, solution: Solution, options: Mapping[st
     return None
 
 
-def _between(pooled: Pooled | None, count: int) -> Floats:
-    return np.zeros((count, count)) if pooled is None else pooled.between[:count, :count]
-
-
-def _with_undetermined(covariance: Floats, precision_of_fit: Precision) -> Floats:
-    unknown = ~np.isfinite(np.diag(precision_of_fit.covariance))
-    return np.where(np.diag(unknown), math.inf, covariance)
-
-
-def log_likelihood(solution: Solution) -> float:
-    """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare models."""
-    part = marginal(solution.cross_products, solution.problem, solution.state)
-    spread = estimate_between_trial_sd(part, solution.problem, solution.state, solution.estimable, restricted=False)
-    return -0.5 * deviance(part, solution.problem, solution.state, spread, restricted=False)
-
-
-def _fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
-    """The model with the fitted values; yield pressures belong to the trials and stay in the numbers."""
-    return layout.model.with_values(
-        values_by_key(
-            (number.key, number.vine, number.value)
-            for number in numbers
-            if number.key != YIELD_PRESSURE and layout.term(number.key) is None
-        )
-    )
-
-
 def _numbers(
     predictor: Predictor,
     solution: Solution,
@@ -762,10 +586,7 @@ def _numbers(
         at = [b for b in (problem.lower[k], problem.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
         numbers.append(
             Number(
-                key=number.key,
-                vine=number.vine,
-                symbol=number.symbol,
-                unit=number.unit,
+                **{name: getattr(number, name) for name in ("key", "vine", "symbol", "unit")},
                 value=number.from_scaled(float(theta[k])),
                 sigma=float(sigma[k]) * number.derivative(number.from_scaled(float(theta[k]))),
                 low=_bound_in_SI_units(number, low),
@@ -792,15 +613,12 @@ def _in_SI_units(layout: ParameterMap, numbers: Sequence[Number], covariance: Fl
 def _trial_effect_sigma(solution: Solution, precision_of_fit: Precision) -> Floats:
     """Standard errors of the trial effects, including those of the shared parameters, shape (n_trials, 4)."""
     problem, state = solution.problem, solution.state
-    white = at_correlation(solution.cross_products, state.rho) / state.variance[:, None, None]
-    precision_own = trial_effect_prior(problem, state)[1]
-    square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision_own[:, :, None] * np.eye(N_TRIAL_EFFECTS)
-    scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
-    scaled = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(N_TRIAL_EFFECTS)
-    inverse = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
+    white = whitened_products(solution.cross_products, state)
+    square = with_diagonal(white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], trial_effect_prior(problem, state)[1])
+    inverse = solve_per_trial(square, np.broadcast_to(np.eye(N_TRIAL_EFFECTS), square.shape))
     response = inverse @ white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
-    shared = np.zeros((state.theta.size + 1,) * 2)
-    shared[:-1, :-1] = np.where(np.isfinite(precision_of_fit.covariance), precision_of_fit.covariance, 0.0)
+    known = np.where(np.isfinite(precision_of_fit.covariance), precision_of_fit.covariance, 0.0)
+    shared = np.pad(known, (0, 1))
     shared_of_trial = shared[problem.index[:, :, None], problem.index[:, None, :]]
     total = inverse + response @ shared_of_trial @ np.swapaxes(response, 1, 2)
     sigma = np.sqrt(np.maximum(np.einsum("nkk->nk", total), 0.0))

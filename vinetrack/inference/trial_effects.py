@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import ParameterMap
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
     trial_effect_penalty,
     trial_effect_prior,
     trial_effect_step,
+    whitened_products,
+    with_diagonal,
 )
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -31,10 +32,10 @@ from vinetrack.inference.sensitivity import (
     ORIGIN,
     PRESSURE,
     RELEASE,
-    Job,
+    Jobs,
     Predictor,
 )
-from vinetrack.inference.whitening import at_correlation, whiten
+from vinetrack.inference.whitening import whiten
 
 # ------------------------------------------------------------------------------
 # Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take cross products.
@@ -90,69 +91,45 @@ def products_at_releases(
 Indices = NDArray[np.int_]
 
 
-def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
-    """Indices of the free parameters that apply to some of these trials, in order."""
-    applicable = np.unique(layout.index[rows])
-    return np.asarray(applicable[applicable >= 0])
-
-
-def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:
-    """The layout of these trials and parameters; names, scales and priors are unchanged."""
-    new_index = np.full(len(layout.free) + 1, -1)
+def subset(
+    predictor: Predictor, problem: MixedProblem, rows: Indices, *states: FitState, every_parameter: bool = False
+) -> tuple[Predictor, MixedProblem, list[FitState]]:
+    """Predictor, with the finite-difference steps of the other, problem and states of some trials and of the parameters
+    that apply to one of them, or of every parameter; names, scales and priors are unchanged.
+    """
+    whole = predictor.layout
+    places = np.arange(len(whole.free)) if every_parameter else np.unique(whole.index[rows])
+    places = places[places >= 0]
+    new_index = np.full(len(whole.free) + 1, -1)
     new_index[places] = np.arange(places.size)
-    index = new_index[layout.index[rows]]
+    index = new_index[whole.index[rows]]
     columns = np.flatnonzero((index >= 0).any(axis=0))
-    return replace(
-        layout,
-        free=tuple(layout.free[place] for place in places),
-        keys=tuple(layout.keys[column] for column in columns),
+    layout = replace(
+        whole,
+        free=tuple(whole.free[place] for place in places),
+        keys=tuple(whole.keys[column] for column in columns),
         index=index[:, columns].astype(int),
-        base=layout.base[rows],
+        base=whole.base[rows],
         between=tuple(
             replace(term, groups=tuple(term.groups[row] for row in rows), regressor=term.regressor[rows])
-            for term in layout.between
+            for term in whole.between
         ),
     )
-
-
-def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Predictor:
-    """A predictor of these trials, with the finite-difference steps of the other."""
-    layout = _subset_layout(predictor.layout, rows, places)
     smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
-    smaller.pressure_step = predictor.pressure_step[rows].copy()
-    smaller.steps = np.array([predictor.steps[predictor.layout.keys.index(key)] for key in layout.keys])
-    return smaller
-
-
-def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
-    """The state of these trials and parameters."""
-    return replace(
-        state, theta=state.theta[places], trial_effects=state.trial_effects[rows], variance=state.variance[rows]
-    )
-
-
-def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
-    """The problem of these trials and parameters."""
-
-    def numbers(values: Floats) -> Floats:
-        return values[places]
-
-    return replace(
+    smaller.pressure_step, smaller.steps = predictor.pressure_step[rows], predictor.steps[columns]
+    by_trial = "has_deviation gauge_error release_origin_mean release_origin_precision points stretches"
+    by_parameter = "prior_mean prior_precision lower upper free random"
+    problem = replace(
         problem,
         index=layout.index,
-        has_deviation=problem.has_deviation[rows],
-        gauge_error=problem.gauge_error[rows],
-        release_origin_mean=problem.release_origin_mean[rows],
-        release_origin_precision=problem.release_origin_precision[rows],
-        prior_mean=numbers(problem.prior_mean),
-        prior_precision=numbers(problem.prior_precision),
-        lower=numbers(problem.lower),
-        upper=numbers(problem.upper),
-        free=problem.free[places],
-        points=problem.points[rows],
-        stretches=problem.stretches[rows],
-        random=problem.random[places],
+        **{name: getattr(problem, name)[rows] for name in by_trial.split()},
+        **{name: getattr(problem, name)[places] for name in by_parameter.split()},
     )
+    reduced = [
+        replace(each, theta=each.theta[places], trial_effects=each.trial_effects[rows], variance=each.variance[rows])
+        for each in states
+    ]
+    return smaller, problem, reduced
 
 
 LARGEST_DEVIATION = 0.9  # Largest deviation of pressure and ln B (chosen)
@@ -167,17 +144,14 @@ def optimise_trial_effects(
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
     cross_products = predictor.products(columns)
-    steps = [
+    (step, decrease), (step_at_release, _) = (
         trial_effect_step(cross_products, problem, state, fixed_release=fixed_release)
         for fixed_release in (False, True)
-    ]
+    )
     current_costs = trial_costs(predictor, problem, state, residuals_in(columns))
-    if (
-        float(np.sum(current_costs - _predicted_decrease(cross_products, problem, state, steps[0])))
-        >= largest_useful_cost
-    ):
+    if float(np.sum(current_costs - decrease)) >= largest_useful_cost:
         return state, current_costs
-    moved_effects = [limited_step(predictor, state.trial_effects, step) for step in steps]
+    moved_effects = [limited_step(predictor, state.trial_effects, each) for each in (step, step_at_release)]
     candidates = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved_effects)]
     residuals_of_candidates = zip(candidates[1:], predictor.residuals_of_each(state.theta, moved_effects), strict=True)
     costs = np.array(
@@ -189,13 +163,6 @@ def optimise_trial_effects(
     best = np.argmin(costs, axis=0)
     trial_effects = np.array([candidates[candidate].trial_effects[i] for i, candidate in enumerate(best)])
     return replace(state, trial_effects=trial_effects), np.min(costs, axis=0)
-
-
-def _predicted_decrease(cross_products: Floats, problem: MixedProblem, state: FitState, step: Floats) -> Floats:
-    """Decrease of the cost of each trial by a Gauss–Newton step of its effects, shape (n_trials,)."""
-    centre, precision = trial_effect_prior(problem, state)
-    gradient = at_correlation(cross_products[:, :, :N_TRIAL_EFFECTS, -1:], state.rho)[:, :, 0] / state.variance[:, None]
-    return np.asarray(np.sum(step * (gradient - precision * (state.trial_effects - centre)), axis=1))
 
 
 def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
@@ -294,9 +261,9 @@ class ReleaseSearch:
         ]
         if not places:
             return None
-        plain = predictor.jobs(state.theta, state.trial_effects)
         releases = [_candidate_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
-        sensitivities = _release_sensitivities(predictor, [plain[i] for i in places], releases)
+        jobs = predictor.job_arrays(state.theta, state.trial_effects).take(np.array(places))
+        sensitivities = _release_sensitivities(predictor, jobs, releases)
         trial_effects = state.trial_effects.copy()
         centre, precision = trial_effect_prior(problem, state)
         any_moved = False
@@ -316,10 +283,7 @@ class ReleaseSearch:
         rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
         predictor, problem, current = self.predictor, self.problem, state
         if rows.size < len(predictor.data) and predictor.separable:
-            places = parameters_of_trials(predictor.layout, rows)
-            predictor = subset_predictor(predictor, rows, places)
-            problem = subset_problem(problem, predictor.layout, rows, places)
-            current, proposed = (subset_state(each, rows, places) for each in (state, proposed))
+            predictor, problem, (current, proposed) = subset(predictor, problem, rows, state, proposed)
         else:
             rows = np.arange(len(predictor.data))
         # 3: steps of the trial effects at another release before it is compared with the current one (chosen)
@@ -340,10 +304,8 @@ class ReleaseSearch:
 def _trial_deviances(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
     """−2 ln L of each trial, its effects integrated out by the Laplace approximation, shape (n_trials,)."""
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
-    white = at_correlation(predictor.products(columns), state.rho)
-    square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] / state.variance[:, None, None]
-    precision = trial_effect_prior(problem, state)[1]
-    log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS))[1]
+    square = whitened_products(predictor.products(columns), state)[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS]
+    log_volume = np.linalg.slogdet(with_diagonal(square, trial_effect_prior(problem, state)[1]))[1]
     return np.asarray(trial_costs(predictor, problem, state, residuals_in(columns)) + log_volume)
 
 
@@ -396,42 +358,28 @@ def _candidate_releases(trial_data: FitTrial, release_s: float) -> Floats:
 
 
 def _release_sensitivities(
-    predictor: Predictor, plain: Sequence[Job], releases: Sequence[Floats]
+    predictor: Predictor, plain: Jobs, releases: Sequence[Floats]
 ) -> list[tuple[Floats, Floats, Floats]]:
     """For each trial times since release, shape (n,), positions there, m, and their sensitivities to its effects.
     Sensitivities have shape (4, n), zero for an effect that the trial does not have.
     """
     damping_step, pressure_step = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
-    jobs: list[Job] = []
-    perturbations: list[tuple[int, float]] = []
-    grids: list[Floats] = []
-    for job, candidates_s in zip(plain, releases, strict=True):
-        i = job.trial
-        variants = [((-1, 0.0), job)]
-        if predictor.has_pressure_deviation[i]:
-            deviation = job.pressure_deviation + pressure_step
-            variants.append(((PRESSURE, pressure_step), job._replace(pressure_deviation=deviation)))
-        if predictor.has_damping_deviation[i]:
-            row = job.row.copy()
-            row[predictor.damping_column] *= np.exp(damping_step)
-            variants.append(((DAMPING_DEVIATION, damping_step), job._replace(row=row)))
-        longest_s = float(predictor.data[i].time_s[-1] - candidates_s.min())
-        for perturbation, perturbed_job in variants:
-            perturbations.append(perturbation)
-            jobs.append(perturbed_job)
-            # 600: points of the time grid of a trajectory that is shifted (derived)
-            grids.append(longest_s * np.linspace(0.0, 1.0, 600) ** 1.5)
-    results: list[tuple[Floats, Floats, Floats]] = []
-    instants = [job.release_s + times for job, times in zip(jobs, grids, strict=True)]
-    for (place, step), times, trajectory in zip(
-        perturbations, grids, predictor.run(jobs, times_s=instants), strict=True
-    ):
-        y = trajectory.observed_position_m
-        if place < 0:
-            sensitivities = np.zeros((N_TRIAL_EFFECTS, times.size))
-            sensitivities[RELEASE] = -np.gradient(y, times)
-            sensitivities[ORIGIN] = 1.0
-            results.append((times, y, sensitivities))
-        else:
-            results[-1][2][place] = (y - results[-1][1]) / step
-    return results
+    with_pressure = predictor.has_pressure_deviation[plain.trial]
+    with_damping = predictor.has_damping_deviation[plain.trial]
+    pressures, dampings = plain.take(np.flatnonzero(with_pressure)), plain.take(np.flatnonzero(with_damping))
+    pressures = replace(pressures, pressure_deviation=pressures.pressure_deviation + pressure_step)
+    dampings.row[:, predictor.damping_column] *= np.exp(damping_step)
+    longest_s = np.array([predictor.data[i].time_s[-1] - s.min() for i, s in zip(plain.trial, releases, strict=True)])
+    # 600: points of the time grid of a trajectory that is shifted (derived)
+    grids = longest_s * np.linspace(0.0, 1.0, 600)[:, None] ** 1.5
+    grids = np.concatenate([grids.T, grids.T[with_pressure], grids.T[with_damping]])
+    jobs = Jobs.concatenated([plain, pressures, dampings])
+    moved = predictor.run_as(predictor.layout.model, jobs, list(jobs.release_s[:, None] + grids))
+    y = np.array([trajectory.observed_position_m for trajectory in moved])
+    n, n_pressures = len(plain), len(pressures)
+    sensitivities = np.zeros((n, N_TRIAL_EFFECTS, grids.shape[1]))
+    sensitivities[:, RELEASE] = [-np.gradient(along_m, times) for along_m, times in zip(y, grids[:n], strict=False)]
+    sensitivities[:, ORIGIN] = 1.0
+    sensitivities[with_pressure, PRESSURE] = (y[n : n + n_pressures] - y[:n][with_pressure]) / pressure_step
+    sensitivities[with_damping, DAMPING_DEVIATION] = (y[n + n_pressures :] - y[:n][with_damping]) / damping_step
+    return list(zip(grids, y, sensitivities, strict=False))

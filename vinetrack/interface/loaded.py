@@ -128,7 +128,7 @@ class LoadedResults:
         diagnosis = self.diagnosis
         if diagnosis is None or not diagnosis.effects:
             return self.initial_model
-        return self._model(FitSummary(diagnosis.final_model, diagnosis.parameters))
+        return self._model(FitSummary(diagnosis.final_model, numbers=diagnosis.parameters))
 
     def _model(self, fit: FitSummary) -> Model:
         from vinetrack.effects import catalogue

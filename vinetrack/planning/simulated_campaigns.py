@@ -20,7 +20,6 @@ from vinetrack.inference.fit_result import DAMPING, ParameterMap
 from vinetrack.inference.marginal_likelihood import FitState
 from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
 from vinetrack.inference.sensitivity import Predictor, align, initial_trial_effects
-from vinetrack.inference.solving import log_likelihood
 from vinetrack.planning.discriminating_design import Condition, Hypothesis, TrackSampling, film_trials
 from vinetrack.tracks.position_noise import ar1_noise
 
@@ -231,7 +230,7 @@ def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, th
         solution = solve(whole, problem, solution.state, warm=True, most_iterations=MOST_ITERATIONS)
     except SimulationError:
         return math.nan
-    return -2 * log_likelihood(solution)
+    return -2 * solution.log_likelihood()
 
 
 def _extended_layout(hypothesis: Hypothesis, places: Sequence[int]) -> ParameterMap:
