@@ -51,7 +51,7 @@ BUDGETS = {
     "effects": (2600, 44, 179),
     "experiment": (1968, 7, 25),
     "figures": (3065, 9, 40),
-    "inference": (7352, 14, 83),
+    "inference": (6741, 14, 82),
     "interface": (651, 3, 2),
     "kinematics": (2254, 6, 22),
     "laboratory": (1890, 6, 16),
