@@ -163,6 +163,12 @@ def effect_sources(path: Path) -> list[Path]:
 def load_effect(path: Path | str) -> Effect:
     """Read one effect from its file, whose name it has; an EffectError says where the file does not follow the contract
     of `Effect`.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.load_effect(vt.effects.air_drag.path).name
+    'air_drag'
     """
     path = Path(path)
     try:
@@ -253,7 +259,14 @@ def _parameter_faults(parameter: Parameter) -> Iterable[str]:
 
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
-    """Return every effect of vinetrack by name: base effects first, then alphabetical."""
+    """Return every effect of vinetrack by name: base effects first, then alphabetical.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.catalogue()["air_drag"].kind
+    'physical'
+    """
     paths = {path.stem: path for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")}
     names = [*BASE_EFFECTS, *sorted(set(paths) - set(BASE_EFFECTS))]
     return MappingProxyType({name: load_effect(paths[name]) for name in names})
@@ -262,6 +275,13 @@ def catalogue() -> Mapping[str, Effect]:
 def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> Effect:
     """Return the effect of this name, from the user's own effects or else from the catalogue; an EffectError suggests
     the nearest name.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.find_effect("air_drg")
+    Traceback (most recent call last):
+    vinetrack.effects._catalogue.EffectError: ...
     """
     known = {**catalogue(), **(user_effects or {})}
     if name in known:

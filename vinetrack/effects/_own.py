@@ -28,6 +28,12 @@ _RIG = TrialInputs(
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
     """Read and check a user's effects; returns them by name. An EffectError says in one sentence where a file is not an
     effect, two have the same name, or one fails its checks.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> dict(vt.effects.own_effects([]))
+    {}
     """
     effects: dict[str, Effect] = {}
     for path in map(Path, paths):

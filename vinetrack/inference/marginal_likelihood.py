@@ -414,6 +414,7 @@ def bounded_solve(
     """`step_within_bounds` of the parameters of a problem. Shapes: square (n_free, n_free); slope, theta (n_free,)."""
     if not slope.size:
         return slope, problem.free
+    square = np.ascontiguousarray(square)  # numba warns of products with any other
     return step_within_bounds(square, slope, theta - problem.lower, problem.upper - theta, problem.free)
 
 
