@@ -23,7 +23,6 @@ from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
 from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build as report_trials
 from vinetrack.report.build import (
-    SHARED_ERROR,
     Clip,
     ModelResult,
     ReportContent,
@@ -466,7 +465,7 @@ def test_the_calibration_is_listed_with_its_error_and_what_it_rests_on() -> None
     html = page(recordings={"a": recording()})
     for words in ("ChArUco board", "calibration/board.png", "0.240700", "0.0090 %", "0.031 px", "52 in 1", "40 %"):
         assert words in html
-    assert SHARED_ERROR.replace("'", "&#39;") in html
+    assert "It is not included in the ± of a speed or in bootstrap intervals" in html
 
 
 def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

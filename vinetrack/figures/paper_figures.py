@@ -40,6 +40,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# Departures from Eq. (2) that the paper's errors are compared with; where they are two, the smaller effect first
+CAUSES = {
+    "chamber not refilled": ("depletion_slow", "depletion_fast"),
+    "tail that cannot push": ("slack",),
+    "both": ("depletion_slow_slack", "depletion_fast_slack"),
+}
+
+
 @figure("paper_fig6", "paper", "Fig. 6: growth force and steady speed", data="damping_points.csv")
 def draw_paper_damping(points: pd.DataFrame, damping: Mapping[str, Any]) -> Figure | None:
     """Growth force above yield against steady tail speed of the four scales. Left: the literal published rule, set
@@ -218,14 +226,8 @@ def _draw_rms_panel(ax: Axes, printed: dict[int, float], ours: pd.Series, row: s
         near = [of_name.loc[np.isclose(of_name["pressure_kPa"], kPa), "size"] for kPa in printed]
         return np.array([float(size.iloc[0]) if len(size) else np.nan for size in near])
 
-    for k, (label, slow, fast, colour) in enumerate(
-        (
-            ("chamber not refilled", "depletion_slow", "depletion_fast", ORANGE),
-            ("tail that cannot push", "slack", "slack", GREEN),
-            ("both", "depletion_slow_slack", "depletion_fast_slack", PURPLE),
-        )
-    ):
-        low, high = np.maximum(sizes(slow), least), sizes(fast)
+    for k, ((label, names), colour) in enumerate(zip(CAUSES.items(), (ORANGE, GREEN, PURPLE), strict=True)):
+        low, high = np.maximum(sizes(names[0]), least), sizes(names[-1])
         shown = high >= least
         middle = np.sqrt(low * np.maximum(high, least))
         bars = [(middle - low)[shown], (high - middle)[shown]]

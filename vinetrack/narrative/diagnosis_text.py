@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.notebook import html_table
-from vinetrack.core.units import decimals, display_unit, interval, number, with_error, with_interval
+from vinetrack.core.units import decimals, display_unit, number, with_error, with_interval
 from vinetrack.diagnosis.remarks import joined
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -451,50 +451,9 @@ _STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "l
 # The two fits of the damping law, by their keys in `damping.json`
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
 
-_TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, exactly as printed"}  # Rows of the tables of n and B
+LAW_METHODS = METHOD_NAMES | {"paper": "the published rule, exactly as printed"}  # Rows of the tables of n and B
 
 PREFERRED = "both_axes"  # The fit whose numbers head the report
-
-REFERENCES = (
-    "Alvarez et al., High-Velocity, Pressure-Driven Eversion for Rapid Vine Robots, IEEE Robotics and Automation "
-    "Letters, 2025: the equation of motion, the damping law and the 3 % rule.",
-    "Savitzky and Golay, Smoothing and Differentiation of Data by Simplified Least Squares Procedures, Analytical "
-    "Chemistry 36, 1964: velocity.",
-    "York, Evensen, Martínez and De Basabe Delgado, Unified equations for the slope, intercept, and standard errors of "
-    "the best straight line, American Journal of Physics 72, 2004: the fit with errors on both axes.",
-    "Efron and Tibshirani, An Introduction to the Bootstrap, 1993: intervals by resampling whole trials.",
-)
-
-DIAGNOSIS_METHODS = (
-    (
-        "Model",
-        "Simulated positions are fitted to the measured ones of all trials at once. Shared parameters: those of the "
-        "model, B of every vine, one n, and the yield pressure with the sheet's error as prior. Parameters of each "
-        "trial: its release, its origin, and deviations of pressure and of B, whose standard deviations between trials "
-        "are estimated too, like replicate scatter, noise and the noise's correlation.",
-    ),
-    (
-        "Diagnosis",
-        "For every candidate of the catalogue a score test predicts by how much the fit would improve with it, all "
-        "fitted parameters estimated anew; faults of the measurement are candidates too. The best, and those "
-        "correlated with them, are fitted in full. Hypotheses within Δχ² = 9 of the best form the answer set. The "
-        "threshold for calling an effect missing accounts for the number of candidates and the correlation between "
-        "them. An effect is added only if it is the only member of the answer set; all candidates are then tested "
-        "again.",
-    ),
-    (
-        "Ladder",
-        "Position errors are root mean squares; only release and origin are estimated for each trial. "
-        "Left-out conditions are predicted by the model fitted to all other conditions, the highest pressure of each "
-        "vine by the model fitted to all lower ones. The floor is the replicate scatter.",
-    ),
-)
-DIAGNOSIS_REFERENCES = (
-    "Rao, Large sample tests of statistical hypotheses concerning several parameters with applications to problems of "
-    "estimation, Proceedings of the Cambridge Philosophical Society 44, 1948: testing candidates without fitting each.",
-    "Wilks, The large-sample distribution of the likelihood ratio for testing composite hypotheses, Annals of "
-    "Mathematical Statistics 9, 1938: the significance of a Δχ².",
-)
 
 
 def damping_headline(damping: Mapping[str, Any]) -> str:
@@ -521,101 +480,8 @@ def status_tally(trials: pd.DataFrame) -> str:
     return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
 
 
-def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return size, B, its intervals, R² and N of each vine and method of `damping.json` as text, smallest
-    vine first.
-    """
-    table, sizes = [], []
-    for method, method_name in _TABLE_METHODS.items():
-        for vine, law in ((damping.get(method) or {}).get("vines") or {}).items():
-            table.append(
-                {
-                    "vine": vine,
-                    "method": method_name,
-                    "size": f"{number(law['diameter_mm'])} mm × {number(law['thickness_um'])} µm",
-                    "B": number(law["B"], 4),
-                    "B_95": interval(law.get("B_95")),
-                    "B_95_total": interval(law.get("B_95_total")),
-                    "R2": number(law.get("R2")),
-                    "n_trials": str(law["n_trials"]),
-                }
-            )
-            sizes.append((law["diameter_mm"], law["thickness_um"], vine))
-    order = sorted(range(len(table)), key=lambda i: sizes[i])
-    return [table[i] for i in order]
-
-
-def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return n and its intervals by each method of `damping.json` as text, or why a method refused."""
-    table = []
-    for method, method_name in _TABLE_METHODS.items():
-        fit = damping.get(method)
-        if fit is None:
-            continue
-        table.append(
-            {
-                "method": method_name,
-                "n": number(fit.get("n"), 4),
-                "n_95": interval(fit.get("n_95")),
-                "n_95_total": interval(fit.get("n_95_total")),
-                "refused": str(fit.get("refused") or ""),
-            }
-        )
-    return table
-
-
-def vines_without_law(damping: Mapping[str, Any]) -> list[str]:
-    """Return the vines that the preferred fit of `damping.json` left out, each with the reason."""
-    left_out = (damping.get(PREFERRED) or {}).get("left_out") or {}
-    return [f"{vine}: {reason}" for vine, reason in left_out.items()]
-
-
-def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return how the results were computed, as (heading, paragraph) pairs, with the numbers of the run's settings."""
-    velocity, steady, damping = (settings.get(key) or {} for key in ("velocity", "steady", "damping"))
-    return [
-        (
-            "Speed",
-            f"Positions are smoothed and differentiated by local polynomials of order {velocity.get('order', 3)} "
-            "(Savitzky–Golay). The window at each point is the widest whose fit agrees with narrower ones within the "
-            "noise; noise and its correlation are estimated from the positions. Speeds in results are those of the "
-            "tail, which moves twice as fast as the leading edge.",
-        ),
-        (
-            "Steady stretch",
-            "The gated rule takes the longest stretch whose change of speed is shown to be below "
-            f"{_percent(steady.get('drift_limit', 0.03))} by an equivalence test, so that noise cannot pass as "
-            "steadiness. "
-            f"The paper's rule takes at least {steady.get('paper_points', 3)} consecutive points whose speeds vary by "
-            f"less than {_percent(steady.get('paper_cv', 0.03))}. A window chosen by hand is used where the sheet "
-            "gives one. All are reported for every trial.",
-        ),
-        (
-            "Force",
-            "F = (P − P_y)·πD²/4 + 2·m·g·cosθ. P is the mean pressure in the window, measured or else computed by the "
-            "model in use; P_y is the yield pressure, and m the mean mass in motion in the window. Only everting "
-            "bodies "
-            "without payload enter the fit.",
-        ),
-        (
-            "Damping law",
-            "F = B·x_ssⁿ with one n for all vines and a B for each: by least squares on logarithms, as in the paper, "
-            "and with errors on both axes (York), where the scatter between vines is added to the measured errors. "
-            f"95 % intervals come from a bootstrap of {damping.get('resamples', 2000)} resamplings of whole trials "
-            f"(seed {damping.get('seed', 0)}), or from Student's t where there are too few trials to resample. The "
-            "total intervals add the stated systematic errors: of the yield pressure, common to a vine, and of the "
-            "scale, "
-            "common to all recordings.",
-        ),
-    ]
-
-
 def _count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:g} %"
 
 
 def _sentence(text: str) -> str:

@@ -14,20 +14,10 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from vinetrack.core.records import split_flags
-from vinetrack.core.units import display_unit, number, with_error
+from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.figures.registry import all_figures
 from vinetrack.figures.style import RULE_NAMES, page_tokens, rows
-from vinetrack.narrative.diagnosis_text import (
-    DIAGNOSIS_METHODS,
-    DIAGNOSIS_REFERENCES,
-    REFERENCES,
-    damping_headline,
-    exponent_table,
-    methods,
-    status_tally,
-    vine_table,
-    vines_without_law,
-)
+from vinetrack.narrative.diagnosis_text import LAW_METHODS, damping_headline, status_tally
 from vinetrack.narrative.verdict_text import bounds_text, is_finite, listed_names, settled_rows
 from vinetrack.report.section import (
     DiagnosisResult,
@@ -63,30 +53,6 @@ FLAG_WORDS = {
     "corrected": "corrected by hand",
     "after_end": "after the end",
 }
-SHARED_ERROR = (
-    "The error of the scale is stated separately from the random error of single points: it is common to all points of "
-    "a recording and to all recordings of one target. It changes every length and speed by the same factor, so that "
-    "replicates do not show it and averaging does not reduce it. It is not included in the ± of a speed or in "
-    "bootstrap intervals; the wider intervals of B include it (a relative scale error ε changes ln B by n·ε), and n is "
-    "independent of it."
-)
-
-# Methods for recordings, as (heading, paragraph) pairs
-METHODS = (
-    (
-        "Edge",
-        "A strip along the axis of growth is cut from every frame; flicker and shake are estimated from the stationary "
-        "scene beside the vine and removed. A pixel that the vine covers changes once: its brightness before and after "
-        "and the position of the edge in every frame are estimated alternately, the edge by maximum likelihood from a "
-        "step blurred by the optics and by its own motion, at mid-exposure. Time is the frame number divided by the "
-        "capture rate.",
-    ),
-    (
-        "Scale",
-        "Positions along the axis are converted with the model of a camera with radial distortion looking at a tilted "
-        "plane, fitted to the corners of the target; without a target, with a single scale.",
-    ),
-)
 
 
 @dataclass(frozen=True)
@@ -319,7 +285,7 @@ def build_report(content: ReportContent) -> str:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": number, "with_error": with_error}
+    environment.filters |= {"number": number, "with_error": with_error, "interval": interval}
     environment.globals |= {"rows": rows, "display_unit": display_unit, "bounds_text": bounds_text}
     environment.globals["listed_names"] = listed_names
     settings = content.provenance.get("settings") or {}
@@ -328,16 +294,20 @@ def build_report(content: ReportContent) -> str:
     for figure in content.figures:
         figures[sections.get(figure.key, "damping")].append(figure)
     trials, n_left_out = trial_entries(content)
-    diagnosed = content.diagnosis is not None
+    laws = [
+        (vine, law, method)
+        for method in LAW_METHODS
+        for vine, law in ((content.damping.get(method) or {}).get("vines") or {}).items()
+    ]
     return environment.get_template("report.html").render(
         name=content.name,
         style=Markup(page_tokens() + (folder / "report.css").read_text(encoding="utf-8")),
         headline=damping_headline(content.damping),
         tally=status_tally(content.trials),
         notes=content.notes,
-        exponents=exponent_table(content.damping),
-        without_law=vines_without_law(content.damping),
-        vines=vine_table(content.damping),
+        damping=content.damping,
+        law_methods=LAW_METHODS,
+        laws=sorted(laws, key=lambda one: (one[1]["diameter_mm"], one[1]["thickness_um"], one[0])),
         model=content.model,
         final_errors=final_errors,
         diagnosis=diagnosis_section(content.diagnosis),
@@ -349,13 +319,8 @@ def build_report(content: ReportContent) -> str:
         rule_names=RULE_NAMES,
         n_left_out=n_left_out,
         calibrations=calibration_table(content.recordings),
-        shared_error=SHARED_ERROR,
-        methods=[
-            *(METHODS if content.recordings else ()),
-            *methods(settings),
-            *(DIAGNOSIS_METHODS if diagnosed else ()),
-        ],
-        references=[*REFERENCES, *(DIAGNOSIS_REFERENCES if diagnosed else ())],
+        filmed=bool(content.recordings),
+        run=settings,
         settings=sorted(_flat(settings)),
         provenance=content.provenance,
     )

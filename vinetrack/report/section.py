@@ -12,6 +12,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+import numpy as np
 from markupsafe import Markup
 
 from vinetrack.core import published
@@ -19,6 +20,7 @@ from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
+from vinetrack.figures.paper_figures import CAUSES
 from vinetrack.figures.style import TOKENS, rows
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import (
@@ -436,6 +438,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
     """Return the section."""
     from vinetrack.paper.rows import MARKS
 
+    by_row = {row.row: row for row in rows(table)}
     present = [f"“{mark}”: {words}" for mark, words in MARKS.items() if (table["mark"] == mark).any()]
     return ReportSection(
         key="paper",
@@ -448,7 +451,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
             "how fast the regulator refills, and how long the vines were, is not published, and B and n of Fig. 6 may "
             "have absorbed a part of it.",
         ],
-        tables=[table_one(table), *table_two(table, departures), *every_row(table)],
+        tables=[table_one(by_row), *table_two(by_row, departures), *every_row(table)],
         figures=list(figures),
     )
 
@@ -462,133 +465,83 @@ def tally(table: pd.DataFrame) -> str:
     return f"{len(table)} rows: {', '.join(parts)}."
 
 
-def table_one(table: pd.DataFrame) -> ReportTable:
+def table_one(by_row: Mapping[str, Any]) -> ReportTable:
     """Return Table I of the paper, with the results of Fig. 6 and ours."""
-    by_row = _by_row(table)
-    body = [
-        (
-            str(scale),
-            *(
-                _shown(_value(by_row.get(f"{name}_R{scale}"), "published"))
-                for name in ("thickness", "diameter", "press", "laser")
-            ),
-            f"{published.DAMPING_B[scale]:g}",
-            _ours(by_row.get(f"B_R{scale}")),
-            f"{published.DAMPING_R2[scale]:g}",
-            number(_value(by_row.get(f"R2_R{scale}"))),
-        )
-        for scale in published.DAMPING_B
-    ]
-    head = (
-        "R",
-        "wall, µm",
-        "diameter, mm",
-        "heat press, °C",
-        "laser, %",
-        "B printed, N·(s/m)ⁿ",
-        "B here (95 %)",
-        "R² printed",
-        "R² here",
-    )
+    head = ("R", "wall, µm", "diameter, mm", "heat press, °C", "laser, %", "B printed, N·(s/m)ⁿ", "B here (95 %)")
+    head += ("R² printed", "R² here")
+    body = []
+    for scale, B in published.DAMPING_B.items():
+        made = [by_row.get(f"{name}_R{scale}") for name in ("thickness", "diameter", "press", "laser")]
+        R2 = f"{published.DAMPING_R2[scale]:g}", number(_value(by_row.get(f"R2_R{scale}")))
+        printed = [_shown(_value(row, "published")) for row in made]
+        body.append((str(scale), *printed, f"{B:g}", _ours(by_row.get(f"B_R{scale}")), *R2))
     return ReportTable("Table I, with the results of Fig. 6", head, body, frozenset(range(1, len(head))))
 
 
-def table_two(table: pd.DataFrame, departures: pd.DataFrame) -> list[ReportTable]:
+def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[ReportTable]:
     """Return Table II of the paper, positions and speeds, with ours and the effects of departures from Eq. (2)."""
-    by_row = _by_row(table)
-    head = ("pressure, kPa", "printed", "here", "chamber not refilled", "tail that cannot push", "both")
+    about_positions = (
+        "Here: mean of the trials minus Eq. (2) with the printed numbers. The last three columns: the error that a "
+        "departure from Eq. (2) would cause, simulated for a vine of 280 mm."
+    )
+    about_speeds = "At 12 cm, over payloads; B of this vine is not printed and is scaled in proportion to the wall."
+    positions, speeds = published.POSITION_RMS_CM, published.FINAL_SPEED_RMS_M_S
+    head = ("pressure, kPa", "printed", "here", *CAUSES)
     made = []
-    for title, figure, row, column, factor, printed, note in _ERRORS:
+    for title, figure, row, column, factor, printed, note in (
+        ("rms of position, cm", "Fig. 4", "position_rms", "rms_position_m", 100, positions, about_positions),
+        (
+            "rms of final speed, m/s",
+            "Fig. 5",
+            "final_speed_rms",
+            "rms_final_lead_velocity_m_s",
+            1,
+            speeds,
+            about_speeds,
+        ),
+    ):
         body = []
-        for pressure_kPa in printed:
-            result = by_row.get(f"{row}_{pressure_kPa:g}kPa")
-            causes = departures[
-                (departures["figure"] == figure) & (abs(departures["pressure_kPa"] - pressure_kPa) < 1e-6)
-            ]
-            size = {str(cause.departure): factor * float(getattr(cause, column)) for cause in rows(causes)}
-            body.append(
-                (
-                    f"{pressure_kPa:g}",
-                    f"{printed[pressure_kPa]:g}",
-                    number(_value(result)),
-                    _range(size, "depletion_slow", "depletion_fast"),
-                    number(size.get("slack")),
-                    _range(size, "depletion_slow_slack", "depletion_fast_slack"),
-                )
-            )
-        made.append(ReportTable(title, head, body, frozenset(range(len(head))), note))
+        for kPa, error in printed.items():
+            of_figure = departures[(departures["figure"] == figure) & np.isclose(departures["pressure_kPa"], kPa)]
+            size = dict(zip(of_figure["departure"], factor * of_figure[column], strict=True))
+            caused = [_range([size[name] for name in names if name in size]) for names in CAUSES.values()]
+            body.append((f"{kPa:g}", f"{error:g}", number(_value(by_row.get(f"{row}_{kPa:g}kPa"))), *caused))
+        made.append(ReportTable(f"Table II, {title}", head, body, frozenset(range(len(head))), note))
     return made
 
 
-_ERRORS = (
-    (
-        "Table II, rms of position, cm",
-        "Fig. 4",
-        "position_rms",
-        "rms_position_m",
-        100.0,
-        published.POSITION_RMS_CM,
-        "Here: mean of the trials minus Eq. (2) with the printed numbers. The last three columns: the error that a "
-        "departure from Eq. (2) would cause, simulated for a vine of 280 mm.",
-    ),
-    (
-        "Table II, rms of final speed, m/s",
-        "Fig. 5",
-        "final_speed_rms",
-        "rms_final_lead_velocity_m_s",
-        1.0,
-        published.FINAL_SPEED_RMS_M_S,
-        "At 12 cm, over payloads; B of this vine is not printed and is scaled in proportion to the wall.",
-    ),
-)
+def _range(sizes: Sequence[float]) -> str:
+    """One size, or two as a range, the smaller first; – for none."""
+    return " to ".join(dict.fromkeys(map(number, sorted(sizes)))) or "–"
 
 
 def every_row(table: pd.DataFrame) -> list[ReportTable]:
     """Return all rows of `paper.csv`, in one table for each part of the paper."""
     head = ("what", "printed", "here (95 %)", "kind", "how obtained, and remarks")
+    parts = table["where"].str.split(";|,| against", n=1, regex=True).str[0].map(_PARTS).fillna(_ELSEWHERE)
     made = []
-    parts = table["where"].map(_part)
-    for title in (*_PARTS, _ELSEWHERE):
-        members = table[parts == title]
-        if len(members):
-            body = [
-                (
-                    f"{row.quantity}{', ' if row.setting else ''}{row.setting}"
-                    + ("" if row.unit == "1" else f" ({row.unit})"),
-                    row.as_printed,
-                    _ours(row),
-                    row.mark,
-                    f"{row.how}{'; ' if row.beside else ''}{row.beside}",
-                )
-                for row in rows(members)
-            ]
+    for title in dict.fromkeys([*_PARTS.values(), _ELSEWHERE]):
+        body = []
+        for row in rows(table[parts == title]):
+            what = ", ".join(filter(None, (row.quantity, row.setting))) + (f" ({row.unit})" if row.unit != "1" else "")
+            body.append((what, row.as_printed, _ours(row), row.mark, "; ".join(filter(None, (row.how, row.beside)))))
+        if body:
             made.append(ReportTable(f"{title}, every number", head, body, frozenset({1, 2})))
     return made
 
 
-# Parts of the paper, with their sections and figures
+# Part of the paper that a place in it belongs to
 _PARTS = {
-    "Table I": ("Table I",),
-    "Protocol": ("Section III-D", "Section III-E"),
-    "Figs. 4 and 5, Table II": ("Fig. 4", "Fig. 5", "Section IV-A"),
-    "Fig. 6": ("Fig. 6",),
-    "Fig. 7": ("Fig. 7A", "Fig. 7B"),
-    "Fig. 8": ("Fig. 8",),
-    "Fig. 9": ("Fig. 9",),
-    "Chamber and injector": ("Section III-B", "Section V-B"),
+    "Table I": "Table I",
+    **dict.fromkeys(("Section III-D", "Section III-E"), "Protocol"),
+    **dict.fromkeys(("Fig. 4", "Fig. 5", "Section IV-A"), "Figs. 4 and 5, Table II"),
+    "Fig. 6": "Fig. 6",
+    **dict.fromkeys(("Fig. 7A", "Fig. 7B"), "Fig. 7"),
+    "Fig. 8": "Fig. 8",
+    "Fig. 9": "Fig. 9",
+    **dict.fromkeys(("Section III-B", "Section V-B"), "Chamber and injector"),
 }
-
 _ELSEWHERE = "The fast vine, air drag, pressures"
-
-
-def _part(where: str) -> str:
-    """The part of the paper of an entry of `where`, from its first reference."""
-    first = where.split(";")[0].split(",")[0].split(" against")[0]
-    return next((title for title, places in _PARTS.items() if first in places), _ELSEWHERE)
-
-
-def _by_row(table: pd.DataFrame) -> Mapping[str, Any]:
-    return {row.row: row for row in rows(table)}
 
 
 def _value(row: Any, column: str = "ours") -> float | None:
@@ -607,11 +560,3 @@ def _shown(value: float | None) -> str:
     """A number to three digits; integers are unchanged."""
     whole = value is not None and math.isfinite(value) and math.isclose(value, round(value), rel_tol=1e-9)
     return f"{value:.0f}" if whole else number(value)
-
-
-def _range(size: Mapping[str, float], low: str, high: str) -> str:
-    """Two sizes as a range, the smaller first."""
-    if low not in size or high not in size:
-        return "–"
-    first, last = (number(value) for value in sorted((size[low], size[high])))
-    return first if first == last else f"{first} to {last}"
