@@ -24,7 +24,7 @@ from vinetrack.paper.motions import (
     Rest,
     departure_table,
     drag_shares,
-    eq2_speed_m_s,
+    final_speed_m_s,
     final_speeds,
     follow,
     mean_motions,
@@ -273,7 +273,7 @@ def test_eq2_by_another_integrator() -> None:
 
     there.terminal = True  # type: ignore[attr-defined]
     found = solve_ivp(rates, (0, 1), [0.0, 1e-9], events=there, method="LSODA", rtol=1e-9, atol=1e-12)
-    assert eq2_speed_m_s(one) == pytest.approx(found.y_events[0][0][1] / 2, rel=2e-3)
+    assert final_speed_m_s(one) == pytest.approx(found.y_events[0][0][1] / 2, rel=2e-3)
 
 
 # Lines that an experiment answers, from results written by hand; and that no published number is without its line.

@@ -19,7 +19,7 @@ from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.figures.diagnosis_figures import (
     DiagnosisTables,
-    cosines_by_rank,
+    cosine_cells,
     predicted_trials,
     read_diagnosis_tables,
     worst_condition,
@@ -216,10 +216,13 @@ def test_what_the_last_model_says_joins_the_comparison_where_something_was_added
 
 def test_ties_stand_in_the_order_of_the_ranking() -> None:
     cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
-    names, matrix = cosines_by_rank(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
-    assert names == ["air_drag", "leak", "time_base"]
-    assert matrix == [[1, 0.3, 0.2], [0.3, 1, 0.1], [0.2, 0.1, 1]]
-    assert cosines_by_rank(Round.from_json({"verdict": ""})) == ([], [])
+    cells = cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
+    assert cells.to_numpy().tolist() == [
+        ["leak", "air_drag", 0.3],
+        ["time_base", "air_drag", 0.2],
+        ["time_base", "leak", 0.1],
+    ]
+    assert cosine_cells(Round.from_json({"verdict": ""})).empty
 
 
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.

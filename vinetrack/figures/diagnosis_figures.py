@@ -10,7 +10,6 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -585,9 +584,9 @@ def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> Diagnos
     if diagnosis is None or not diagnosis.verdict:
         return None
     names = ("along_position.csv", "drift_groups.csv", "missing_force.csv", "learned_force.csv")
-    located, drifting, force, learned = (_table(results.diagnosed(name)) for name in names)
-    trials = predicted_trials(results, conditions)
-    return assemble_tables(diagnosis, conditions, trials, located, drifting, force, learned)
+    paths = map(results.diagnosed, names)
+    tables = [read_result(path) if path.exists() else empty_table(()) for path in paths]
+    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), *tables)
 
 
 def assemble_tables(
@@ -604,13 +603,12 @@ def assemble_tables(
 
     labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
     worst = worst_condition(trials)
-    names, matrix = cosines_by_rank(diagnosis.rounds[0])
     return DiagnosisTables(
         ladder=pd.DataFrame() if diagnosis.ladder is None else diagnosis.ladder,
         trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
         where=_where_table(trials, labels, located),
-        cosines=_cosine_cells(names, matrix),
+        cosines=cosine_cells(diagnosis.rounds[0]),
         drift=drifting,
         missing_force=force,
         rounds=[(round_heading(i, diagnosis.rounds), ranking_table(one)) for i, one in enumerate(diagnosis.rounds)],
@@ -618,10 +616,6 @@ def assemble_tables(
         added=listed_names(diagnosis.effects),
         learned_force=pd.DataFrame() if learned is None else learned,
     )
-
-
-def _table(path: Path) -> pd.DataFrame:
-    return read_result(path) if path.exists() else empty_table(())
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
@@ -724,17 +718,12 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def cosines_by_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
-    """Return the cosines of a round, ordered by rank, with the answer set first. Returns names, matrix."""
+def cosine_cells(ranked: Round) -> pd.DataFrame:
+    """Return the cosines of a round with one row per pair, ordered by rank, with the answer set first."""
+    import pandas as pd
+
     names, matrix = ranked.cosine_names, ranked.cosines
     ranks = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(ranked.ranking)}
     order = sorted(range(len(matrix)), key=lambda i: ranks.get(names[i], (True, len(ranked.ranking))))
-    return [names[i] for i in order], [[matrix[i][j] for j in order] for i in order]
-
-
-def _cosine_cells(names: Sequence[str], matrix: Sequence[Sequence[float]]) -> pd.DataFrame:
-    """Return the matrix of cosines as a table with one row per pair."""
-    import pandas as pd
-
-    rows = [(names[i], names[j], matrix[i][j]) for i in range(len(matrix)) for j in range(i)]
+    rows = [(names[i], names[j], matrix[i][j]) for k, i in enumerate(order) for j in order[:k]]
     return pd.DataFrame(rows, columns=["effect", "other", "cosine"])

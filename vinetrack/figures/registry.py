@@ -109,8 +109,6 @@ def draw(name: str, tables: Any) -> Figure | None:
 # ------------------------------------------------------------------------------
 # The tables of a results folder, as figures name them.
 
-MAX_CURVE_ROWS = 6000  # Largest number of rows of the downloadable curves (chosen)
-
 
 class FigureTables:
     """The tables of a results folder by the names that figures give them; each is read when a figure first needs it.
@@ -185,13 +183,13 @@ class FigureTables:
 
     @property
     def curves(self) -> pd.DataFrame:
-        """Measured and modelled growth of all trials, at most `MAX_CURVE_ROWS` rows at an even stride."""
+        """Measured and modelled growth of all trials, at most 6000 rows (chosen) at an even stride."""
         import pandas as pd
 
         conditions = read_result(self.results.comparison)["condition"]
         parts = [read_result(self.results.trajectories(name)).assign(condition=name) for name in conditions]
         whole = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-        return whole.iloc[:: -(-len(whole) // MAX_CURVE_ROWS) or 1]
+        return whole.iloc[:: -(-len(whole) // 6000) or 1]
 
     @cached_property
     def diagnosed(self) -> DiagnosisTables | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
     from vinetrack.diagnosis.force_laws import Law
     from vinetrack.diagnosis.further_trials import InformativeTrials
-    from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
+    from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.remarks import Remark
     from vinetrack.inference.fit_result import Fit
 
@@ -73,33 +73,26 @@ def size_text(power: EffectPower, value: float) -> str:
     return f"{number(factor * value, 2)} {unit}".strip()
 
 
+def _at_largest(power: EffectPower) -> float:
+    """Probability with which an effect of the largest plausible size is detected."""
+    return power.probability_at(power.largest)
+
+
 def effect_sentence(power: EffectPower, n_trials: int) -> str:
     """Return the sizes of one effect that the trials detect, in a sentence."""
-    trials, detect = (f"These {n_trials} trials", "detect") if n_trials != 1 else ("This trial", "detects")
-    name, symbol = spaced_name(power.effect), power.symbol
-    largest, at_largest = size_text(power, power.largest), power.probability_at(power.largest)
-    if at_largest < LOW_POWER:
-        text = (
-            f"{trials} {detect} {name} with less than {percent(LOW_POWER)} power even at its largest plausible size, "
-            f"{symbol} = {largest}"
-        )
-    elif at_largest < 0.9:
-        text = (
-            f"{trials} {detect} {name} with {percent(at_largest)} power at its largest plausible size, "
-            f"{symbol} = {largest}"
-        )
+    trials = f"These {n_trials} trials detect" if n_trials != 1 else "This trial detects"
+    at_largest, little = _at_largest(power), f"less than {percent(LOW_POWER)}"
+    seen, unseen_below = (f"{power.symbol} = {size_text(power, power.size_at(0.9))}", power.size_at(LOW_POWER))
+    if at_largest < 0.9:
+        how_often = f"{little} power even" if at_largest < LOW_POWER else f"{percent(at_largest)} power"
+        largest = f"{power.symbol} = {size_text(power, power.largest)}"
+        sizes = f"with {how_often} at its largest plausible size, {largest}"
     elif power.least != power.zero and power.probability_at(power.least) >= 0.9:
-        text = (
-            f"{trials} {detect} {name} of any plausible size (90 % power at {symbol} = "
-            f"{size_text(power, power.size_at(0.9))})"
-        )
+        sizes = f"of any plausible size (90 % power at {seen})"
     else:
         beyond, within = ("above", "below") if power.largest > power.zero else ("below", "above")
-        text = (
-            f"{trials} {detect} {name} with at least 90 % power {beyond} {symbol} = "
-            f"{size_text(power, power.size_at(0.9))}, and with less than {percent(LOW_POWER)} {within} "
-            f"{size_text(power, power.size_at(LOW_POWER))}"
-        )
+        sizes = f"with at least 90 % power {beyond} {seen}, and with {little} {within} {size_text(power, unseen_below)}"
+    text = f"{trials} {spaced_name(power.effect)} {sizes}"
     if power.taken_for and at_largest >= LOW_POWER:
         names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:2]]
         text += f"; it would be mistaken for {joined(names)} of campaigns"
@@ -124,7 +117,7 @@ def power_brief(power: Power) -> str:
 
 def detectable_count(power: Power) -> str:
     """Return how many effects the trials detect with 90 % power at their largest plausible size."""
-    n_detectable = sum(entry.probability_at(entry.largest) >= 0.9 for entry in power.effects)
+    n_detectable = sum(_at_largest(entry) >= 0.9 for entry in power.effects)
     return f"{n_detectable} of {len(power.effects) + len(power.not_testable)} effects"
 
 
@@ -132,22 +125,18 @@ def could_have_seen(power: Power) -> list[str]:
     """Return the sizes that the trials detect with 90 % power, and the effects that they do not detect."""
     if power.wary:
         return [f"Detectable sizes were not computed: {power.wary}."]
-    physical = _physical(power)
-    detectable = [entry for entry in physical if entry.probability_at(entry.largest) >= 0.9]
-    sometimes = [entry for entry in physical if LOW_POWER <= entry.probability_at(entry.largest) < 0.9]
-    lines = []
-    if detectable:
-        sizes = "; ".join(
-            f"{spaced_name(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}"
-            for entry in detectable
-        )
-        lines.append(f"Detectable with 90 % power: {sizes}.")
-    if sometimes:
-        parts = [
-            f"{spaced_name(entry.effect)} ({percent(entry.probability_at(entry.largest))} at "
-            f"{entry.symbol} = {size_text(entry, entry.largest)})"
-            for entry in sometimes
-        ]
+    physical, lines = _physical(power), []
+    if sizes := [
+        f"{spaced_name(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}"
+        for entry in physical
+        if _at_largest(entry) >= 0.9
+    ]:
+        lines.append(f"Detectable with 90 % power: {'; '.join(sizes)}.")
+    if parts := [
+        f"{spaced_name(one.effect)} ({percent(_at_largest(one))} at {one.symbol} = {size_text(one, one.largest)})"
+        for one in physical
+        if LOW_POWER <= _at_largest(one) < 0.9
+    ]:
         lines.append(f"Detectable with less power, even at the largest plausible size: {joined(parts)}.")
     if undetectable := unseen(power):
         lines.append(f"Not detectable: {listed_names(undetectable)}.")
@@ -158,20 +147,13 @@ def unseen(power: Power) -> list[str]:
     """Return the physical effects that are not testable, or detected with less than 10 % power at any
     plausible size.
     """
-    undetectable = [entry.effect for entry in _physical(power) if entry.probability_at(entry.largest) < LOW_POWER]
+    undetectable = [entry.effect for entry in _physical(power) if _at_largest(entry) < LOW_POWER]
     return [*undetectable, *(name for name in power.not_testable if name not in undetectable)]
 
 
 def _physical(power: Power) -> list[EffectPower]:
     """The physical effects; all effects where none is physical."""
     return [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
-
-
-def width_text(width: NumberWidth) -> str:
-    """Return the half width of the 95 % interval of a parameter: `n ± 0.0075`."""
-    title = f"{width.name} ({width.vine})" if width.vine else width.name
-    half = percent(width.half_width) if width.is_relative else number(width.half_width, 2)
-    return f"{title} ± {half}"
 
 
 def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str, str, str, str]]:
@@ -186,7 +168,7 @@ def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str,
                 size_text(entry, entry.size_at(0.5)),
                 size_text(entry, entry.size_at(0.9)),
                 size_text(entry, entry.largest),
-                percent(entry.probability_at(entry.largest)),
+                percent(_at_largest(entry)),
                 taken or "–",
             )
         )
@@ -205,17 +187,27 @@ POWER_COLUMNS = (
 
 
 def power_lines(power: Power) -> list[str]:
-    """Return what `vinetrack power` prints."""
+    """Return what `vinetrack power` prints: all effects in a table, visible ones first, and a sentence on each if they
+    are few, else on the physical ones of the lowest power.
+    """
+    from vinetrack.core.terminal import table
+
+    few = 4  # Effects that get a sentence each, at most (chosen)
+    physical = sorted((entry for entry in power.effects if entry.kind == "physical"), key=_at_largest)
+    listed = power_rows(sorted(power.effects, key=lambda entry: (not entry.is_visible, entry.effect)))
     lines = [f"Power of {power.n_trials} trials to detect effects beyond {' + '.join(power.model)}"]
     lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
     if power.wary:
         lines.append(f"! {power.wary}")
-    lines += _size_table(power.effects)
+    lines += table(listed, POWER_COLUMNS, indent="  ", align="<" * len(POWER_COLUMNS))
     lines += [f"  not testable: {spaced_name(name)}: {why}" for name, why in power.not_testable.items()]
-    lines += [effect_sentence(entry, power.n_trials) for entry in _effects_in_sentences(power)]
+    told = power.effects if len(power.effects) <= few else physical[:few]
+    lines += [effect_sentence(entry, power.n_trials) for entry in told]
     lines += [false_alarm_sentence(power)]
     if power.numbers:
-        lines.append(f"95 % intervals: {', '.join(map(width_text, power.numbers))}.")
+        halves = [percent(one.half_width) if one.is_relative else number(one.half_width, 2) for one in power.numbers]
+        names = [f"{one.name} ({one.vine})" if one.vine else one.name for one in power.numbers]
+        lines.append(f"95 % intervals: {', '.join(map(' ± '.join, zip(names, halves, strict=True)))}.")
     if power.recommended is not None:
         lines += ["", informative_text(power.recommended)]
     for plan in power.further:
@@ -223,44 +215,22 @@ def power_lines(power: Power) -> list[str]:
     return lines + simulated_lines(power)
 
 
-def _size_table(effects: Sequence[EffectPower]) -> list[str]:
-    """A row for each effect, detectable ones first."""
-    rows = [POWER_COLUMNS, *power_rows(sorted(effects, key=lambda entry: (not entry.is_visible, entry.effect)))]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(POWER_COLUMNS))]
-    return [
-        ("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip() for row in rows
-    ]
-
-
-def _effects_in_sentences(power: Power) -> list[EffectPower]:
-    """All effects if they are few, else the physical ones of the lowest power."""
-    most_sentences = 4  # Effects that get a sentence each, at most (chosen)
-    if len(power.effects) <= most_sentences:
-        return list(power.effects)
-    physical = [entry for entry in power.effects if entry.kind == "physical"]
-    return sorted(physical, key=lambda entry: entry.probability_at(entry.largest))[:most_sentences]
-
-
 def simulated_lines(power: Power) -> list[str]:
     """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory."""
     lines = []
     for rates in power.simulated:
         counted = rates.detections if rates.effect else rates.alarms
-        low, high = counted.interval
-        rate = f"{counted.count} of {counted.campaigns} ({percent(low)} to {percent(high)} with 95 % confidence)"
-        named = ", ".join(f"{names} {count}" for names, count in rates.named[:4])
+        low, high = map(percent, counted.interval)
+        rate = f"{counted.count} of {counted.campaigns} ({low} to {high} with 95 % confidence)"
         if rates.effect:
             entry = power[rates.effect]
-            what = (
-                f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}: detected in {rate}, "
-            )
-            what += f"{percent(rates.promised)} by linear theory"
+            size = f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}"
+            what = f"{size}: detected in {rate}, {percent(rates.promised)} by linear theory"
         else:
             what = f"nothing missing: a false alarm in {rate}, at most {percent(rates.promised)} by the tests' levels"
-        lines.append(
-            what + (f"; named: {named}" if named else "") + (f"; no verdict: {rates.failed}" if rates.failed else "")
-        )
-    return ["Simulated campaigns, each diagnosed in full:", *(f"  {line}" for line in lines)] if lines else []
+        what += f"; named: {', '.join(f'{names} {count}' for names, count in rates.named[:4])}" if rates.named else ""
+        lines.append(f"  {what}" + (f"; no verdict: {rates.failed}" if rates.failed else ""))
+    return ["Simulated campaigns, each diagnosed in full:", *lines] if lines else []
 
 
 def further_lines(plan: FurtherTrials) -> list[str]:
@@ -418,7 +388,8 @@ def informative_text(plan: InformativeTrials) -> str:
     gains = [
         (before[entry.effect], entry, _gain(before[entry.effect], entry))
         for entry in plan.then.effects
-        if entry.effect in before and _is_plausible(entry)
+        # whose size detected with 90 % power is no larger than the largest plausible one
+        if entry.effect in before and abs(entry.size_at(0.9) - entry.zero) <= abs(entry.largest - entry.zero)
     ]
     # 1.1: factor by which a detectable size must fall to be stated (chosen)
     gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > 1.1][:MOST_NAMED]
@@ -436,11 +407,6 @@ def _gain(now: EffectPower, then: EffectPower) -> float:
     """Factor by which the size detected with 90 % power falls; 0 where either is unknown."""
     sizes = [abs(entry.size_at(0.9) - entry.zero) for entry in (now, then)]
     return sizes[0] / sizes[1] if math.isfinite(sizes[0]) and sizes[1] > 0 else 0.0
-
-
-def _is_plausible(entry: EffectPower) -> bool:
-    """Whether the size detected with 90 % power is no larger than the largest plausible one."""
-    return abs(entry.size_at(0.9) - entry.zero) <= abs(entry.largest - entry.zero)
 
 
 # ------------------------------------------------------------------------------
@@ -536,10 +502,6 @@ def verdict_line(diagnosis: Diagnosis) -> str:
     return f"{diagnosis.verdict}: {_headline(diagnosis)}"
 
 
-def _rows(table: pd.DataFrame) -> Iterator[Any]:
-    return iter(table.itertuples(index=False))
-
-
 def _headline(diagnosis: Diagnosis) -> str:
     if diagnosis.odd_trials:
         return verdict_sentence(diagnosis).rstrip(".")
@@ -591,20 +553,16 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
 
     body = [
         (
-            (str(row.added) or "initial model") + _partial_mark(row),
+            (str(row.added) or "initial model")
+            + (", partial" if getattr(row, "partial", False) in (True, "True") else ""),
             *(
                 f"{1e3 * value:.2f}" if math.isfinite(value) else "–"
                 for value in (row.rms_in_sample_m, row.rms_left_out_m, row.rms_highest_pressure_m, row.floor_m)
             ),
         )
-        for row in _rows(ladder)
+        for row in ladder.itertuples()
     ]
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
-
-
-def _partial_mark(row: Any) -> str:
-    """Mark of a step of the ladder that reduces an unexplained misfit without removing it."""
-    return ", partial" if getattr(row, "partial", False) in (True, "True") else ""
 
 
 def gain_in_words(before: Fit, after: Fit) -> str:
@@ -634,7 +592,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         "parameters",
     ]
     changed: dict[tuple[str, str], dict[str, str]] = {}
-    for row in _rows(numbers):
+    for row in numbers.itertuples():
         unit, factor = display_unit(row.unit)
         title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol
         place = changed.setdefault((title, unit), {})

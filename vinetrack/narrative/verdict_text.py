@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.units import decimals, display_unit, number, with_error
@@ -36,7 +37,6 @@ from vinetrack.inference.robust_covariance import FILM_ERROR
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.core.records import Trial
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.remarks import Remark
@@ -95,9 +95,10 @@ def difference_in_words(result: LikelihoodRatio) -> str:
     return f"{name}s differ {' and '.join(parts)}"
 
 
-def remedies_in_words(answers: Sequence[LikelihoodRatio], trials: Sequence[Trial]) -> str:
+def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = ()) -> str:
     """What to do about the differences between trials in an answer set; blank where there are none."""
-    names = [result.names[-1] for result in answers if result.effects[-1].kind == BETWEEN_TRIALS]
+    trials = [trial.trial for trial in step.tests.fit.trials]
+    names = [result.names[-1] for result in answers or step.answer_set if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""
     text = "".join(f" {REMEDIES[name]}." for name in names)
@@ -219,15 +220,17 @@ def verdict_meaning(diagnosis: Diagnosis) -> str:
 
 def summary_facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
     """Return significance, sizes, power, change of the error and damping exponent, as far as the verdict has them."""
-    entries = [
-        _significance(diagnosis),
+    bounded = [row for row in diagnosis.ranking if row.largest] if diagnosis.verdict == ADEQUATE else []
+    n = [entry for entry in diagnosis.parameters if entry.key == EXPONENT and is_finite(entry.value)]
+    limits = f"{len(bounded)} candidates", "the largest undetected size of each is listed below"
+    return [
+        *filter(None, [_significance(diagnosis)]),
         *_sizes(diagnosis),
-        _upper_limits(diagnosis),
+        *([Fact("Upper limits", *limits)] if bounded else []),
         *_power_facts(diagnosis),
         *_errors(ladder),
-        *_exponent(diagnosis),
+        *(Fact("Damping exponent", estimate_text(entry), interval_text(entry)) for entry in n[:1]),
     ]
-    return [fact for fact in entries if fact is not None]
 
 
 def is_finite(value: Any) -> bool:
@@ -239,7 +242,8 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
     ranking, verdict = diagnosis.ranking, diagnosis.verdict
     tested = [row for row in ranking if is_finite(row.delta_chi2)]
     others = [row for row in tested if not row.in_answer_set]
-    best = max(tested, key=_gain, default=None)
+    by_gain = attrgetter("delta_chi2")
+    best = max(tested, key=by_gain, default=None)
     if verdict == ADEQUATE:
         # Ranked by the score: a predicted Δχ² may belong to a size of the wrong sign.
         scored = [row for row in ranking if is_finite(row.sigma)]
@@ -252,24 +256,20 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
         note = f"{_sigmas(best)} σ better" + (f", but {best.reason}" if best.reason else "")
         return Fact("Nearest candidate", spaced_name(best.effect), note)
     inside = [row for row in tested if row.in_answer_set]
-    best = max(inside, key=_gain, default=None)
+    best = max(inside, key=by_gain, default=None)
     if best is None:
         return None
     n_tested = sum(row.status != NOT_TESTABLE for row in ranking)
     note = f"of {n_tested} candidates tested" if n_tested > 1 else "the only candidate"
     note = f"{len(inside)} of {n_tested} candidates fit equally well" if len(inside) > 1 else note
     # A candidate that contains the answer as a limiting case fits as well by construction, and is no rival.
-    rival = max([row for row in others if not row.plausible or not row.reason], key=_gain, default=None)
+    rival = max([row for row in others if not row.plausible or not row.reason], key=by_gain, default=None)
     if rival is not None:
         behind = best.delta_chi2 - rival.delta_chi2
         # An implausible candidate, or one whose Δχ² is only predicted, may have the larger Δχ².
         note = f"next best: {spaced_name(rival.effect)}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
         note += "" if rival.plausible else ", not plausible"
     return Fact("Significance", f"{_sigmas(best)} σ", note, "significance")
-
-
-def _gain(row: Candidate) -> float:
-    return row.delta_chi2
 
 
 def _sigmas(row: Candidate) -> str:
@@ -353,13 +353,6 @@ def bounds_text(entry: Number, unit: str = "") -> str:
     return f"{text} (its {ends} bound{'s' if ' ' in ends else ''})" if ends else text
 
 
-def _upper_limits(diagnosis: Diagnosis) -> Fact | None:
-    bounded = [row for row in diagnosis.ranking if row.largest]
-    if diagnosis.verdict != ADEQUATE or not bounded:
-        return None
-    return Fact("Upper limits", f"{len(bounded)} candidates", "the largest undetected size of each is listed below")
-
-
 def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
     """The false-alarm rate of such trials, and the effects that they could have detected."""
     if diagnosis.power is None:
@@ -391,14 +384,6 @@ def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
     if len(ladder) > 1:
         answer = f"{number(before)} → {number(1e3 * float(last[key]))} mm"
     return [Fact(what, answer, f"replicate scatter {number(floor)} mm" if math.isfinite(floor) else "")]
-
-
-def _exponent(diagnosis: Diagnosis) -> list[Fact]:
-    """The damping exponent of the final model."""
-    for entry in diagnosis.parameters:
-        if entry.key == "eversion_damping.n" and is_finite(entry.value):
-            return [Fact("Damping exponent", estimate_text(entry), interval_text(entry))]
-    return []
 
 
 def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
@@ -458,7 +443,7 @@ def _ambiguous(step: SelectionStep, model: str, trials: str) -> str:
     return (
         f"{model} lacks an effect, and these data cannot tell which: {joined(list(step.answer_names), 'or')}. "
         f"{_hypotheses(answers)}. Their fits to {trials} lie within Δχ² = 9 of each other{_by_film(answers)}."
-        f"{_weights(answers)}{_chamber(answers)}{_camera_of_a_vine(answers)}{_remedies(step)}"
+        f"{_weights(answers)}{_chamber(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
     )
 
 
@@ -466,7 +451,7 @@ def _difference_between_trials(step: SelectionStep, model: str, trials: str) -> 
     answers = step.answer_set
     return (
         f"The trials differ from each other, and no effect is missing from {model}: {_hypotheses(answers)}. That "
-        f"explains the misfit of {trials} (Δχ² = {answers[0].delta_chi2:.0f}).{_remedies(step)}"
+        f"explains the misfit of {trials} (Δχ² = {answers[0].delta_chi2:.0f}).{remedies_in_words(step)}"
         f"{_with_the_fault(step)}"
     )
 
@@ -476,7 +461,7 @@ def _measurement_fault(step: SelectionStep, model: str, trials: str) -> str:
     return (
         f"A fault of the measurement, not missing physics: {joined(list(step.answer_names), 'or')} explains the misfit "
         f"of {model} to {trials} ({_hypotheses(answers)}). It is not added to the model: find the fault and measure "
-        f"again, or correct the sheet.{_slips(answers)}{_camera_of_a_vine(answers)}{_remedies(step)}"
+        f"again, or correct the sheet.{_slips(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
         f"{_with_the_fault(step)}{_other_effects_beside_the_fault(answers[0].names)}"
     )
 
@@ -587,16 +572,13 @@ def _slips(answers: Sequence[LikelihoodRatio]) -> str:
 
 def _camera_of_a_vine(answers: Sequence[LikelihoodRatio]) -> str:
     """Name the faults of camera and gauge equivalent to film masses that differ between vines; blank where none do."""
-    if not any(FILM in hypothesis.names and len(_vines_with_film_error(hypothesis)) > 1 for hypothesis in answers):
+    vines = [{one.vine for one in answer.numbers if one.key.startswith(f"{FILM}.")} for answer in answers]
+    if not any(FILM in answer.names and len(of) > 1 for answer, of in zip(answers, vines, strict=True)):
         return ""
     return (
         " In a vine's recordings an error of ε/2 in frame rate, of −ε in scale or of −ε in pressure has the same effect"
         " as an error of ε in its film mass: check the camera settings and the gauge of each vine too."
     )
-
-
-def _vines_with_film_error(hypothesis: LikelihoodRatio) -> set[str]:
-    return {number.vine for number in hypothesis.numbers if number.key.startswith(f"{FILM}.")}
 
 
 def _by_film(answers: Sequence[LikelihoodRatio]) -> str:
@@ -623,11 +605,14 @@ def _with_the_fault(step: SelectionStep) -> str:
     if best.names[-1] == N_BY_VINE:
         return ""
     before = {number.name: number for number in fit.numbers}
-    biased = [
-        number
-        for number in best.others
-        if number.name in before and math.isfinite(number.sigma) and _is_biased(before[number.name], number)
-    ]
+    biased = []
+    for fitted in best.others:
+        without = before.get(fitted.name)
+        if without is None or not math.isfinite(fitted.sigma):
+            continue
+        within = not math.isfinite(without.sigma) or without.low <= fitted.value <= without.high
+        if fitted.key.split(".")[0] not in base_model() or not within:
+            biased.append(fitted)
     biased.sort(key=lambda number: number.key != EXPONENT)
     if not biased:
         return ""
@@ -637,22 +622,12 @@ def _with_the_fault(step: SelectionStep) -> str:
     return f" Fitted together with {best.names[-1]}, {', '.join(changes[:MOST_NAMED])}{others}."
 
 
-def _is_biased(before: Number, with_fault: Number) -> bool:
-    if before.key.split(".")[0] not in base_model():
-        return True
-    return math.isfinite(before.sigma) and not before.low <= with_fault.value <= before.high
-
-
 def _hypotheses(answers: Sequence[LikelihoodRatio]) -> str:
     """The hypotheses of an answer set with their sizes, differences between trials first."""
     differences = [difference_in_words(result) for result in answers if result.effects[-1].kind == BETWEEN_TRIALS]
     effects = [result for result in answers if result.effects[-1].kind != BETWEEN_TRIALS]
     sizes = {" with ".join(result.names): sizes_in_words(result.numbers) for result in effects}
     return "; ".join([*differences, *(f"{names} has {size}" if size else names for names, size in sizes.items())])
-
-
-def _remedies(step: SelectionStep) -> str:
-    return remedies_in_words(step.answer_set, [trial.trial for trial in step.tests.fit.trials])
 
 
 def _adequate(step: SelectionStep, model: str, trials: str) -> str:
@@ -683,10 +658,9 @@ def _unstated(step: SelectionStep) -> str:
     if not step.unstated_differences:
         return ""
     best = max(step.unstated_differences, key=lambda result: result.delta_chi2)
-    trials = [trial.trial for trial in step.tests.fit.trials]
     return (
         f" However, the trials seem to differ, which biases the fitted numbers: {difference_in_words(best)}"
-        f" (Δχ² = {best.delta_chi2:.0f}).{remedies_in_words([best], trials)}"
+        f" (Δχ² = {best.delta_chi2:.0f}).{remedies_in_words(step, [best])}"
     )
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,9 +39,9 @@ def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> fl
     return area_m2(diameter_mm) * length_mm / 1e3 / chamber_m3
 
 
-def gauge_left(gauge_Pa: float, change: float, gamma: float = 1.0) -> float:
-    """Return the fraction of the gauge pressure left after the volume has grown by the fraction `change`. P_abs V^γ is
-    constant, with absolute pressure.
+def gauge_left(gauge_Pa: float, change: Any, gamma: float = 1.0) -> Any:
+    """Return the fraction of the gauge pressure left after the volume has grown by the fraction `change`, one or many.
+    P_abs V^γ is constant, with absolute pressure.
     """
     absolute_Pa = gauge_Pa + AMBIENT_PRESSURE_PA
     return (absolute_Pa * (1 + change) ** -gamma - AMBIENT_PRESSURE_PA) / gauge_Pa
@@ -121,8 +121,11 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
             rms_m = position_rms_m(plain, moved, trial)
             rows.append(("Fig. 4", trial.pressure_Pa / 1e3, departure.name, rms_m, math.nan, moved.slack_from_s))
     for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
+        size = (published.DIAMETER_MM[4], published.FINAL_SPEED_THICKNESS_UM, published.LONGEST_VINE_MM)
+        trials = [paper_trial(*size, pressure_kPa, payload_g) for payload_g in payloads_g]
+        plain_m_s = [final_speed_m_s(trial) for trial in trials]
         for departure in DEPARTURES:
-            off = [_speed_change_m_s(pressure_kPa, payload_g, departure) for payload_g in payloads_g]
+            off = [final_speed_m_s(trial, departure) - plain for trial, plain in zip(trials, plain_m_s, strict=True)]
             rms_m_s = math.sqrt(float(np.mean(np.square(off)))) if off else math.nan
             rows.append(("Fig. 5", float(pressure_kPa), departure.name, math.nan, rms_m_s, math.nan))
     return pd.DataFrame(rows, columns=list(DEPARTURE_COLUMNS))
@@ -138,21 +141,6 @@ def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
     """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %."""
     stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))
     return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
-
-
-def _speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departure) -> float:
-    """Change of the leading edge's speed at the paper's 12 cm against Eq. (2), in Fig. 5; its B is not printed and
-    taken as proportional to the wall.
-    """
-    wall_um = published.FINAL_SPEED_THICKNESS_UM
-    B = published.DAMPING_B[4] * wall_um / published.THICKNESS_UM[4]
-    trial = paper_trial(published.DIAMETER_MM[4], wall_um, published.LONGEST_VINE_MM, pressure_kPa, payload_g)
-    at_m = published.FINAL_SPEED_AT_MM / 1e3
-    speeds = []
-    for assumed in (departure, NONE):
-        moved = follow(trial, assumed, B)
-        speeds.append(lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, at_m))
-    return speeds[0] - speeds[1] if math.isfinite(speeds[0]) else -speeds[1]
 
 
 def motion_table(instants: int = 200) -> pd.DataFrame:
@@ -171,24 +159,24 @@ def motion_table(instants: int = 200) -> pd.DataFrame:
 
 def pressure_table(instants: int = 60) -> pd.DataFrame:
     """Compute the remaining gauge pressure along the growth of Fig. 4's vine."""
-    rows = []
+    parts = []
     for trial in position_trials():
+        y = np.linspace(0, trial.length_m, instants)
+        change = area_m2(1e3 * trial.diameter_m) * y / trial.chamber_m3
         for departure in DEPARTURES[:2]:
-            for y in np.linspace(0, trial.length_m, instants):
-                change = area_m2(1e3 * trial.diameter_m) * float(y) / trial.chamber_m3
-                left = gauge_left(trial.pressure_Pa, change, departure.gamma or 1.0)
-                rows.append((trial.pressure_Pa / 1e3, departure.name, float(y), left))
-    return pd.DataFrame(rows, columns=["pressure_kPa", "departure", "lead_position_m", "gauge_left"])
+            columns = {"pressure_kPa": trial.pressure_Pa / 1e3, "departure": departure.name, "lead_position_m": y}
+            left = gauge_left(trial.pressure_Pa, change, departure.gamma or 1.0)
+            parts.append(pd.DataFrame(columns | {"gauge_left": left}))
+    return pd.concat(parts, ignore_index=True)
 
 
 # ------------------------------------------------------------------------------
 # The fast vine, the example of air drag, and the published rule, by Eq. (2).
 
 
-def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
-    """Compute the speed of the fast vine's leading edge by Eq. (2) with B from the scaling prior."""
-    fast = published.FAST_VINE
-    trial = paper_trial(fast["diameter_mm"], fast["thickness_um"], fast["length_mm"], fast["pressure_kPa"])
+def speeds_at(fractions: Sequence[float], case: Mapping[str, float]) -> list[float]:
+    """Compute the speed of a vine's leading edge by Eq. (2), B from the scaling prior, at fractions of its length."""
+    trial = paper_trial(case["diameter_mm"], case["thickness_um"], case["length_mm"], case["pressure_kPa"])
     model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
     motion = simulate(model, trial, np.linspace(0, 0.05, 50_001))
     return [lead_velocity_at(motion.lead_position_m, motion.lead_velocity_m_s, f * trial.length_m) for f in fractions]
@@ -197,15 +185,11 @@ def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
 def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, float]]:
     """Compute the ratio of drag to drive in the paper's example of air drag, by mechanics and as printed. By mechanics
     the air meets the head at ẏ and the pulley halves the force: ¼ρ A C_D ẏ² over ½PA; printed is ½ρ A C_D ẋ². Speeds
-    are those of Eq. (2) without drag, with B from the scaling prior.
+    are those of Eq. (2) without drag.
     """
     case = published.DRAG_EXAMPLE
-    trial = paper_trial(case["diameter_mm"], case["thickness_um"], case["length_mm"], case["pressure_kPa"])
-    model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
-    motion = simulate(model, trial, np.linspace(0, 0.05, 50_001))
-    for fraction in fractions:
-        lead = lead_velocity_at(motion.lead_position_m, motion.lead_velocity_m_s, fraction * trial.length_m)
-        share = 0.5 * AIR_DENSITY_KG_M3 * published.DRAG_COEFFICIENT * lead**2 / trial.pressure_Pa
+    for fraction, lead in zip(fractions, speeds_at(fractions, case), strict=True):
+        share = 0.5 * AIR_DENSITY_KG_M3 * published.DRAG_COEFFICIENT * lead**2 / (1e3 * case["pressure_kPa"])
         yield fraction, share, 8 * share
 
 
@@ -397,14 +381,16 @@ def final_speeds(
         if count:
             first = trials[0]
             sizes = (condition, first.vine, first.pressure_Pa / 1e3, 1e3 * first.payload_kg)
-            rows.append((*sizes, count, 1e3 * at_m, mean, sigma, eq2_speed_m_s(first)))
+            rows.append((*sizes, count, 1e3 * at_m, mean, sigma, final_speed_m_s(first)))
     return pd.DataFrame(rows, columns=list(SPEED_COLUMNS))
 
 
-def eq2_speed_m_s(trial: Trial) -> float:
-    """Return the speed of the leading edge at 12 cm by Eq. (2), B proportional to the wall; 0 where not reached."""
+def final_speed_m_s(trial: Trial, departure: Departure = NONE) -> float:
+    """Return the speed of the leading edge at the paper's 12 cm by Eq. (2), or with a departure from it; 0 where it
+    does not get there. B of Fig. 5's vine is not printed and taken as proportional to the wall.
+    """
     B = published.DAMPING_B[4] * 1e6 * trial.thickness_m / published.THICKNESS_UM[4]
-    moved = follow(trial, NONE, B)
+    moved = follow(trial, departure, B)
     speed = lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, published.FINAL_SPEED_AT_MM / 1e3)
     return speed if math.isfinite(speed) else 0.0
 
@@ -418,7 +404,7 @@ def speed_curves(conditions: Mapping[str, list[Trial]], instants: int = 15) -> p
     for pressure_Pa, trials in by_pressure.items():
         payloads_kg = [trial.payload_kg for trial in trials]
         for payload_kg in np.linspace(min(payloads_kg), max(payloads_kg), instants):
-            speed = eq2_speed_m_s(replace(trials[0], payload_kg=float(payload_kg)))
+            speed = final_speed_m_s(replace(trials[0], payload_kg=float(payload_kg)))
             rows.append((trials[0].vine, pressure_Pa / 1e3, 1e3 * payload_kg, speed, math.nan))
     names = ["vine", "pressure_kPa", "payload_g", "final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s"]
     return pd.DataFrame(rows, columns=names)

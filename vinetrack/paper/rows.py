@@ -29,9 +29,9 @@ from vinetrack.paper.motions import (
     DEPARTURES,
     area_m2,
     drag_shares,
-    fast_vine_speeds,
     gauge_left,
     rule_on_noise_free,
+    speeds_at,
     volume_change,
 )
 from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
@@ -448,7 +448,7 @@ def theory_rows(trials: Sequence[Trial]) -> Iterator[Row]:
     fast = published.FAST_VINE
     B = damping_prior(fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
     printed = published.FAST_VINE_PREDICTED_M_S
-    for fraction, speed in zip(fast_at, fast_vine_speeds(fast_at), strict=True):
+    for fraction, speed in zip(fast_at, speeds_at(fast_at, fast), strict=True):
         yield row_of("fast_vine_predicted_{percent:.0f}", speed, published_as=printed, percent=100 * fraction, B=B)
     # (0.50, 0.95, 0.99): fractions of the length at which drag is evaluated (chosen)
     for fraction, share, by_print in drag_shares((0.50, 0.95, 0.99)):

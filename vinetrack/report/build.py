@@ -186,11 +186,6 @@ class ModelResult:
     diagnosis: Diagnosis | None = None
 
     @property
-    def is_refuted(self) -> bool:
-        """Whether the diagnosis refutes the model in use."""
-        return self.diagnosis is not None and self.diagnosis.refutes
-
-    @property
     def verdict(self) -> str:
         """The position error of the model in two sentences; blank without a condition."""
         table = self.comparison
@@ -241,16 +236,6 @@ class Clip:
     caption: str
     poster: bytes = b""
 
-    @property
-    def source(self) -> str:
-        """The film as a data URI."""
-        return base64_uri("video/mp4", self.mp4)
-
-    @property
-    def poster_uri(self) -> str:
-        """The poster as a data URI."""
-        return base64_uri("image/webp", self.poster)
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReportContent:
@@ -287,7 +272,8 @@ def build_report(content: ReportContent) -> str:
     )
     environment.filters |= {"number": number, "with_error": with_error, "interval": interval}
     environment.globals |= {"rows": rows, "display_unit": display_unit, "bounds_text": bounds_text}
-    environment.globals["listed_names"] = listed_names
+    environment.globals |= {"listed_names": listed_names, "inline_picture": inline_picture}
+    environment.globals |= {"data_uri": data_uri, "base64_uri": base64_uri}
     settings = content.provenance.get("settings") or {}
     sections = {name: figure.section for name, figure in all_figures().items()}
     figures: dict[str, list[ReportFigure]] = {section: [] for section in sections.values()}

@@ -120,16 +120,6 @@ class ReportFigure:
     data_name: str = ""
     data: str = ""
 
-    @property
-    def element(self) -> Markup:
-        """The picture as an element of the page."""
-        return inline_picture(self.picture, self.key, self.title)
-
-    @property
-    def data_uri(self) -> str:
-        """The data as a file to download."""
-        return data_uri(self.data_name, self.data)
-
 
 @dataclass(frozen=True)
 class ReportTable:
