@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.notebook import html_table
@@ -246,22 +247,14 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         return [f"{what}: no further trial within `limits` can be made and filmed."]
     count = len(plan.trials)
     lines = [f"To detect {what} with {percent(plan.target)} power ({percent(plan.before)} with the trials so far):"]
-    rows, done = [], 0
-    while done < count:
-        added = plan.trials[done]
-        same = [other for other in plan.trials[done:] if sheet_cells(other.trial) == sheet_cells(added.trial)]
-        times = next((k for k, other in enumerate(plan.trials[done:]) if other not in same), count - done)
-        cells = sheet_cells(added.trial)
-        changed = [f"{COLUMN_WORDS.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
+    rows = []
+    for cells, group in groupby(plan.trials, key=lambda trial: sheet_cells(trial.trial)):
+        alike = list(group)
+        added, kPa, grams = alike[0], cells.get("pressure_kPa", math.nan), cells.get("payload_g", 0.0)
         new = ["a new vine"] if added.new_vine else []
-        rows.append(
-            (
-                str(times), added.trial.vine, f"{cells.get('pressure_kPa', math.nan):g}",
-                f"{cells.get('payload_g', 0.0):g}", ", ".join([*new, *changed]) or "–",
-                percent(plan.trials[done + times - 1].probability),
-            )
-        )  # fmt: skip
-        done += times
+        new += [f"{COLUMN_WORDS.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
+        power = percent(alike[-1].probability)
+        rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", power))
     if rows and plan.after > plan.before:
         head = ("trials", "vine", "pressure", "payload", "new", "power then")
         lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
@@ -551,17 +544,11 @@ def _status(candidate: Candidate, step: Round) -> str:
 def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     from vinetrack.core.terminal import table
 
-    body = [
-        (
-            (str(row.added) or "initial model")
-            + (", partial" if getattr(row, "partial", False) in (True, "True") else ""),
-            *(
-                f"{1e3 * value:.2f}" if math.isfinite(value) else "–"
-                for value in (row.rms_in_sample_m, row.rms_left_out_m, row.rms_highest_pressure_m, row.floor_m)
-            ),
-        )
-        for row in ladder.itertuples()
-    ]
+    body = []
+    for row in ladder.to_dict("records"):
+        model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") in (True, "True") else "")
+        errors = (row[f"{key}_m"] for key in ("rms_in_sample", "rms_left_out", "rms_highest_pressure", "floor"))
+        body.append((model, *(f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)))
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
 
 
@@ -592,12 +579,12 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         "parameters",
     ]
     changed: dict[tuple[str, str], dict[str, str]] = {}
-    for row in numbers.itertuples():
-        unit, factor = display_unit(row.unit)
-        title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol
+    for row in numbers.to_dict("records"):
+        unit, factor = display_unit(row["unit"])
+        title = f"{row['symbol']} ({row['vine']})" if row["vine"] else row["symbol"]
         place = changed.setdefault((title, unit), {})
-        place["after" if row.added else "before"] = with_error(row.value * factor, row.sigma * factor)
-    body = [(title, row.get("before", "–"), row.get("after", "–"), unit) for (title, unit), row in changed.items()]
+        place["after" if row["added"] else "before"] = with_error(row["value"] * factor, row["sigma"] * factor)
+    body = [(title, of.get("before", "–"), of.get("after", "–"), unit) for (title, unit), of in changed.items()]
     lines += aligned(body, ("", "before", "after", "unit"))
     return lines + [f"! {message}" for message in after.messages]
 

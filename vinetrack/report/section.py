@@ -204,7 +204,15 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "where": [line for line in diagnosis.where if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
         "rounds": [
-            {"table": ranking_table(entry), "blind": _not_testable(entry.ranking), "of": entry}
+            {
+                "table": ranking_table(entry),
+                "blind": [
+                    f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}"
+                    for row in entry.ranking
+                    if row.status == NOT_TESTABLE
+                ],
+                "of": entry,
+            }
             for entry in diagnosis.rounds
         ],
         # Upper limits are valid only if no effect is missing.
@@ -299,13 +307,6 @@ def power_entry(power: Power | None) -> dict[str, Any] | None:
     return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "table": table}
 
 
-def _not_testable(ranking: Sequence[Candidate]) -> list[str]:
-    """Candidates without an observable effect under these conditions, each with the reason."""
-    return [
-        f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in ranking if row.status == NOT_TESTABLE
-    ]
-
-
 def tied_pairs(entry: Round) -> list[str]:
     """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
     names, matrix = entry.cosine_names, entry.cosines
@@ -333,28 +334,18 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         [number(trial.get(key)) if key != "replicates" else str(trial.get(key)) for key in shown] for trial in trials
     ]
     simulated = content.get("simulated_sigma") or {}
-    separations = [
-        (
-            " from ".join(spaced_name(part.strip()) for part in str(pair).split("|")),
-            number(sigma, 2),
-            _simulated(simulated.get(pair) or {}),
-        )
-        for pair, sigma in (content.get("separation_sigma") or {}).items()
-    ]
+    separations = []
+    for pair, sigma in (content.get("separation_sigma") or {}).items():
+        found = simulated.get(pair) or {}
+        spread = f"{number(found['mean'], 2)} ± {number(found.get('sd'), 1)}" if is_finite(found.get("mean")) else "–"
+        separations.append((" from ".join(map(spaced_name, pair.split(" | "))), number(sigma, 2), spread))
+    columns = ("They separate", "by (σ)", "in simulation (σ)")
     return {
         "text": str(content.get("text") or ""),
         "trials": ReportTable("", head, rows if head else (), frozenset(range(len(head)))),
-        "separations": ReportTable(
-            "", ("They separate", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2})
-        ),
+        "separations": ReportTable("", columns, separations, frozenset({1, 2})),
         "calibration": str(content.get("calibration") or ""),
     }
-
-
-def _simulated(entry: Mapping[str, Any]) -> str:
-    if not is_finite(entry.get("mean")):
-        return "–"
-    return f"{number(entry['mean'], 2)} ± {number(entry.get('sd'), 1)}"
 
 
 def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -457,8 +448,10 @@ def tally(table: pd.DataFrame) -> str:
 
 def table_one(by_row: Mapping[str, Any]) -> ReportTable:
     """Return Table I of the paper, with the results of Fig. 6 and ours."""
-    head = ("R", "wall, µm", "diameter, mm", "heat press, °C", "laser, %", "B printed, N·(s/m)ⁿ", "B here (95 %)")
-    head += ("R² printed", "R² here")
+    head = (
+        *("R", "wall, µm", "diameter, mm", "heat press, °C", "laser, %"),
+        *("B printed, N·(s/m)ⁿ", "B here (95 %)", "R² printed", "R² here"),
+    )
     body = []
     for scale, B in published.DAMPING_B.items():
         made = [by_row.get(f"{name}_R{scale}") for name in ("thickness", "diameter", "press", "laser")]
@@ -493,8 +486,10 @@ def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[Repor
         body = []
         for kPa, error in printed.items():
             of_figure = departures[(departures["figure"] == figure) & np.isclose(departures["pressure_kPa"], kPa)]
-            size = dict(zip(of_figure["departure"], factor * of_figure[column], strict=True))
-            caused = [_range([size[name] for name in names if name in size]) for names in CAUSES.values()]
+            caused = [
+                _range((factor * of_figure.loc[of_figure["departure"].isin(names), column]).tolist())
+                for names in CAUSES.values()
+            ]
             body.append((f"{kPa:g}", f"{error:g}", number(_value(by_row.get(f"{row}_{kPa:g}kPa"))), *caused))
         made.append(ReportTable(f"Table II, {title}", head, body, frozenset(range(len(head))), note))
     return made
