@@ -226,7 +226,7 @@ def quality(first_moving: int = 10, last_moving: int = 49) -> PointQuality:
     slot = np.arange(EDGE_PX.size)
     without_edge = np.zeros(slot.size, dtype=bool)
     flag = np.full(slot.size, "", dtype="<U64")
-    return PointQuality(flag, slot, (), first_moving, last_moving, None, without_edge)
+    return PointQuality(flag, slot, (), first_moving, last_moving, None, without_edge, np.zeros(slot.size))
 
 
 @pytest.mark.parametrize(("length_px", "complete"), [(400, True), (405, True), (395, True), (430, False), (370, False)])

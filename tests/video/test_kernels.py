@@ -61,7 +61,7 @@ def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     start = edge + 1.4
     start[5] = np.nan
     fit = kernels.fit_edges(
-        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, 0.15, 6.0, 12,
+        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
         NO_SHADING, np.arange(16), (0, 9),
     )  # fmt: skip
     assert np.isnan(fit[5]).all()
@@ -77,7 +77,7 @@ def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_l
     strip, edge, pictures = stepping(rim=True, contrast=contrast)
     known, ignored = (
         kernels.fit_edges(
-            strip, np.ones(16), np.zeros(16), edge - 1.4, np.zeros(16), LAG, 0.4, pictures, 0.15, 6.0, 12,
+            strip, np.ones(16), np.zeros(16), edge - 1.4, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
             shading, np.arange(16), (0, 9),
         )[:, 0] - edge
         for shading in (RIM, NO_SHADING)
@@ -86,17 +86,18 @@ def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_l
     assert np.abs(ignored).max() > 2 * np.abs(known).max()
 
 
-def test_what_a_fit_leaves_is_summed_by_row_by_distance_and_in_all() -> None:
+def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     strip, edge, pictures = stepping(rim=True)
     blur, margin = 0.8, 6.0
     fit = np.column_stack([edge, np.zeros((16, 2)), np.full(16, 0.03), np.full(16, -0.02), np.zeros(16)])
     use = np.arange(16) % 3 != 0
     steady, frames = (strip, np.ones(16), np.zeros(16)), np.flatnonzero(use)
     arguments = (*steady, fit, np.zeros(16), LAG, blur, pictures, margin, frames, 0.5 * RIM)
-    rows, places, misfit = (sums.sum(axis=0) for sums in kernels.residual_sums(*arguments))
+    rows, places, distances, misfit = (sums.sum(axis=0) for sums in kernels.residual_sums(*arguments))
     half = kernels.coverage_reach(0.0, blur) + margin
-    by_row, by_place, logs = np.zeros((9, 2)), np.zeros((65, 2)), []
+    by_distance, by_row, by_place, logs = np.zeros_like(distances), np.zeros((9, 2)), np.zeros((65, 2)), []
     for t in np.flatnonzero(use):
+        columns: dict[int, np.ndarray] = {}
         for u in range(9):
             for s in range(120):
                 x = edge[t] - LAG[u] - s
@@ -111,8 +112,13 @@ def test_what_a_fit_leaves_is_summed_by_row_by_distance_and_in_all() -> None:
                 ahead, part = divmod(-x, 1.0)
                 by_place[int(ahead) + 32] += (1 - part) * w * np.array([r, 1.0])
                 by_place[int(ahead) + 33] += part * w * np.array([r, 1.0])
+                i = int(len(by_distance) // 2 - x)
+                columns[i] = columns.get(i, np.zeros(2)) + w * (after - before) * np.array([r, after - before])
                 by_row[u] += w * g * np.array([r, g])
                 logs.append(math.log(1 + r * r / (4.5 * (va + vb))))
+        for i, (top, square) in columns.items():
+            by_distance[i] += top**2 / square, 1
+    assert np.allclose(distances, by_distance, rtol=0.01, atol=0.02)
     assert np.allclose(rows, by_row, rtol=0.01, atol=0.02 * np.abs(by_row).max())
     assert misfit == pytest.approx([np.sum(logs), len(logs)], rel=1e-3)
     assert np.allclose(places.T, by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))

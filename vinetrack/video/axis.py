@@ -19,14 +19,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.experiment.schema import SHORTEST_AXIS_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import collecting_path, monotone_path_sums
-from vinetrack.video.small_pictures import (
-    MIN_GROWN_PART,
-    Pixels,
-    SmallPictures,
-    changed_pixels,
-    frames_with_change,
-    order_tolerance,
-)
+from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures, changed_pixels, order_tolerance
 
 # Least share of all change that one front explains where nothing else of weight moves (chosen)
 LEAST_FRONT_SHARE = 0.45
@@ -77,11 +70,6 @@ class Axis:
         """Half the width of the widest strip along the axis whose normals do not cross."""
         return math.inf
 
-    @property
-    def total_turn_rad(self) -> float:
-        """Angle by which the direction turns in all, to either side."""
-        return 0.0
-
     def direction_at(self, along_px: Floats) -> Floats:
         """Unit vectors of growth at places along the axis. Shape (..., 2)."""
         return np.broadcast_to(self.direction, (*np.shape(along_px), 2))
@@ -124,11 +112,7 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
     use_lasting = grows and small.grown is not small.changed
     for fraction in BEGINNINGS:
         count = max(3, int(fraction * len(small.frames)))
-        pixels = (
-            _pixels_until(fraction, small.grown)
-            if use_lasting
-            else changed_pixels(*frames_with_change(small.frames[:count]))
-        )
+        pixels = _pixels_until(fraction, small.grown) if use_lasting else changed_pixels(small.frames, count)
         line = _line_through(small, pixels, early_first=True)
         in_order = line.front_share * line.collected
         if line.front_share >= LEAST_FRONT_SHARE and (

@@ -200,7 +200,34 @@ def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple
     return None
 
 
+STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
 CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
+
+
+def path_error_px(axis: Axis) -> float:
+    """Return the slow error of positions along an axis that comes from its curvature."""
+    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
+    return 0.04 * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
+
+
+def curve_note(axis: CurvedAxis) -> str:
+    """Say that the growth axis was found to be a curve."""
+    return (
+        f"the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those along a curve that"
+        " was found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
+    )
+
+
+def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
+    """Refuse a curve that leaves the picture or bends more sharply than its strip is wide."""
+    complaint = curve_problem(axis, half_px, (shape[1], shape[0]))
+    if complaint is not None:
+        raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
+
+
+def outline_stretches(axis: Axis) -> int:
+    """Number of stretches in which the sides of a tube are found."""
+    return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
 
 
 def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
@@ -226,7 +253,7 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
 
 def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
     """Middle of the tube at places along it, by Gaussian-weighted local lines; level beyond the outermost stretches."""
-    spacing = float(np.median(np.diff(places))) if len(places) > 1 else 1.0
+    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
     queries = np.clip(queries, places[0], places[-1])
     out = np.empty(len(queries))
     for k, place in enumerate(queries):

@@ -24,9 +24,11 @@ from vinetrack.video.edge_state import (
     ASSUMED_EXPOSURE,
     EARLY_FIT_ROUNDS,
     FIT_ROUNDS,
+    OPTICAL_BLUR_PX,
     START_CLEARANCE_PX,
     EdgeState,
     blur_lengths,
+    clear_of_start,
     core_frames,
     estimate_appearance,
     find_exposure,
@@ -37,9 +39,11 @@ from vinetrack.video.edge_state import (
     informative_frames,
     initial_state,
     moving_frames,
+    residuals,
     search_edges,
     seen_exposure,
 )
+from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.point_quality import growth_end
 from vinetrack.video.strip import SLOW_PX, Positions, Strip
 
@@ -59,6 +63,25 @@ from vinetrack.video.strip import SLOW_PX, Positions, Strip
 # and where a shaken camera was stabilised the slow part of the shake stays.
 
 GUESS_RANDOM_PART = math.sqrt(0.5)  # The same for an edge that is a guess, since a door or the mouth hides it (chosen)
+
+
+def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats:
+    """Slow error of each frame's edge, one standard deviation. Shapes: edge_px (n_frames,); contrast (n_along,) →
+    (n_frames,).
+    """
+    from scipy.ndimage import median_filter
+
+    everywhere_px = float(np.hypot(SLOW_PX, shared_px))
+    finite = np.isfinite(contrast)
+    if not finite.any():
+        return np.full(len(edge_px), everywhere_px)
+    columns = np.arange(len(contrast))
+    # 21: columns over which the contrast at an edge is taken, px (chosen)
+    smooth_contrast = median_filter(np.interp(columns, columns[finite], np.abs(contrast[finite])), 21, mode="nearest")
+    local_contrast = np.interp(np.nan_to_num(edge_px), columns, smooth_contrast)
+    # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
+    # 1.0: least contrast, in grey levels (chosen)
+    return np.asarray(np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0)))
 
 
 def shared_disagreement(lead_px: Floats) -> float:
@@ -98,6 +121,8 @@ def noise_and_slow(bands_px: Floats, seen_px: Floats, apart_px: Floats) -> tuple
 
 
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
+# Ratio by which the misfit of a fit that agrees with its neighbours may exceed that of one that does not (chosen)
+CONSISTENT_MISFIT_RATIO = 1.4
 # Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
 LEAST_FITTED_AMPLITUDE = 0.5
 
@@ -135,8 +160,8 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
             if inside:
                 if replacement is not None and (faint or replacement[2] < out[t, 2]):
                     out[t] = replacement
-            elif not faint and _spans_missing_frames(edge[t] - previous, step) and (
-                out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
+            elif not faint and _spans_missing_frames(edge[t] - previous, step) and _good_and_better(
+                out[t], replacement, bad_misfit
             ):  # fmt: skip
                 continue
             elif replacement is None:
@@ -145,13 +170,12 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
             else:
                 out[t] = replacement
             edge[t] = float(out[t, 0])
-    return _repair_strays(strip, state, out, moving)
+    return _repair_strays(strip, state, out, moving, bad_misfit)
 
 
-def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[np.int_]) -> Floats:
-    """Replace fits that stray from the parabola through two neighbours on each side by the best fit near it; one that
-    fits much better than what is found there stays. Where none is found the parabola counts, and errs as one gone
-    astray, unless the edge stands: its frame repeats the one before.
+def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[np.int_], bad_misfit: float) -> Floats:
+    """Replace bad fits that stray from the parabola through two neighbours on each side by the best fit near it. A good
+    fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
     """
     out = fit.copy()
     for t in moving[2:-2]:
@@ -159,23 +183,24 @@ def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[
         expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
         bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
         distance = abs(out[t, 0] - expected)
-        if not np.isfinite(distance) or distance < max(1.5, bend):
+        if not np.isfinite(distance) or out[t, 2] <= bad_misfit or distance < max(1.5, bend):
             continue
         reach = max(2.0, 0.3 * distance)
         replacement = _best_between(strip, state, int(t), expected - reach, expected + reach, 9)
-        # 1.4: ratio by which the misfit of a fit that agrees with its neighbours may exceed that of one that does not
-        # (chosen)
-        if replacement is not None and replacement[2] < 1.4 * out[t, 2]:
+        if replacement is not None and replacement[2] < CONSISTENT_MISFIT_RATIO * out[t, 2]:
             out[t] = replacement
-        elif replacement is None and abs(out[t, 0] - around[1]) > 0.3 * abs(expected - around[1]):
-            out[t, :2] = expected, ASTRAY_PX
     return out
+
+
+def _good_and_better(fit: Floats, other: Floats | None, bad_misfit: float) -> bool:
+    """Whether a fit is good, and better than another."""
+    return bool(fit[2] <= bad_misfit) and (other is None or bool(other[2] > fit[2]))
 
 
 def _spans_missing_frames(stride: float, step: float) -> bool:
     """Whether a stride is two to four whole steps: frames are missing, and the point is right."""
     ratio = abs(stride) / max(step, 1e-6)
-    return step > 1.0 and 1.85 < ratio < 4.15 and abs(ratio - round(ratio)) < 0.15
+    return step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25
 
 
 def _is_rough(edge: Floats) -> NDArray[np.bool_]:
@@ -197,6 +222,10 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
 
 BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
 
+# Deviation of a band, in median absolute deviations of the bands of its frame, at which it is clipped (chosen)
+OUTLYING_BAND = 2.0
+BAND_OFFSET_PX = 50.0  # Growth over which the lead or lag of a band is taken as its usual offset (chosen)
+
 MEDIAN_TO_MEAN = 1.27  # Ratio of mean to median of χ² with three degrees of freedom (derived)
 
 
@@ -213,14 +242,36 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
         return np.zeros(len(edge)), 0.0
     lead_px = np.nan_to_num(edges - edge[:, None])
     slow = shared_disagreement(lead_px[core])
-    lead_px = lead_px - np.median(lead_px[core], axis=0)
+    lead_px = lead_px - _band_offsets(lead_px, edge, np.flatnonzero(core))
     weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
+    median_lead = np.median(lead_px, axis=1, keepdims=True)
+    limit = OUTLYING_BAND * np.median(np.abs(lead_px - median_lead), axis=1, keepdims=True) + 0.05
+    lead_px = median_lead + np.clip(lead_px - median_lead, -limit, limit)
     total = weight.sum(axis=1)
     mean = (weight * lead_px).sum(axis=1) / total
     variance = (weight * (lead_px - mean[:, None]) ** 2).sum(axis=1) / (lead_px.shape[1] - 1) / total
     padded = np.pad(variance, neighbours, mode="edge")
     running_median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * neighbours + 1), axis=1)
     return np.asarray(np.sqrt(MEDIAN_TO_MEAN * running_median)), slow
+
+
+# Part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
+BLUR_SIGMA_PART = 0.25
+
+
+def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
+    """Standard error of an edge that stops or starts within an exposure or next to it. The model's blur is that of
+    uniform motion at the mean of the speeds before and after. Where these differ by Δv, either may be the speed during
+    the exposure of τ frames, and the length of the blur is uncertain by τΔv/2. Shapes: edge (n_frames,) → (n_frames,).
+    """
+    if len(edge) < 3 or exposure_frames <= 0:
+        return np.zeros(len(edge))
+    steps = np.abs(np.diff(np.pad(np.nan_to_num(edge), 2, mode="edge")))
+    speed = np.maximum(steps[:-3], steps[3:])
+    from_middle = (steps[1:-2] + steps[2:-1]) / np.maximum(speed, 1e-9) - 1
+    within = np.maximum(exposure_frames / 2 - np.abs(from_middle), 0.0)
+    behind = speed * within**2 / (2 * exposure_frames)
+    return np.asarray(np.hypot(behind, BLUR_SIGMA_PART * exposure_frames / 4 * np.abs(steps[2:-1] - steps[1:-2])))
 
 
 def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Floats]:
@@ -244,6 +295,20 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
     return np.stack(edges, axis=1), np.stack(sigmas, axis=1)
 
 
+def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
+    """Median lead of each band over the core frames within BAND_OFFSET_PX, or the nearest few, (n_frames, n_bands)."""
+    # 7: fewest frames from which that offset is taken (chosen)
+    fewest = min(7, len(core))
+    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
+    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
+    out = np.empty((len(places), lead_px.shape[1]))
+    for i, place in enumerate(places):
+        distance = np.abs(edge[core] - place)
+        near = distance <= max(BAND_OFFSET_PX, float(np.partition(distance, fewest - 1)[fewest - 1]))
+        out[i] = np.median(lead_px[core[near]], axis=0)
+    return out[frame_places]
+
+
 # ------------------------------------------------------------------------------
 # Detect what hides the tip at the start: a door that stands or swings in front of it, or the mouth of a launcher.
 #
@@ -252,8 +317,16 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
 # leaves behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a
 # tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
-# Misfit over that of frames clear of the start above which an object stands in front of the tip (chosen)
-HIDDEN_MISFIT_RATIO = 2.5
+# Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
+# edge is a guess (chosen)
+HIDDEN_MISFIT = 3.2
+# Misfit above which nothing of the tip is visible, whatever its contrast (chosen)
+COVERED_MISFIT = 1.12 * HIDDEN_MISFIT
+# Ratio of the misfit to the median above which a frame differs from those clear of the start (chosen)
+UNUSUAL_MISFIT_RATIO = 2.0
+# Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
+# visible, and below which part of it is hidden (chosen)
+LEAST_AMPLITUDE, REDUCED_AMPLITUDE = 0.6, 0.75
 # Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it
 GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
 
@@ -262,6 +335,10 @@ BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
 # Least ratio of the border to the largest step between neighbouring columns of film further on (measured)
 BORDER_TO_FILM = 2.0
 FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed and acceleration are estimated (chosen)
+# Ratio of a change of the step to the largest of the next four, above which the hidden frames do not belong to the
+# motion that follows (chosen)
+LEAP_RATIO = 3.0
+LEAST_LEAP_PX = ASTRAY_PX  # Smallest change of the step that is a leap (chosen)
 
 
 @dataclass(frozen=True)
@@ -313,20 +390,49 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     return Mouth(np.arange(len(edge)) < exit_frame, _moved_behind(after_exit, rest_px))
 
 
-def hidden_errors(misfit_ratio: Floats, edge: Floats, added_px: Floats) -> Floats:
-    """Enlarge the errors of frames at the start in which a door still hides the tip: until three moving frames in a row
-    show it, there is no edge where the picture differs from the model. Shapes (n_frames,).
+def disturbed_start(strip: Strip, state: EdgeState) -> float:
+    """Share of the columns at the start that change before the edge reaches them: a door swings there."""
+    # First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
+    door_columns, door_frames = (6, 10), 15
+    begin, columns = state.edge[0], strip.values.shape[2]
+    column_range = np.arange(int(begin) + door_columns[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
+    moving = np.flatnonzero(moving_frames(state.edge))
+    if len(column_range) < door_columns[1] or moving[0] < 2:
+        return 0.0
+    first = max(0, int(moving[0]) - door_frames)
+    rising = np.maximum.accumulate(state.edge)
+    contrast = float(np.median(np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))))
+    changed = 0
+    for column in column_range:
+        arrival = int(np.searchsorted(rising, column - 5.0))
+        brightness = strip.values[first : max(arrival - 1, first + 1), :, column].mean(axis=1)
+        frames = slice(first, first + len(brightness))
+        change = np.ptp(brightness * strip.scale[frames] + strip.offset[frames])
+        # 0.25, 4.0: A door changes a column where its brightness varies by this part of the film's contrast
+        # and by so many grey levels (chosen)
+        changed += change > max(0.25 * contrast, 4.0)
+    return changed / len(column_range)
+
+
+def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Floats) -> Floats:
+    """Enlarge the errors of frames in which a door still hides the tip. There the edge is a guess; where the picture
+    differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames, 6);
+    misfit_ratio, edge, added_px (n_frames,) → (n_frames,).
     """
-    moving = np.flatnonzero(moving_frames(edge))
-    shown = np.convolve(misfit_ratio[moving] <= HIDDEN_MISFIT_RATIO, np.ones(3), "valid") > 2.5
-    first_shown = moving[int(np.argmax(shown))] if shown.any() else len(edge)
-    covered = (np.arange(len(edge)) < first_shown) & (misfit_ratio > HIDDEN_MISFIT_RATIO)
+    near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
+    misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
+    large, raised = misfit > HIDDEN_MISFIT, misfit > HIDDEN_MISFIT / 2
+    no_edge = (misfit > COVERED_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE)
+    covered = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & no_edge
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
         earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
         covered |= earlier & moving_frames(edge)
         added_px = np.where(earlier, np.hypot(added_px, ASTRAY_PX), added_px)
-    return np.where(covered, NO_EDGE_PX, added_px)
+    unlike_model = large & (misfit_ratio > HIDDEN_MISFIT)
+    partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < REDUCED_AMPLITUDE)
+    guessed = near & (unlike_model | partly_hidden)
+    return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
 
 
 def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> NDArray[np.float32]:
@@ -363,6 +469,29 @@ def _moved_behind(edge: Floats, rest_px: float) -> bool:
     return bool(run_up_px > 2 * (start_px - rest_px) + 5)
 
 
+def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
+    """Distance of hidden frames from the motion that follows, extrapolated backwards; 0 where they lead up to it. What
+    swings in front of the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
+    Shapes: edge (n_frames,) → (n_frames,).
+    """
+    speed_gain = 0.3  # Gain of speed over the next four frames (chosen)
+    out = np.zeros(len(edge))
+    if hidden.all():
+        return out
+    steps = np.diff(edge)
+    bends = np.diff(steps)  # bends[t] is the change between the steps from t and from t + 1
+    for t in range(int(np.argmin(hidden)) - 1, -1, -1):
+        later = bends[t + 1 : t + FRAMES_AFTER_EXIT]
+        if len(later) < FRAMES_AFTER_EXIT - 1 or not later.sum() > speed_gain * steps[t + 1]:
+            continue
+        if abs(bends[t]) <= max(LEAP_RATIO * np.abs(later).max(), LEAST_LEAP_PX):
+            continue
+        back = np.maximum(steps[t + 1] - max(float(later.mean()), 0.0) * np.arange(1, t + 2), 0.0)
+        out[t::-1] = np.abs(edge[t::-1] - (edge[t + 1] - np.cumsum(back)))
+        break
+    return np.nan_to_num(out)
+
+
 # ------------------------------------------------------------------------------
 # Initial path of the front through a strip, before film, background or the tip are known.
 #
@@ -372,6 +501,9 @@ def _moved_behind(edge: Floats, rest_px: float) -> bool:
 # flown past by the end, or an object that stood in front at the start, has no vote, and the path starts up to three
 # frames late and ends up to three frames early, because several frames are averaged at either end. The path that
 # leaves the smaller residual sum is used.
+
+
+AVERAGED_FRAMES = 12  # Frames after and before the front over which film and background are averaged (derived)
 
 
 def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
@@ -401,7 +533,7 @@ def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
 
 def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> float:
     """Residual sum of a path over some columns, with the film and background that follow from it."""
-    pictures = initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2, :, slice(*columns)]
+    pictures = appearance_about_path(strip, path, columns)
 
     def residuals_of(first: int, last: int) -> Floats:
         part = slice(first, last)
@@ -410,6 +542,13 @@ def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> f
         )
 
     return float(np.concatenate(in_parts(residuals_of, len(strip.values), FEWEST_PICTURES)).sum())
+
+
+def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:
+    """Average each pixel over the AVERAGED_FRAMES frames after (film) and before (background) the front passes it.
+    Shapes: path (n_frames,) → (2, n_across, n_columns).
+    """
+    return ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns, AVERAGED_FRAMES)
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -452,14 +591,18 @@ def _run_up(path: Floats) -> Floats:
 
 
 START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
-# Added to the error near the start if the frames there do not fit the model, as where a door swings (chosen)
+# Added to the error near the start if a door crosses the whole strip before growth and the frames do not fit the model
+# (chosen)
 DOOR_ERROR_PX = 0.5
+# Factor on the disagreement of the bands when the fitted blur is at its upper bound (chosen)
+OUT_OF_FOCUS_FACTOR = 3.0
 # Frames in which the error of the start is at least this part of its full value count as near the start (derived)
 NEAR_START_WEIGHT = 0.1
 # Excess of the mean misfit ratio near the start at which the error of a door is added in full (chosen)
 FULL_DOOR_EXCESS = 0.7
 # Error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
 WIDTH_ERROR_PX = 1.0
+MIN_FRAME_WEIGHT = 0.05  # Weight of a frame identical to the one before it (chosen)
 
 
 def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions:
@@ -469,8 +612,9 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = initial_state(strip, path, exposure)
+    change = _frame_changes(strip)
     for iteration in range(3):
-        before, path = path, _path_from_appearance(strip, state, passed)
+        before, path = path, _path_from_appearance(strip, state, passed, change)
         # 1.0: two paths are the same if they nowhere differ by more than this (derived)
         if iteration > 0 and np.abs(before - path).max() <= 1.0:
             break
@@ -492,11 +636,25 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
             break
     resting_fit = _fit_frames(strip, state, ~informative)
     fit = repair_jumps(strip, state, np.where(informative[:, None], fit, resting_fit), np.ones(len(fit), dtype=bool))
-    finished = _with_errors(strip, state, fit, exposure)
+    finished = _with_errors(strip, state, fit, exposure, passed)
     if not np.isfinite(exposure_frames):
         return finished
     blur_exposure, speed = seen_exposure(strip, state, fit, exposure)
     return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
+
+
+def _unsure(fit: Floats, sigma_px: Floats, extra_px: Floats, hidden: Bools) -> Bools:
+    """Frames in which the fit is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain. Shapes: fit
+    (n_frames, 6), all others (n_frames,).
+    """
+    # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
+    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
+    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
+    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
+    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
+    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
+    uncertain = (extra_px > 1.0) | (sigma_px > np.maximum(1.0, 5.0 * np.nanmedian(sigma_px)))
+    return np.asarray(odd | uncertain | hidden)
 
 
 def _fit_frames(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT_ROUNDS) -> Floats:
@@ -521,15 +679,13 @@ class Outline:
     middles_px: Floats
 
 
-def outline(strip: Strip) -> Outline:
+def outline(strip: Strip, parts: int = 12) -> Outline:
     """Measure the centreline and width of the tube that the front leaves behind. The contrast of each row between film
-    and background gives the sides in stretches along the axis. This corrects a given axis that is, say, two
+    and background gives the sides in `parts` stretches along the axis. This corrects a given axis that is, say, two
     degrees off and would cut the tube obliquely.
     """
-    # 12, 30.0: stretches along a straight axis, and their length along a curve, px (chosen)
-    parts = max(12, round(strip.axis.length_px / 30.0)) if strip.axis.bends else 12
     path, passed = initial_front_path(strip)
-    film, background = initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2, :, slice(*passed)]
+    film, background = appearance_about_path(strip, path, passed)
     power = (film - background).astype(float) ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
@@ -581,55 +737,90 @@ def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
     return slope, float(np.median(y - slope * x))
 
 
-def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int]) -> Floats:
+def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
     """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
+    # Distance, in standard deviations, at which the difference of a pixel from film or background is clipped
+    # (chosen)
+    evidence_clip = 2.5
     contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
 
-    # 0.1: evidence in favour of film in every pixel (chosen)
-    evidence = ky.film_evidence(strip, state.appearance, width, bias=0.1)
+    def evidence_of(first: int, last: int) -> NDArray[np.float32]:
+        part = slice(first, last)
+        return kernels.film_evidence(
+            strip.values[part], strip.scale[part], strip.offset[part], state.appearance, width, evidence_clip
+        )
+
+    evidence = np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
-    path = ky.dividing_path(evidence)
+    path = ky.dividing_path(evidence * _frame_weights(change, state.edge)[:, None])
     return np.clip(path - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
 
+def _frame_changes(strip: Strip) -> Floats:
+    """Return the mean absolute difference of each frame from the one before it, shape (n_frames,)."""
+    change = np.zeros(len(strip.values))
+    change[1:] = mean_changes(strip.values, 2)
+    change[0] = change[1] if len(change) > 1 else 1.0
+    return change
+
+
+def _frame_weights(change: Floats, edge: Floats) -> NDArray[np.float32]:
+    """Weight each frame by how much it differs from the one before it, MIN_FRAME_WEIGHT to 1, shape (n_frames,). While
+    the tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
+    """
+    usual = float(np.median(change[moving_frames(edge)]))
+    floor = float(np.quantile(change, 0.05))
+    return np.clip((change - floor) / max(usual - floor, 1e-6), MIN_FRAME_WEIGHT, 1.0).astype(np.float32)
+
+
 def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
-    """Take over the fitted edges; re-estimate blur lengths, film and background."""
+    """Take over the fitted edges; re-estimate blur lengths, film and background, and the correlation of the noise.
+    `inflation` is the variance of a column's mean residual over that of white noise, by distance from the edge.
+    """
     edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
-    return estimate_appearance(strip, state, 4 * strip.noise + 4)
+    state = estimate_appearance(strip, state, 4 * strip.noise + 4)
+    by_distance = residuals(strip, state, fit, core_frames(state, fit)).by_distance
+    counted = by_distance[:, 1] > 4
+    ratio = np.where(counted, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
+    smoothed = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    return replace(state, inflation=np.clip(smoothed, 0.3, 50.0))
 
 
-def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> Positions:
+def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:
     """Add to a converged fit the errors of bands, start, doors and leaps, and refer the edge to mid-exposure."""
     core = core_frames(state, fit)
     # Where a frame departs from the model (a door, a glint), the error exceeds that from the curvature of ln L.
     # 100.0: upper limit of a frame's misfit relative to the median (chosen)
     misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0)
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
-    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * np.sqrt(misfit_ratio), ASTRAY_PX)
+    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * misfit_ratio, ASTRAY_PX)
     # The fitted box assumes constant speed: its centre is the mean position, which leads mid-exposure by aτ²/24.
     acceleration = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(acceleration, -50, 50) * exposure**2 / 24
+    contrast = (state.appearance[0] - state.appearance[1]).mean(axis=0).astype(float)
+    contrast[: passed[0]] = np.nan
+    contrast[passed[1] :] = np.nan
     # 25.0: growth over which that error falls to 1/e (chosen)
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / 25.0)
     near = (near_start > NEAR_START_WEIGHT) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
     door_weight = float(np.clip((np.mean(misfit_ratio[near]) - 1) / FULL_DOOR_EXCESS, 0, 1)) if near.any() else 0.0
-    door = DOOR_ERROR_PX * door_weight
+    door = DOOR_ERROR_PX * disturbed_start(strip, state) * door_weight
     start_error = (START_ERROR_PX + door) * near_start
     bands, shared = band_disagreement(strip, state, edge_now, core)
-    bands = bands * (1 - 0.5 * near_start)
-    visible_error = np.hypot(bands, start_error)
-    extra = hidden_errors(misfit_ratio, edge_now, visible_error)
+    bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
+    visible_error = np.hypot(bands * (OUT_OF_FOCUS_FACTOR if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
+    extra = hidden_errors(fit, misfit_ratio, edge_now, visible_error)
     mouth = find_mouth(strip, state, edge_now)
     extra = np.where(mouth.before, np.maximum(extra, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), extra)
     # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_ERROR_PX) | mouth.before
+    extra = np.maximum(extra, leap_error_px(edge_now, hidden))
     bands, slow_bands = noise_and_slow(bands, visible_error, extra)
-    slow = np.hypot(slow_bands, math.hypot(SLOW_PX, shared))
-    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
+    slow = np.hypot(slow_bands, slow_error_px(edge_now, contrast, shared))
     return Positions(
-        edge_px=edge, sigma_px=sigma, unsure=(extra > 1.0) | hidden, blur_px=state.blur,
+        edge_px=edge, sigma_px=sigma, unsure=_unsure(fit, sigma, extra, hidden), blur_px=state.blur,
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
         bands_sigma_px=bands,
     )  # fmt: skip

@@ -29,6 +29,8 @@ FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
 MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
 FEWEST_FITS = 4  # Fewest fits, or frames summed over, for which another thread is used (chosen)
 SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
+# Part of the typical contrast below which film and background near the start are taken to be the same material (chosen)
+SAME_MATERIAL_CONTRAST = 0.4
 # Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
 
@@ -44,6 +46,7 @@ class EdgeState:
     lag: Floats
     blur: float
     appearance: NDArray[np.float32]
+    inflation: Floats
     shading: Floats = field(default_factory=lambda: np.zeros(2 * SHADING_REACH_PX + 1))
 
 
@@ -113,24 +116,25 @@ def _film_at_start(state: EdgeState, appearance: NDArray[np.float32]) -> NDArray
     If the initial edge is placed too far back, film serves as its own background; without contrast nothing corrects it.
     """
     contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
-    columns, clear = np.arange(len(contrast)), clear_of_start(state.edge)
-    later = (columns >= clear) & (columns < state.edge.max() - 5)
+    columns = np.arange(len(contrast))
+    near = (columns > state.edge[0] - 5) & (columns < clear_of_start(state.edge))
+    later = (columns >= clear_of_start(state.edge)) & (columns < state.edge.max() - 5)
     if later.sum() < 10:
         return np.zeros(len(contrast), dtype=bool)
-    # 0.4: part of the typical contrast below which both are taken to be the same material (chosen)
-    near = (columns > state.edge[0] - 5) & (columns < clear)
-    return near & (contrast < 0.4 * float(np.median(contrast[later])))
+    return near & (contrast < SAME_MATERIAL_CONTRAST * float(np.median(contrast[later])))
 
 
 def _passage_frames(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
-    """First and last frame in which the edge is over each column, shapes (n_along,)."""
+    """First and last frame in which the edge is over each column, shapes (n_along,). Near the start, film is counted
+    only once the edge has cleared it: until then a door may stand or swing there.
+    """
     monotone = np.maximum.accumulate(state.edge) + 1e-6 * np.arange(len(state.edge))
     frames = np.arange(len(monotone), dtype=float)
     moving = np.flatnonzero(moving_frames(state.edge))
     places = np.arange(columns, dtype=float)
     reach = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
     begin, end = frames[moving[0]], frames[moving[-1]]
-    behind = places + reach + float(state.lag.max())
+    behind = np.maximum(places + reach + float(state.lag.max()), clear_of_start(state.edge))
     early = np.clip(np.interp(places - reach, monotone, frames), begin, end)
     late = np.clip(np.interp(behind, monotone, frames), begin, end)
     return early, late
@@ -177,7 +181,7 @@ def search_edges(
     def fits(first: int, last: int) -> Floats:
         return kernels.fit_edges(
             strip.values, strip.scale, strip.offset, starts[first:last], state.lengths, state.lag, state.blur,
-            state.appearance, CONTRAST_PRIOR_SD, MARGIN_PX, rounds, shading, frames[first:last],
+            state.appearance, state.inflation, CONTRAST_PRIOR_SD, MARGIN_PX, rounds, shading, frames[first:last],
             rows,
         )  # fmt: skip
 
@@ -195,12 +199,13 @@ def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
 
 
 class Residuals(NamedTuple):
-    """What a fit leaves, summed over frames; see `edge_kernels.residual_sums`. Shapes (n_across, 2), (2, n_distances)
-    and (2,).
+    """What a fit leaves, summed over frames; see `edge_kernels.residual_sums`. Shapes (n_across, 2), (2, n_distances),
+    (n_bins, 2) and (2,).
     """
 
     by_row: Floats
     by_place: Floats
+    by_distance: Floats
     misfit: Floats
 
 
@@ -233,7 +238,7 @@ def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
     """
     rows, columns = strip.values.shape[1:]
     blank = np.zeros((4, rows, columns), np.float32)
-    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank)
+    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
     return estimate_appearance(strip, state, 0.0)
 
 
@@ -266,8 +271,8 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
         step = np.clip(step, -largest_lag_step_px, largest_lag_step_px)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
         state = replace(state, lag=lag, edge=state.edge - lead)
-    # 16: frames from which the blur is estimated, those in which the edge is seen most clearly (chosen)
-    sampled = np.sort(np.flatnonzero(slow)[np.argsort(fit[slow, 1])[:16]])
+    # 16: frames from which the blur is estimated (chosen)
+    sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // 16)]
     candidates = BLURS_PX if everywhere else state.blur * NEAR_BLURS
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))

@@ -103,10 +103,7 @@ def decode_container(
                     if buffer is None or n == len(buffer):
                         buffer = _enlarged(buffer, picture, expected, available_bytes)
                     buffer[n] = picture
-                    decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base)
-                    decoded.corrupt.append(bool(frame.is_corrupt))
-                    decoded.key.append(bool(frame.key_frame))
-                    decoded.between.append(frame.pict_type == 3)  # the code of a B frame
+                    _record_frame(decoded, frame, base)
         except av.error.FFmpegError as error:
             messages.append(str(error.strerror or error))
     decoded.messages = list(messages)
@@ -210,6 +207,14 @@ def open_film(path: Path) -> Iterator[av.container.InputContainer]:
             for stream in container.streams.video:
                 if stream.codec_context is not None:
                     stream.codec_context.flush_buffers()
+
+
+def _record_frame(decoded: Decoded, frame: av.VideoFrame, base_s: float) -> None:
+    decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base_s)
+    decoded.corrupt.append(bool(frame.is_corrupt))
+    decoded.key.append(bool(frame.key_frame))
+    # 3: code of a B frame (defined)
+    decoded.between.append(frame.pict_type == 3)
 
 
 def _frames_of(packets: Iterator[av.Packet[Any]], messages: list[str]) -> Iterator[av.VideoFrame]:

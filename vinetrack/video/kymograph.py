@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
-from vinetrack.video import edge_kernels
 from vinetrack.video.edge_kernels import FASTMATH
 
 if TYPE_CHECKING:
@@ -124,6 +123,8 @@ WINDOW = 10  # Frames before and after a frame whose means are compared (chosen)
 MIN_SCORE, PEAK_FRACTION, UNCHANGED_COLUMN_COST = 3.0, 0.15, 0.2
 # Number of frames at either end of the recording whose median shows the scene before and after growth (chosen)
 END_FRAMES = 5
+# Difference of initial and final appearance, in units of the noise, at which a pixel has half a vote (chosen)
+HALF_VOTE_NOISE = 4.0
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -231,35 +232,24 @@ def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
 
 def path_by_appearance(strip: Strip) -> tuple[Floats, Floats]:
     """Find the front as the path that separates pixels that look as at the end from pixels that look as at the start.
+    The vote of a pixel is its distance from the final less that from the initial appearance, divided by the distance
+    between the two plus HALF_VOTE_NOISE times the noise: near −1 if it looks as at the end, near 1 if as at the start.
     Returns column of the front, shape (n_frames,), px, change of each column from start to end, in the units of
     `path_by_change`; shape (n_along,).
     """
     first, last = _median_frame(strip, slice(0, END_FRAMES)), _median_frame(strip, slice(-END_FRAMES, None))
-    appearance = np.stack([last, first, np.zeros_like(first), np.zeros_like(first)])
-    evidence = film_evidence(strip, appearance, 2 * strip.noise, bias=0.0)
+
+    def votes_of(begin: int, end: int) -> NDArray[np.float32]:
+        scale, offset = strip.scale[begin:end], strip.offset[begin:end]
+        return _votes(strip.values[begin:end], scale, offset, first, last, HALF_VOTE_NOISE * strip.noise)
+
+    votes = np.concatenate(in_parts(votes_of, len(strip.values), FEWEST_PICTURES))
     group_size = _group_size(strip)
     power = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1]).mean(
         axis=1
     ) ** 2
     times_noise = WINDOW / 2 * power.mean(axis=0) / (strip.noise**2 / group_size)
-    return dividing_path(evidence), (1 - PEAK_FRACTION) * np.log1p(times_noise)
-
-
-def film_evidence(strip: Strip, appearance: NDArray[np.float32], width: float, bias: float) -> NDArray[np.float32]:
-    """Score of each column of each frame, negative where it looks like film, shape (n_frames, n_along); see
-    `edge_kernels.film_evidence`. Shapes: appearance (4, n_across, n_along).
-    """
-    # 2.5: distance, in standard deviations, at which the difference of a pixel from film or background is clipped
-    # (chosen)
-    clip = 2.5
-
-    def evidence_of(first: int, last: int) -> NDArray[np.float32]:
-        part = slice(first, last)
-        return edge_kernels.film_evidence(
-            strip.values[part], strip.scale[part], strip.offset[part], appearance, width, clip, bias
-        )
-
-    return np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))
+    return dividing_path(votes), (1 - PEAK_FRACTION) * np.log1p(times_noise)
 
 
 def _group_size(strip: Strip) -> int:
@@ -270,8 +260,75 @@ def _group_size(strip: Strip) -> int:
 
 def _median_frame(strip: Strip, frames: slice) -> NDArray[np.float32]:
     """Median brightness of every pixel over some frames, shape (n_across, n_along)."""
-    values = strip.values[frames] * strip.scale[frames, None, None] + strip.offset[frames, None, None]
-    return np.asarray(np.median(values, axis=0), np.float32)
+    values = strip.values[frames] * strip.scale[frames, None, None].astype(np.float32)
+    values += strip.offset[frames, None, None].astype(np.float32)
+    if len(values) != END_FRAMES:
+        return np.asarray(np.median(values, axis=0), np.float32)
+    # Median of five: the median of the fifth value, the larger minimum and the smaller maximum of two pairs.
+    a, b, c, d, e = values
+    low, high = np.maximum(np.minimum(a, b), np.minimum(c, d)), np.minimum(np.maximum(a, b), np.maximum(c, d))
+    return np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _votes(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, first: np.ndarray, last: np.ndarray, softening: float
+) -> np.ndarray:
+    """Sum the votes of each column in each frame, shape (n_frames, n_along); see `path_by_appearance`."""
+    n, rows, columns = strip.shape
+    out = np.zeros((n, columns), np.float32)
+    weight = np.float32(1.0) / (np.abs(last - first) + np.float32(softening))
+    for t in range(n):
+        gain, level = np.float32(scale[t]), np.float32(offset[t])
+        for u in range(rows):
+            for s in range(columns):
+                value = np.float32(strip[t, u, s]) * gain + level
+                out[t, s] += (abs(value - last[u, s]) - abs(value - first[u, s])) * weight[u, s]
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def mean_appearance(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int, window: int
+) -> np.ndarray:
+    """Return the mean brightness of each pixel in the frames after (film) and before (background) the front passes it.
+    Shapes: strip (n_frames, n_across, n_along); scale, offset, path (n_frames,) → (2, n_across, end − begin).
+    """
+    n, rows, _ = strip.shape
+    front = np.empty(n + 1, np.int64)
+    for t in range(n):
+        front[t] = min(max(math.ceil(path[t]), begin), end)
+    front[n] = front[n - 1]
+    sums, counts = np.zeros((2, rows, end - begin), np.float32), np.zeros((2, end - begin), np.float32)
+    for t in range(n):
+        gain, level = np.float32(scale[t]), np.float32(offset[t])
+        for k in range(2):
+            # The frame of the passage and its neighbour are left out: they show the edge itself.
+            low, high = front[t + 1], front[min(t + window + 1, n)]
+            if k == 0:
+                low, high = begin if t <= window else front[t - window - 1], front[max(t - 1, 0)]
+            elif t + window + 1 >= n:
+                high = end
+            if high <= low:
+                continue
+            counts[k, low - begin : high - begin] += np.float32(1.0)
+            for u in range(rows):
+                values, row_sums = strip[t, u, low:high], sums[k, u, low - begin : high - begin]
+                for s in range(high - low):
+                    row_sums[s] += np.float32(values[s]) * gain + level
+    for k in range(2):
+        visible = np.flatnonzero(counts[k] > 0)
+        for s in range(end - begin):
+            source = s
+            if len(visible) and counts[k, s] == 0:
+                source = visible[np.argmin(np.abs(visible - s))]
+            share = 1 / max(counts[k, source], np.float32(1.0))
+            for u in range(rows):
+                if source <= s:
+                    sums[k, u, s] = sums[k, u, source] * (share if source == s else np.float32(1.0))
+                else:
+                    sums[k, u, s] = sums[k, u, source] * share
+    return sums
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")

@@ -27,12 +27,18 @@ FEWEST_DIFFERENCES, SMALLEST_FACTOR, LARGEST_FACTOR = 8, 0.5, 6.0
 # pixels (measured)
 LARGEST_BODY_FACTOR = 20.0
 REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while it stays this near to its level (chosen)
+# Steps this many times the tolerance of rest, followed by one last frame without a step, show an abrupt stop, though
+# elsewhere two equal positions are no rest (chosen)
+ABRUPT_STOP_RATIO = 5.0
+# Distance from the curve through its neighbours, in standard errors and in px, from which a point is an outlier
+# (chosen)
+OUTLIER_SIGMAS, OUTLIER_PX = 6.0, 1.0
 
 
 @dataclass(frozen=True)
 class PointQuality:
     """Flag of every frame, its capture period with missing frames counted in, and sentences for a person. `flag`,
-    `slot` and `without_edge` have shape (n_frames,).
+    `slot`, `without_edge` and `departure_px` have shape (n_frames,).
     """
 
     flag: NDArray[np.str_]
@@ -42,6 +48,7 @@ class PointQuality:
     last_moving: int
     left_picture: int | None
     without_edge: Bools
+    departure_px: Floats
 
 
 def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, largest: float = LARGEST_FACTOR) -> Floats:
@@ -102,8 +109,7 @@ def _first_moving_point(y: Floats, tolerance: float) -> int:
 def _stops_abruptly(y: Floats, tolerance: float) -> bool:
     """Whether a fast edge stands still in the last two frames; the step before may be shorter than a whole one."""
     steps = np.diff(y[-7:])
-    # 5.0: steps in tolerances of rest from which an edge is fast: elsewhere two equal positions are no rest (chosen)
-    return len(steps) == 6 and abs(steps[-1]) <= tolerance and float(steps[:-2].min()) > 5.0 * tolerance
+    return len(steps) == 6 and abs(steps[-1]) <= tolerance and float(steps[:-2].min()) > ABRUPT_STOP_RATIO * tolerance
 
 
 def assess_points(
@@ -133,6 +139,8 @@ def assess_points(
     if repeats.any():
         count, first_repeat = int(repeats.sum()), number[repeats][0]
         notes.append(f"{count} frames repeat the one before them and are dropped, first frame {first_repeat}")
+    departure_px = _outlier_distances(y, sigma_px, first, last)
+    is_outlier = departure_px > 0
     without_edge = no_edge & (np.arange(n) < first_outside)
     flags = [
         join_flags(
@@ -142,7 +150,7 @@ def assess_points(
             "duplicate" if repeats[i] else "",
             "gap" if missing.gap[i] else "",
             "retimed" if missing.retimed[i] else "",
-            "doubtful" if unsure[i] and not no_edge[i] else "",
+            "doubtful" if (unsure[i] or is_outlier[i]) and not no_edge[i] else "",
         )
         for i in range(n)
     ]
@@ -152,8 +160,60 @@ def assess_points(
         notes.append(f"the leading edge is lost in {count} moving frames, first frame {first_lost}")
     return PointQuality(
         np.array(flags, dtype=np.str_), missing.slot, tuple(notes), first, last,
-        first_outside if first_outside < n else None, without_edge,
+        first_outside if first_outside < n else None, without_edge, departure_px,
     )  # fmt: skip
+
+
+def _outlier_distances(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
+    """Distance of outlying points from where their neighbours lead, shape (n_frames,), px; 0 of all others."""
+    inside = _off_parabola(y, sigma_px, first, last)
+    at_start, at_end = _hidden_at_start(y, sigma_px, first), _flying_on(y, sigma_px, first, last)
+    return np.asarray(np.maximum(np.maximum(inside, at_start), at_end))
+
+
+def _off_parabola(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
+    """Distance of each moving point from the parabola through two neighbours on either side, where it is an outlier."""
+    distance_px = np.zeros(len(y))
+    for i in range(max(first, 2), min(last, len(y) - 1) - 1):  # an abrupt stop is no outlier
+        around = y[[i - 2, i - 1, i + 1, i + 2]]
+        if not np.all(np.isfinite(around)) or not np.isfinite(y[i]):
+            continue
+        expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
+        bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
+        # 1.4: standard deviation of a point minus the parabola through its four neighbours, for equal errors
+        sigma = 1.4 * float(np.max(sigma_px[i - 2 : i + 3]))
+        distance = abs(y[i] - expected)
+        distance_px[i] = distance if distance > max(OUTLIER_SIGMAS * sigma, OUTLIER_PX, bend) else 0.0
+    return distance_px
+
+
+def _hidden_at_start(y: Floats, sigma_px: Floats, first: int) -> Floats:
+    """Distance of the points at rest where the first step is too long: something hid the tip, which was further on."""
+    distance_px = np.zeros(len(y))
+    for i in range(max(first - 1, 1), min(first + 2, len(y) - 2)):
+        step, later_step = y[i] - y[i - 1], 0.5 * (y[i + 2] - y[i])
+        # 1.2, 0.5: A first step this many times the mean of the next two (chosen)
+        too_long = step > 1.2 * later_step + max(sigma_px[i], 0.5)
+        if np.isfinite(step - later_step) and too_long:
+            distance_px[:i] = np.maximum(distance_px[:i], step - 0.5 * later_step)
+    return distance_px
+
+
+def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
+    """Distance of the last points from the line through the two before: an object flies on where growth has ended."""
+    distance_px = np.zeros(len(y))
+    for i in range(max(first + 4, last - 2), last + 1):
+        before = y[i - 4 : i]
+        excess = y[i] - 2 * before[-1] + before[-2]
+        roughness = float(np.max(np.abs(np.diff(before, 2))))
+        # 0.5, 4.0: A last step that exceeds the extrapolated one by this part of a step (chosen)
+        limit = max(
+            OUTLIER_SIGMAS * sigma_px[i], 2 * OUTLIER_PX, 0.5 * (before[-1] - before[-2]),
+            4.0 * roughness,
+        )  # fmt: skip
+        if np.isfinite(excess) and excess > limit:
+            distance_px[i : last + 1] = np.maximum(distance_px[i : last + 1], excess)
+    return distance_px
 
 
 # ------------------------------------------------------------------------------
@@ -204,6 +264,13 @@ def ending_of(
             np.median(edge_px[followed][: max(quality.first_moving, 1)])
         )
     return Ending(grown_px, truncated_px, tuple(growth_end_notes(luma, quality, edge_px, name, number)), name, place)
+
+
+def body_end_note(frame: int, turns_back: bool) -> str:
+    """Say why a body is not followed to the end of the recording."""
+    if turns_back:
+        return f"the body turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
+    return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
 
 
 def growth_end_notes(

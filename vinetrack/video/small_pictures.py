@@ -51,12 +51,12 @@ class SmallPictures:
     @cached_property
     def _busy(self) -> tuple[NDArray[np.float32], float]:
         """Frames in which something changes, and the variance of their noise."""
-        return frames_with_change(self.frames)
+        return _frames_with_change(self.frames)
 
     @cached_property
     def changed(self) -> Pixels:
         """All pixels that change."""
-        return changed_pixels(*self._busy)
+        return _changed(*self._busy)
 
     @cached_property
     def grown(self) -> Pixels:
@@ -77,20 +77,22 @@ class SmallPictures:
         return x[kept], y[kept], time[kept], weight, n_times
 
 
-def changed_pixels(busy: NDArray[np.float32], noise_power: float) -> Pixels:
-    """Find the pixels that change in frames of which each shows something new. Shapes: busy (n_frames, height,
-    width).
-    """
+def changed_pixels(small: NDArray[np.float32], count: int) -> Pixels:
+    """Find the pixels that change. Shapes: small (n_frames, height, width)."""
+    return _changed(*_frames_with_change(small[:count]))
+
+
+def _frames_with_change(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+    """Return the frames in which something changes, and the variance of their noise."""
+    busy = small[_busy_frames(small)]
+    return busy, _noise_power(busy)
+
+
+def _changed(busy: NDArray[np.float32], noise_power: float) -> Pixels:
     frame, weight = _changes(busy, noise_power)
     rows, columns = np.nonzero(weight > 0)
     time = frame[rows, columns].astype(float)
     return columns.astype(float), rows.astype(float), time, weight[rows, columns].astype(float), len(busy)
-
-
-def frames_with_change(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-    """Return the frames in which something changes, and the variance of their noise."""
-    busy = small[_busy_frames(small)]
-    return busy, _noise_power(busy)
 
 
 def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:

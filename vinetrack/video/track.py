@@ -16,8 +16,11 @@ from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import (
     CENTRED_PX,
     CurvedAxis,
-    curve_problem,
+    check_curve,
+    curve_note,
     find_growth_axis,
+    outline_stretches,
+    path_error_px,
     recentred_curve,
 )
 from vinetrack.video.edge import Outline, outline, track_edge
@@ -32,6 +35,7 @@ from vinetrack.video.point_quality import (
     Ending,
     PointQuality,
     assess_points,
+    body_end_note,
     calibrated_sigma,
     ending_of,
 )
@@ -56,13 +60,13 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
     if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
     strip = first = cut_strip(luma, snap_to_grid(axis, first_slope * axis.width_px), 0.65 * axis.width_px + 3)
-    tube = outline(strip)
+    tube = outline(strip, outline_stretches(axis))
     try:
         for _ in range(2 * most_recuts if axis.bends else most_recuts):
             before, strip = strip, recentred_strip(luma, strip, tube)
             if strip is before:
                 break
-            tube = outline(strip)
+            tube = outline(strip, outline_stretches(axis))
         off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
     except (RecordingError, ValueError):
         return None
@@ -277,10 +281,8 @@ def track_pixels(
         repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
     )  # fmt: skip
     if quality.last_moving < 0:
-        raise RecordingError(_why_motionless(total_px), name=name)
-    # The disagreement of bands is random too.
-    noise_px = np.minimum(np.maximum(random_px, followed.bands_sigma_px), LOST_SIGMA_PX)
-    errors_px = noise_px, _slow_error(strip, followed)
+        raise RecordingError(f"{_why_motionless(total_px, quality)}", name=name)
+    errors_px = _random_error(random_px, followed, quality), _slow_error(strip, followed)
     notes, ending = _notes(frames, selection, luma, trial, strip, followed, quality, axis_given)
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
@@ -345,19 +347,26 @@ def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Float
     return random_px, np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
 
 
+def _random_error(random_px: Floats, followed: Positions, quality: PointQuality) -> Floats:
+    """Random error with the disagreement of bands and the distance of outliers in it, LOST_SIGMA_PX at most."""
+    larger_px = np.maximum(random_px, followed.bands_sigma_px)
+    return np.minimum(np.hypot(larger_px, quality.departure_px), LOST_SIGMA_PX)
+
+
 def _slow_error(strip: Strip, followed: Positions) -> Floats:
     """Error that neighbouring frames share: of edge, stabilisation and path, LOST_SIGMA_PX at most."""
     slow_px = np.broadcast_to(followed.slow_px, followed.edge_px.shape)
     slow_px = np.hypot(slow_px, STABILISED_PX if strip.stabilised else 0.0)
-    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
-    return np.minimum(np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad), LOST_SIGMA_PX)
+    return np.minimum(np.hypot(slow_px, path_error_px(strip.axis)), LOST_SIGMA_PX)
 
 
-def _why_motionless(total_px: Floats) -> str:
+def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
     """The message for a recording in which no frame is moving."""
     # Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing
     # moves (chosen)
     mostly_lost = 0.5
+    outlying_px = np.minimum(np.hypot(total_px, quality.departure_px), LOST_SIGMA_PX)
+    total_px = np.where(total_px < LOST_SIGMA_PX, outlying_px, total_px)
     if np.mean(~(total_px < LOST_SIGMA_PX)) > mostly_lost:
         return (
             "something moves, but its edge is too vague to be followed: film it nearer, with more light or"
@@ -375,22 +384,12 @@ def _notes(
     notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
         last_frame, turns_back = followed.end
-        how = "turns back" if turns_back else "is not recognised"
-        why = (
-            "a bounce, or the end of its motion; later frames are not used"
-            if turns_back
-            else "it is gone, hidden or turned over"
-        )
-        notes.append(f"{name}: the body {how} after frame {number[last_frame]}: {why}")
+        notes.append(f"{name}: {body_end_note(int(number[last_frame]), turns_back)}")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
     if isinstance(strip.axis, CurvedAxis) and not axis_given:
-        notes.append(
-            f"{name}: the vine bends by {np.degrees(strip.axis.total_turn_rad):.0f}° in all, and positions are those "
-            "along a curve that was found: look at its overlay, and draw the curve (column `axis`) if the edge is not "
-            "on it"
-        )
+        notes.append(f"{name}: {curve_note(strip.axis)}")
     if not followed.is_edge:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -413,9 +412,7 @@ def locate_axis(luma: NDArray[Any], small: SmallPictures, axis: Axis | None, tri
     wide_px = width_px + GIVEN_AXIS_MARGIN * axis.length_px
     if axis.bends:
         width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
-        complaint = curve_problem(axis, width_px / 2 if width_known else math.nan, (luma.shape[2], luma.shape[1]))
-        if complaint is not None:
-            raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
+        check_curve(axis, width_px / 2 if width_known else math.nan, luma.shape[1:])
         wide_px = min(wide_px, 2 * axis.largest_half_px)
         return replace(axis, width_px=max(wide_px, width_px) if width_known else wide_px)
     axis = replace(axis, width_px=wide_px)
