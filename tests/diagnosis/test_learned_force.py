@@ -22,7 +22,7 @@ from vinetrack.diagnosis.force_inversion import (
     ForcePoint,
     ForceProblem,
     _with_updated_motions,
-    force_sensitivities,
+    acceleration_sensitivities,
     integrate_responses,
     motions_of,
     splines,
@@ -223,7 +223,7 @@ def slowed(tmp_path_factory: pytest.TempPathFactory) -> ForceProblem:
 
 def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(slowed: ForceProblem) -> None:
     """The score of a trial's pressure deviation against a finite difference of the cost."""
-    tracks = slowed.on_tracks()
+    tracks = slowed.tracks
     domain = next(each for each in candidate_domains(tracks.motions) if each.variables == ("growth", "pressure"))
     growth, pressure = (uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
@@ -321,7 +321,8 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path: Pat
         "bump": lambda m: np.exp(-0.5 * ((m.lead_position_m - 0.08) / 0.01) ** 2),
         "slow": lambda m: 1 / (0.3 + m.tail_velocity_m_s),
     }
-    answers = force_sensitivities(found, own, motions, lambda m: np.column_stack([f(m) for f in shapes.values()]))
+    pushes = [np.column_stack([f(m) for f in shapes.values()]) / m.mass_kg[:, None] for m in motions]
+    answers = acceleration_sensitivities(found, own, motions, pushes)
     jobs = found.predictor.jobs(found.solution.state.theta, own)
     times = [item.time_s - job.release_s for item, job in zip(found.predictor.data, jobs, strict=True)]
     with_force = model + own_effects([effect_file(tmp_path)])["hidden"]

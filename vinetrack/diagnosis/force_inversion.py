@@ -253,22 +253,11 @@ def _observed_slope(run: Trajectory) -> Floats:
     return np.where(moving, observed_velocity / np.where(moving, velocity, 1.0), 1.0)
 
 
-def force_sensitivities(
-    fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats]
-) -> list[Floats]:
-    """Derivatives of the observed positions of every trial with respect to force amplitudes. Shapes: trial_effects
-    (n_trials, 4) → (n_points, n_forces).
-    """
-    return acceleration_sensitivities(
-        fit, trial_effects, motions, [force(motion) / motion.mass_kg[:, None] for motion in motions]
-    )
-
-
 def acceleration_sensitivities(
     fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], accelerations: Sequence[Floats]
 ) -> list[Floats]:
-    """As `force_sensitivities`, for added accelerations of the tail in place of forces. Shapes: trial_effects
-    (n_trials, 4); accelerations (N_STEPS + 1, n) → (n_points, n).
+    """Derivatives of the observed positions of every trial with respect to the amplitudes of added accelerations of the
+    tail. Shapes: trial_effects (n_trials, 4); accelerations (N_STEPS + 1, n) → (n_points, n).
     """
     dx, _ = _responses(motions, np.array(accelerations))
     return [
@@ -361,10 +350,6 @@ def _responses(motions: Sequence[FittedMotion], acceleration: Floats) -> tuple[F
 # would be poor.
 
 
-# Penalties on second differences, relative to the information from positions (chosen)
-SMOOTHED_MOTIONS_SMOOTHING_PENALTIES = np.geomspace(1e-8, 1e2, 21)
-
-
 def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
     since_s = data.time_s - trial_effects[RELEASE]
     observed_m = data.lead_position_m - trial_effects[ORIGIN]
@@ -410,7 +395,8 @@ def _penalised_fit(design: Floats, values: Floats) -> Floats:
     unit = float(np.trace(gram)) / design.shape[1]
     roughness = unit * (second_difference.T @ second_difference + 1e-9 * np.eye(design.shape[1]))
     best: tuple[float, Floats] | None = None
-    for penalty in SMOOTHED_MOTIONS_SMOOTHING_PENALTIES:
+    # Penalties, relative to the information from positions (chosen)
+    for penalty in np.geomspace(1e-8, 1e2, 21):
         inverse = np.linalg.pinv(gram + penalty * roughness, hermitian=True)
         coefficients = inverse @ (design.T @ values)
         degrees_of_freedom = min(float(np.trace(inverse @ gram)), values.size - 1.0)
@@ -523,7 +509,8 @@ class CoefficientLikelihood:
 class ForceProblem:
     """A fit, the noise of its tracks, and the priors of its parameters and trial effects: what is asked of forces. The
     noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial
-    have the standard deviations estimated from replicates.
+    have the standard deviations estimated from replicates. `tracks` are the motions that lie on the tracks, whatever
+    the model says, at its fitted parameters.
     """
 
     def __init__(self, fit: Fit, scatter: Scatter) -> None:
@@ -537,15 +524,11 @@ class ForceProblem:
         self.effects_mean, self.effects_precision = trial_effect_prior(self.prior, state)
         self.conditions = [trial_data.trial.condition for trial_data in self.data]
         self.n_points = float(sum(trial_data.time_s.size for trial_data in self.data))
-
-    def on_tracks(self) -> ForcePoint:
-        """The motions that lie on the tracks, whatever the model says, at the parameters of the fit."""
         effects = np.zeros_like(self.effects_mean)
         effects[:, :2] = self.effects_mean[:, :2]
-        motions = motions_of(self.fit, effects)
-        on_tracks = [_on_track(self.data[i], effects[i], motion) for i, motion in enumerate(motions)]
+        on_tracks = [_on_track(*pair) for pair in zip(self.data, effects, motions_of(fit, effects), strict=True)]
         none = FreeForce(lambda motion: np.zeros((motion.time_s.size, 0)))
-        return ForcePoint(self.fit.solution.state.theta, effects, none, np.zeros(0), on_tracks)
+        self.tracks = ForcePoint(fit.solution.state.theta, effects, none, np.zeros(0), on_tracks)
 
     @property
     def independent_points(self) -> float:
@@ -791,8 +774,9 @@ def _with_updated_motions(fit: Fit, point: ForcePoint) -> ForcePoint:
     motions = [with_model_terms(_with_parameters_of_job(fit, *pair)) for pair in zip(point.motions, jobs, strict=True)]
     # 2: corrections of the motions at each step (chosen)
     corrections = 2 if point.motions_include_force else 0
-    along = lambda motion: point.force.force(motion, point.amplitude)  # noqa: E731
-    return replace(point, motions=with_force(motions, along, corrections))
+    return replace(
+        point, motions=with_force(motions, lambda motion: point.force.force(motion, point.amplitude), corrections)
+    )
 
 
 def _points_before_end(trial_data: FitTrial, trial_effects: Floats) -> slice:

@@ -369,7 +369,7 @@ def learned_force(problem: ForceProblem) -> LearnedForce | None:
     """Estimate the missing force over the variables with the highest marginal likelihood. All choices of variables are
     compared about the same motions: those on the tracks, then those under the force that leaves least.
     """
-    seen = _choices_seen_from(problem, problem.on_tracks())
+    seen = _choices_seen_from(problem, problem.tracks)
     if seen is None or seen.chi2_without_force < LEAST_CHI2_PER_POINT * problem.n_points:
         return None
     log_bayes_factors = {each.domain.name: each.log_evidence - seen.log_evidence_without_force for each in seen.choices}

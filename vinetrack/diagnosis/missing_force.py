@@ -177,7 +177,7 @@ def misfit_of(problem: ForceProblem) -> Misfit:
     """The misfit seen from the tracks or, where that leaves less, from the motions under the law that is best there.
     Tracks are smoothed too much to show a force over a few millimetres in its place; the vine under a law is not.
     """
-    on_tracks = _seen_from(problem, problem.on_tracks())
+    on_tracks = _seen_from(problem, problem.tracks)
     best = on_tracks.laws[0]
     if not best.is_detected:
         return on_tracks
