@@ -46,7 +46,7 @@ FLOORS = (
 BUDGETS = {
     "cli": (649, 4, 7),
     "core": (1488, 9, 77),
-    "diagnosis": (11829, 23, 182),
+    "diagnosis": (11827, 23, 182),
     "dynamics": (2519, 8, 28),
     "effects": (2626, 44, 179),
     "experiment": (1968, 7, 25),

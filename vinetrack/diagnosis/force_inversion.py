@@ -31,7 +31,7 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError, Trajectory, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import trial_effect_prior
+from vinetrack.inference.marginal_likelihood import eliminated, trial_effect_prior, with_diagonal
 from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Job
 from vinetrack.inference.whitening import whiten
@@ -577,7 +577,6 @@ class LinearForce:
         off = point.trial_effects - problem.effects_mean
         from_mean = point.theta - prior.prior_mean
         each = np.arange(N_TRIAL_EFFECTS)
-        grams[:, each, each] += problem.effects_precision
         grams[:, each, -1] -= problem.effects_precision * off
         grams[:, -1, each] = grams[:, each, -1]
         self.prior_precision = np.concatenate([prior.prior_precision, np.full(q, point.force.amplitude_precision)])
@@ -587,16 +586,15 @@ class LinearForce:
         # Places of a trial's parameters and amplitudes among all; parameters that it does not depend on come last.
         keys = np.where(prior.index >= 0, prior.index, p + q)
         self.places = np.hstack([keys, np.broadcast_to(p + np.arange(q), (len(keys), q))])
-        self.eliminated, self.response = self._without_effects(0.0)
+        self.eliminated, _ = self._without_effects(0.0)
 
     def _without_effects(self, damping: float) -> tuple[Floats, Floats]:
         """Products of [parameters, amplitudes, residual] of each trial, its effects eliminated, and the response of the
         effects to those. Shapes (n_trials, m, m), (n_trials, 4, m).
         """
-        effects, others = slice(None, N_TRIAL_EFFECTS), slice(N_TRIAL_EFFECTS, None)
-        of_effects = self.grams[:, effects, effects] * (1 + damping * np.eye(N_TRIAL_EFFECTS))
-        response = np.linalg.solve(of_effects, self.grams[:, effects, others])
-        return self.grams[:, others, others] - self.grams[:, others, effects] @ response, np.asarray(response)
+        precision = self.problem.effects_precision
+        own = np.einsum("nkk->nk", self.grams)[:, :N_TRIAL_EFFECTS] + precision
+        return eliminated(self.grams, precision + damping * own)
 
     def _blocks(self, products: Floats) -> tuple[Floats, Floats, Floats]:
         """Normal equations over all trials, with priors: parameters by themselves (p, p), by [amplitudes, residual]
@@ -686,7 +684,7 @@ class LinearForce:
         root = vectors[:, estimable] / np.sqrt(values[estimable])
         explained = root.T @ (cross[size > 0] * unit[:, None])
         reduced = rest - explained.T @ explained
-        of_effects = self.grams[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS]
+        of_effects = with_diagonal(self.grams[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], self.problem.effects_precision)
         own = np.einsum("nkk->k", self.grams)[-len(rest) : -1] + self.prior_precision[size.size :]
         scale = np.sqrt(own)
         inverse_scale = np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)
