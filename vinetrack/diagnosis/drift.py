@@ -43,6 +43,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import fit_subset, rest_is_seen
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number, TrialFit
+from vinetrack.inference.robust_covariance import robust_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
 
 if TYPE_CHECKING:
@@ -182,15 +183,6 @@ class Covariate:
     def formatted(self, level: float) -> str:
         """A level with its unit."""
         return f"{level * self.factor:.3g} {self.unit}"
-
-
-COVARIATES = (
-    Covariate("pressure_Pa", "pressure", "kPa", 1e-3, True),
-    Covariate("payload_kg", "payload", "g", 1e3, False),
-    Covariate("growth_angle_rad", "growth angle", "°", 180 / math.pi, False),
-    Covariate("chamber_m3", "chamber volume", "l", 1e3, True),
-    Covariate("inlet_m", "inlet", "mm", 1e3, True),
-)
 
 
 @dataclass(frozen=True)
@@ -335,9 +327,6 @@ def _group(
 # here even where n and the yield pressure absorb it in every comparison between trials.
 
 
-DRIFT_ALONG_LEAST_SCATTER = 2e-3  # Lower limit of the standard deviation of the rise of ln B in single trials (chosen)
-
-
 HALVES = (0.25, 0.75)  # Midpoints of the halves, as fractions of the growth (defined)
 
 
@@ -412,7 +401,8 @@ def _difference_test(
     scatter, dof = _scatter(rise, [halves.trials[i].condition for i in chosen])
     if dof < FEWEST_DEGREES:
         return None
-    sigma = max(scatter, DRIFT_ALONG_LEAST_SCATTER) / math.sqrt(rise.size)
+    # 2e-3: lower limit of the standard deviation of the rise of ln B in single trials (chosen)
+    sigma = max(scatter, 2e-3) / math.sqrt(rise.size)
     mean = float(rise.mean())
     p = float(2 * student.sf(abs(mean) / sigma, dof))
     change, error = math.expm1(abs(mean)), math.exp(abs(mean)) * sigma
@@ -459,17 +449,22 @@ def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
 
 
 def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
-    """Compare fitted yield pressures with the sheet, in units of the standard error stated there."""
-    for number, free in zip(fit.numbers, fit.predictor.layout.free, strict=True):
-        if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
+    """Compare fitted yield pressures with the sheet. With σ₀ that of the sheet and σ that of the fit with exact errors,
+    the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
+    fit adds to σ² for scatter and shared errors comes on top.
+    """
+    plain = np.diag(robust_covariance(fit.predictor, fit.solution)[0])
+    for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
+        variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2
+        if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:
             continue
-        z = abs(number.value - free.start) / free.prior_sd
+        z = abs(number.value - free.start) / math.sqrt(variance)
         yield _tested(
             number,
             number.vine,
             "sheet",
             (free.start, number.value),
-            (number.value - free.start, free.prior_sd),
+            (number.value - free.start, math.sqrt(variance)),
             p=math.erfc(z / math.sqrt(2)),
             z=z,
             dof=math.inf,
@@ -547,7 +542,13 @@ def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTe
             notes.append(f"{key} could not be fitted to single trials: the simulation fails there.")
             continue
         damping = estimates if key == DAMPING else damping
-        for against in COVARIATES:
+        for against in (
+            Covariate("pressure_Pa", "pressure", "kPa", 1e-3, True),
+            Covariate("payload_kg", "payload", "g", 1e3, False),
+            Covariate("growth_angle_rad", "growth angle", "°", 180 / math.pi, False),
+            Covariate("chamber_m3", "chamber volume", "l", 1e3, True),
+            Covariate("inlet_m", "inlet", "mm", 1e3, True),
+        ):
             yield from _against(estimates, against)
     yield from _between_vines(fit, scatter)
     yield from against_the_sheet(fit)

@@ -110,7 +110,7 @@ def structure_from_scores(scores: Scores) -> Structure:
     trial_z = scores.trial_scores[:, informative] @ directions
     trial_informations = scores.trial_informations[:, informative][:, :, informative]
     explained = np.einsum("jk,njl,lk->nk", directions, trial_informations, directions) * z
-    robust = cluster_variance(trial_z - explained, scores.degrees)
+    robust = cluster_variance(trial_z - explained, scores.fitted, scores.groups)
     chi2 = float(np.sum(z**2 / np.maximum(1.0, robust)))
     degrees = int(np.count_nonzero(keep))
     few, noise_degrees = len(trial_z) < FEWEST_CLUSTERS, 8 * scores.degrees  # 8: bumps along the growth
@@ -137,7 +137,7 @@ STRETCH_FRAMES = 8  # Frames over which residuals are summed (chosen)
 
 MIN_REPLICATE_DEGREES = 4  # Degrees of freedom between replicates from which their scatter is estimated (chosen)
 
-STATED_ERROR_FACTOR, CAREFUL_DAMPING_SCATTER = 2.0, 0.04  # Root mean square by which conditions may differ (chosen)
+CAREFUL_DAMPING_SCATTER = 0.04  # Root mean square of ln B by which conditions may differ (chosen)
 
 CAREFUL_PRESSURE_SCATTER = 0.02  # Relative standard deviation of pressure that is usual between trials (chosen)
 
@@ -150,7 +150,8 @@ def between_conditions_p(fit: Fit) -> float:
         trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
     ]
     known = [relative for relative in stated if math.isfinite(relative)]
-    pressure = max(STATED_ERROR_FACTOR * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
+    # 2.0: root mean square by which conditions may differ, in stated errors of the pressure (chosen)
+    pressure = max(2.0 * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
     allowed = pressure, CAREFUL_DAMPING_SCATTER
     p_values = [
         _anova_p(deviations, *_grouping(fit), limit)
@@ -267,9 +268,9 @@ FAR_OFF_CHI2_PER_DOF = 4.0
 # Root mean square misfit of the median trial, as a fraction of its growth, that exceeds the slow errors of any tracker
 MISSED_FRACTION, MISSED_FRACTION_WITHOUT_SLOW_ERRORS = 6e-4, 1.5e-4
 
-# A model that passes every test is searched nevertheless from this χ² per degree of freedom, or below this p-value of
-# the trial effects; an effect must then reach this many standard deviations (chosen)
-SEARCH_CHI2_PER_DOF, SEARCH_P_VALUE, SEARCH_SIGMAS = 1.5, 1e-2, 6.0
+# A model that passes every test is searched nevertheless from this χ² per degree of freedom; an effect must then reach
+# this many standard deviations (chosen)
+SEARCH_CHI2_PER_DOF, SEARCH_SIGMAS = 1.5, 6.0
 
 # Significance that the largest plausible size of an effect must reach for the effect to be testable (chosen)
 TESTABLE_SIGMAS = 3.0
@@ -352,7 +353,8 @@ class MisfitTests:
     @property
     def needs_search(self) -> bool:
         """Whether to search even where every test passes: trial effects and noise may have absorbed the misfit."""
-        return self.fit.chi2_per_dof > SEARCH_CHI2_PER_DOF or self.trial_effect_p < SEARCH_P_VALUE
+        # 1e-2: p-value of the trial effects below which a model that passes every test is searched too (chosen)
+        return self.fit.chi2_per_dof > SEARCH_CHI2_PER_DOF or self.trial_effect_p < 1e-2
 
     @cached_property
     def rejects_at_first_round_level(self) -> bool:

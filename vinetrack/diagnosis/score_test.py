@@ -41,20 +41,15 @@ from vinetrack.inference.marginal_likelihood import (
 )
 from vinetrack.inference.marginal_likelihood import trial_deviation_sd as between_trial_sd
 from vinetrack.inference.position_errors import with_shapes
-from vinetrack.inference.robust_covariance import Systematics, cluster_variance
+from vinetrack.inference.robust_covariance import Systematics, cluster_variance, coarsest_groups
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
 from vinetrack.inference.whitening import all_products, at_correlation
 
 # ------------------------------------------------------------------------------
 # Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried.
 
-# Where the ends of a plausible range differ by more than the first factor, a size may lie below it by the second
-# (chosen)
-NARROW_RANGE, BELOW_RANGE_FACTOR = 2.0, 3.0
+NARROW_RANGE = 2.0  # Ratio of the ends of a plausible range from which a size may lie below it (chosen)
 
-
-# The same for an effect with a threshold (chosen)
-THRESHOLD_AMPLITUDES = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
 
 # Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
 RANGE_SHARE_BESIDE_SLIP = 0.5
@@ -148,7 +143,8 @@ def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = (()
     zero = effect.parameters[0].zero
     # (0.03, 0.2, 0.7): fractions of the plausible range at which an effect is tried that has no response to an
     # infinitesimal size (chosen)
-    fractions = THRESHOLD_AMPLITUDES if "rest_force" in effect.functions else (0.03, 0.2, 0.7)
+    with_threshold = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
+    fractions = with_threshold if "rest_force" in effect.functions else (0.03, 0.2, 0.7)
     return [
         CandidateShape(effect, values, fraction * (largest - zero), whole=True)
         for values in other_values
@@ -212,7 +208,8 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     if math.isfinite(parameter.period):
         value = low + (value - low) % parameter.period
     if low > 0 and high / low > NARROW_RANGE:
-        low /= BELOW_RANGE_FACTOR
+        # 3.0: factor by which a size may lie below a range that is not narrow (chosen)
+        low /= 3.0
     low, high = min(low / widened, low * widened), max(high * widened, high / widened)
     margin = reach * sigma if math.isfinite(sigma) else math.inf
     return bool(low - margin <= value <= high + margin)
@@ -457,7 +454,15 @@ class Scores:
     information: Floats
     trial_scores: Floats
     trial_informations: Floats
-    degrees: float
+    fitted: int
+    groups: Sequence[str]
+
+    @property
+    def degrees(self) -> float:
+        """Degrees of freedom of the scatter of trials."""
+        clusters = len(set(self.groups))
+        spare = len(self.groups) - self.fitted
+        return float(max(min(spare, clusters - 1), 1))
 
     @property
     def size(self) -> Floats:
@@ -483,7 +488,7 @@ class Scores:
         """
         diagonal = np.diag(self.information)
         residual = self.trial_scores - np.einsum("njj->nj", self.trial_informations) * self.size
-        scatter = np.sqrt(cluster_variance(residual, self.degrees))
+        scatter = np.sqrt(cluster_variance(residual, self.fitted, self.groups))
         return np.where(diagonal > 0, scatter / np.maximum(diagonal, 1e-300), math.inf)
 
     @property
@@ -593,8 +598,8 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
         trial_informations[part] = of_shapes @ (of_part[:, C, S] - of_part[:, C, X] @ lever[keys]) - of_parameters @ (
             of_part[:, X, S] - of_part[:, X, X] @ lever[keys]
         )
-    degrees = max(len(trial_scores) - projection.estimated.size, 1)
-    return Scores(score, information, trial_scores, trial_informations, float(degrees))
+    groups = coarsest_groups([trial.trial for trial in fit.trials])
+    return Scores(score, information, trial_scores, trial_informations, projection.estimated.size, groups)
 
 
 def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float, float]]) -> Floats:

@@ -37,12 +37,6 @@ from vinetrack.inference.whitening import at_correlation
 RIDGE = 1e-13  # Added to the diagonal of systems with a unit diagonal before they are solved (derived)
 
 
-LEAST_RELEASE_DECREASE = 1e-6  # Decrease of −2 ln L, by leaving its bound, from which a parameter is released (derived)
-
-# Bounds met or released per parameter, at most, in the search for the minimum within bounds (chosen)
-ACTIVE_SET_CHANGES = 10
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def step_within_bounds(
     square: Floats, slope: Floats, below: Floats, above: Floats, free: NDArray[np.bool_]
@@ -55,7 +49,8 @@ def step_within_bounds(
     diagonal = np.diag(square)
     moving = free & (diagonal > 0)
     step, outward = np.zeros_like(slope), np.zeros_like(slope)
-    for _ in range(ACTIVE_SET_CHANGES * slope.size + 1):
+    # 10: bounds met or released per parameter, at most, in the search for the minimum within bounds (chosen)
+    for _ in range(10 * slope.size + 1):
         k = np.flatnonzero(moving)
         if k.size:
             slope_left = slope - square @ np.where(moving, 0.0, step)
@@ -73,7 +68,8 @@ def step_within_bounds(
         # Decrease of the form if a parameter alone left its bound.
         inward = np.where(moving, 0.0, np.maximum(-outward * (slope - square @ step), 0.0))
         decrease = inward**2 / np.where(outward != 0, diagonal, 1.0)
-        if not decrease.max() > LEAST_RELEASE_DECREASE:
+        # 1e-6: decrease of −2 ln L, by leaving its bound, from which a parameter is released (derived)
+        if not decrease.max() > 1e-6:
             break
         moving[np.argmax(decrease)] = True
     return step, moving
@@ -225,6 +221,11 @@ class MixedProblem:
         """`index` with -1 replaced by n_free, one past the last parameter."""
         return np.where(self.index < 0, self.prior_mean.size, self.index)
 
+    @cached_property
+    def places_of_pairs(self) -> NDArray[np.int_]:
+        """Places of all pairs of a trial's columns in a flattened matrix of n_free + 1 rows."""
+        return (self.places[:, :, None] * (self.prior_mean.size + 1) + self.places[:, None, :]).ravel()
+
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
     """Prior mean and precision of the trial effects. Returns centre, precision : arrays, shape (n_trials, 4)."""
@@ -263,9 +264,7 @@ def sum_matrix_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
     blocks (n_trials, n_keys, n_keys) → (n_free, n_free).
     """
     p = problem.prior_mean.size
-    columns = problem.places
-    flat_index = columns[:, :, None] * (p + 1) + columns[:, None, :]
-    total = np.bincount(flat_index.ravel(), weights=blocks.ravel(), minlength=(p + 1) ** 2)
+    total = np.bincount(problem.places_of_pairs, weights=blocks.ravel(), minlength=(p + 1) ** 2)
     return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
 
 
@@ -420,18 +419,12 @@ def bounded_solve(
 
 LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
 
-# Standard deviations from which the maximum of the likelihood is searched
-SPREAD_GRID = (0.001, 0.004, 0.01, 0.025, 0.06)
 
 LARGEST_CORRELATION = 0.9998  # Upper bound of the noise correlation, nearly 1 (derived)
 
 CORRELATIONS = np.concatenate(
     [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97, 0.985, 0.993, 0.997, 0.999, LARGEST_CORRELATION]]
 )
-
-# Prior precision of a shared parameter that is freed in each trial, relative to that trial's information at white
-# noise; least part of the residual sum of squares that remains (derived)
-VAGUE_PRECISION, LEAST_RESIDUAL_PART = 1e-9, 1e-6
 
 
 @dataclass(frozen=True)
@@ -541,7 +534,8 @@ def estimate_between_trial_sd(
         return deviance(part, problem, state, at(logs), restricted=restricted)
 
     start_point = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
-    axes = np.meshgrid(*[np.log(SPREAD_GRID)] * len(which), indexing="ij")
+    # Standard deviations from which the maximum of the likelihood is searched (chosen)
+    axes = np.meshgrid(*[np.log((0.001, 0.004, 0.01, 0.025, 0.06))] * len(which), indexing="ij")
     points = [start_point, *np.column_stack([axis.ravel() for axis in axes])]
     start = points[int(np.argmin([cost(point) for point in points]))]
     # The simplex extends towards smaller values: at the upper bound a step up would be clipped and degenerate.
@@ -585,6 +579,7 @@ def estimate_noise(
         precision_scaled = np.concatenate([precision_scaled, _vague_precision(cross_products, n_freed)], axis=1)
         prior_gradient = np.pad(prior_gradient, ((0, 0), (0, n_freed - N_TRIAL_EFFECTS)))
     columns = [*range(n_freed), cross_products.shape[-1] - 1]
+    # 1e-6, 0.2: least part of the residual sum of squares that remains (derived)
     scores, squares, degrees = noise_at_correlations(
         np.ascontiguousarray(cross_products[:, :, columns][:, :, :, columns]),
         precision_scaled,
@@ -592,7 +587,7 @@ def estimate_noise(
         problem.points,
         grid,
         shared,
-        LEAST_RESIDUAL_PART if within else 0.2,
+        1e-6 if within else 0.2,
     )
     scores -= np.sum(problem.stretches) * np.log(1 - grid**2)
     best = int(np.argmin(scores))
@@ -604,7 +599,8 @@ def estimate_noise(
 def _vague_precision(cross_products: Floats, n_freed: int) -> Floats:
     """Prior precision that leaves the shared parameters free in each trial, shape (n_trials, n_keys)."""
     information = np.einsum("nkk->nk", cross_products[:, 0])[:, N_TRIAL_EFFECTS:n_freed]
-    return np.asarray(np.where(information > 0, VAGUE_PRECISION * information, 1.0))
+    # 1e-9: part of that trial's information at white noise (derived)
+    return np.asarray(np.where(information > 0, 1e-9 * information, 1.0))
 
 
 def _parabola_minimum(grid: Floats, scores: Floats, best: int) -> float:

@@ -251,14 +251,16 @@ FEWEST_CLUSTERS = 8  # Trials from which the sandwich is better than the model o
 FEWEST_DEGREES = 4  # Trials beyond the number of parameters that a sandwich needs (chosen)
 
 
-def cluster_variance(single: Floats, degrees: float) -> Floats:
-    """Variance of sums over trials, estimated from the scatter of single trials; 0 where they are too few. The
-    contributions of priors belong to no trial: the mean is subtracted. Shapes: single (n_trials, n) → (n,).
+def cluster_variance(single: Floats, fitted: int, groups: Sequence[str]) -> Floats:
+    """Variance of sums over trials, from the scatter of single trials or, where that is larger, of their clusters
+    (`coarsest_groups`); 0 where trials are too few. Shapes: single (n_trials, n) → (n,).
     """
     trials = len(single)
     if trials < FEWEST_CLUSTERS:
         return np.zeros(single.shape[1])
-    return np.asarray(np.sum((single - single.mean(axis=0)) ** 2, axis=0) * trials / degrees)
+    single = single - single.mean(axis=0)
+    by_trial = np.sum(single**2, axis=0) * trials / max(trials - fitted, 1)
+    return np.asarray(np.maximum(by_trial, np.diag(group_scatter(single, groups, fitted))))
 
 
 def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
@@ -368,7 +370,9 @@ def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics)
     estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
     plain = inverse_of_block(square, estimated)
     scores = by_parameter(blocks[:, :p, p], problem)
-    scores -= scores.mean(axis=0)
+    # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
+    depend = by_parameter(np.ones((len(blocks), p)), problem) > 0
+    scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
     trials = len(blocks)
     # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
     prior = np.diag(problem.prior_precision)
