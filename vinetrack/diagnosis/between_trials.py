@@ -59,7 +59,6 @@ from vinetrack.inference.position_errors import with_smooth_errors
 
 SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0  # Standard deviation of ln B and of P_y among tubes of one kind
 
-DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03  # The same between days, and of ln P (chosen)
 
 MIN_TRIALS_EACH_SIDE = 2  # Minimum number of trials before and after a change (derived)
 
@@ -147,7 +146,8 @@ def _groups(trials: Sequence[Trial]) -> list[Difference]:
         groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
         stated_differences += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
     days = groups_of(trials, "day")
-    stated_differences += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, gain_sd=DAY_GAIN_SD, stated=True)
+    # 0.03, 300.0, 0.03: standard deviations of ln B, P_y and ln P between days (chosen)
+    stated_differences += _forms(DAY, days, trials, 0.03, 300.0, gain_sd=0.03, stated=True)
     return stated_differences
 
 

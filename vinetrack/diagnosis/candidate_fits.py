@@ -62,15 +62,10 @@ from vinetrack.inference.solving import SLOW_NOISE, as_recorded, assemble
 Start = tuple[Sequence[Effect], Mapping[str, Value]]  # Effects to add, and parameter values to start from
 
 
-# Iterations of a subset fit from each start, and of the best one each further time (chosen)
-SUBSET_FIRST_ITERATIONS, SUBSET_FURTHER_ITERATIONS = 4, 10
-
+SUBSET_FIRST_ITERATIONS = 4  # Iterations of a subset fit from each start (chosen)
 
 # Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
 MIN_SHARE_OF_BEST_GAIN = 0.3
-
-# Fall of −2 ln L of a subset fit from which its start is worth a full fit (chosen)
-MIN_DEVIANCE_FALL, MIN_DEVIANCE_FALL_PER_POINT = 1.0, 0.02
 
 
 @dataclass(frozen=True)
@@ -224,7 +219,8 @@ def best_subset_fit(
     if best.deviance - goal > 0.5 * fitter.n_points:
         return best
     for _ in range(3):
-        further = fitter.fit_hypothesis(best.effects, best.values, iterations=SUBSET_FURTHER_ITERATIONS, search=search)
+        # 10: iterations of the best subset fit each further time (chosen)
+        further = fitter.fit_hypothesis(best.effects, best.values, iterations=10, search=search)
         if further is None:
             break
         required_fall = STAGNATION_DECREASE * fitter.n_points if search and further.far_off else 0.1
@@ -273,7 +269,8 @@ def restart_exponents(fit: Fit) -> Fit:
     if len(starts) == 1:
         return fit
     fitter = SubsetFitter(fit)
-    return _restart(fitter, starts, fitter.null_deviance(), MIN_DEVIANCE_FALL_PER_POINT * fitter.n_points)
+    # 0.02: fall of −2 ln L per point of a subset fit from which its start is worth a full fit (chosen)
+    return _restart(fitter, starts, fitter.null_deviance(), 0.02 * fitter.n_points)
 
 
 def exponent_starts(fit: Fit) -> list[Start]:
@@ -292,10 +289,8 @@ def restart_without(fit: Fit, larger: Fit) -> Fit:
     added = [effect for effect in larger.model if effect.name not in fit.model]
     null_deviance = fitter.null_deviance()
     with_effects = fitter.fit_hypothesis(added, larger.model.values, iterations=1)
-    if with_effects is None:
-        required_fall = math.inf
-    else:
-        required_fall = max(MIN_DEVIANCE_FALL, 0.5 * (null_deviance - with_effects.deviance))
+    # 1.0: least fall of −2 ln L of a subset fit from which its start is worth a full fit (chosen)
+    required_fall = math.inf if with_effects is None else max(1.0, 0.5 * (null_deviance - with_effects.deviance))
     start = {key: value for key, value in larger.model.values.items() if key in names}
     return _restart(fitter, [((), start)], null_deviance, required_fall)
 
@@ -340,9 +335,6 @@ def sheet_slip_starts(effect: Effect) -> list[Start]:
 # where a later step needs them.
 
 
-# Fits, the likeliest of a search, and misfit tests, the last made, that are kept whole (chosen)
-MAX_WHOLE_FITS, MAX_WHOLE_TESTS = 8, 1
-
 Key = TypeVar("Key")
 
 
@@ -355,7 +347,8 @@ def is_large(fit: Fit) -> bool:
 def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
     """Drop the curves of hypotheses that can no longer enter an answer set."""
     ranked = sorted(fitted.items(), key=lambda entry: -entry[1].fit.log_likelihood)
-    for key, hypothesis in ranked[MAX_WHOLE_FITS:]:
+    # 8: fits, the likeliest of a search, that are kept whole (chosen)
+    for key, hypothesis in ranked[8:]:
         fit = hypothesis.fit
         deviance_excess = 2 * (ranked[0][1].fit.log_likelihood - fit.log_likelihood)
         if fit.trials and deviance_excess > ANSWER_SET_DELTA_CHI2 * MAX_INFLATION and is_large(fit):
@@ -389,19 +382,12 @@ MIN_SHARE_OF_SUBSET_GAIN = 0.1  # Share of the subset fit's gain that the fit to
 
 FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
 
-
-# Δχ² by which an effect's predicted gain may fall short of the best one's for it still to be fitted (chosen)
-LINEAR_REACH, LINEAR_REACH_SHARE, MAX_LINEAR_REACH_SHARE = 16.0, 0.4, 0.75
-
-
 ALIKE_COSINE = 0.95  # Cosine from which two effects count as alike (chosen)
 
 MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
 
-MIN_SUBSET_FITS, HIGHEST_SCORES = 5, 4  # Number of effects fitted to the subset in any case (chosen)
-
 # −2 ln L by which a subset fit may end behind the best and still be fitted to all trials (chosen)
-SUBSET_REACH, SUBSET_REACH_SHARE, ALIKE_REACH_FACTOR = 40.0, 0.1, 5.0
+SUBSET_REACH, ALIKE_REACH_FACTOR = 40.0, 5.0
 
 MAX_FULL_FITS = 7  # Candidates fitted to all trials after their subset fits, at most (chosen)
 
@@ -463,7 +449,7 @@ class CandidateFits:
                 return tests
         tests = misfit_tests(with_curves(fit), self.tests.effects, FALSE_ALARM_LEVEL_LATER_ROUNDS, film=film)
         if is_large(fit):
-            del self.tests_by_fit[: max(len(self.tests_by_fit) - MAX_WHOLE_TESTS + 1, 0)]
+            self.tests_by_fit.clear()
         self.tests_by_fit.append((fit, film, tests))
         return tests
 
@@ -479,7 +465,8 @@ class CandidateFits:
         null_fit = self.subset_fitter.fit_hypothesis((), {}, iterations=4)
         self.null_deviance = null_fit.deviance if null_fit else best.deviance
         gain = max(self.null_deviance - best.deviance, 0.0)
-        reach = max(SUBSET_REACH, SUBSET_REACH_SHARE * gain)
+        # 0.1: the same as a share of the gain of the best subset fit (chosen)
+        reach = max(SUBSET_REACH, 0.1 * gain)
         alike = [fit for fit in ranked if self.tests.cosine(fit.names[0], best.names[0]) > ALIKE_COSINE]
         within_reach = [
             fit
@@ -550,17 +537,19 @@ class CandidateFits:
         """Effects of a large predicted gain or score, and those that look like the most promising one."""
         top = self.tests.predicted_gain(self.names[0]) if self.names else 0.0
         highest_scores = self._highest_scores()
+        # 5: effects of the largest predicted gains, fitted to the subset in any case (chosen)
         return [
             name
             for k, name in enumerate(self.names)
-            if k < MIN_SUBSET_FITS
+            if k < 5
             or name in highest_scores
             or self.tests.predicted_gain(name) > MIN_SHARE_OF_BEST_PREDICTION * top
             or self.tests.cosine(name, self.names[0]) > ALIKE_COSINE
         ]
 
     def _highest_scores(self) -> list[str]:
-        return sorted(self.names, key=lambda name: -self.tests.best_z(name)[0])[:HIGHEST_SCORES]
+        # 4: effects of the highest scores, fitted to the subset in any case (chosen)
+        return sorted(self.names, key=lambda name: -self.tests.best_z(name)[0])[:4]
 
     def _fit_subsets(self, names: Iterable[str]) -> None:
         """Fit effects to the subset, each from its best shapes and from the sizes of common slips in the sheet."""
@@ -586,7 +575,9 @@ class CandidateFits:
         if not names:
             return []
         top, highest_score = self.tests.predicted_gain(names[0]), self._highest_scores()[:1]
-        reach = min(max(LINEAR_REACH, LINEAR_REACH_SHARE * top), MAX_LINEAR_REACH_SHARE * top)
+        # 16.0, 0.4, 0.75: Δχ², and shares of the best predicted gain, by which that of an effect may fall short of
+        # the best one for it still to be fitted (chosen)
+        reach = min(max(16.0, 0.4 * top), 0.75 * top)
         for name in names:
             promising = self.tests.predicted_gain(name) > top - reach
             alike = self.tests.cosine(name, names[0]) > ALIKE_COSINE or name in highest_score

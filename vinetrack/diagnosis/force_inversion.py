@@ -427,7 +427,6 @@ class Force(Protocol):
 
 PARAMETER_CUTOFF = 1e-11  # Relative eigenvalue below which a combination of model parameters is not estimable (derived)
 LEAST_INFORMATION = 1e-9  # Part of the largest information below which an amplitude is not estimable (chosen)
-STEP_CUTOFF = 1e-12  # The same for a combination of all unknowns in a step (derived)
 
 
 @dataclass(frozen=True)
@@ -711,7 +710,8 @@ class LinearForce:
         parameters, cross, rest = self._blocks(products)
         matrix = np.block([[parameters, cross[:, :-1]], [cross[:, :-1].T, rest[:-1, :-1]]])
         matrix += damping * np.diag(np.diag(matrix))
-        step = scaled_pseudo_inverse(matrix, STEP_CUTOFF) @ np.concatenate([cross[:, -1], rest[:-1, -1]])
+        # 1e-12: relative eigenvalue below which a combination of unknowns is not moved in a step (derived)
+        step = scaled_pseudo_inverse(matrix, 1e-12) @ np.concatenate([cross[:, -1], rest[:-1, -1]])
         of_effects = response[:, :, -1] - np.einsum(
             "nem,nm->ne", response[:, :, :-1], np.append(step, 0.0)[self.places]
         )

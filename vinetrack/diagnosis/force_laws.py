@@ -19,8 +19,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import N_NONZERO, FittedMotion, nonzero_splines, uniform_knots
 from vinetrack.diagnosis.remarks import remark
 
-# Number of positions of a local force, and its widths as parts of the growth (chosen)
-PATCH_CENTRES, PATCH_WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
+PATCH_CENTRES = 16  # Number of positions of a local force (chosen)
 
 
 EDGE_FRACTION = 0.1  # Part of a patch's width over which the force rises at each end (chosen)
@@ -206,7 +205,8 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
         laws.append(Law("falling_with_speed", n_shapes=1, scale=part * visited.speed_m_s))
         laws.append(Law("fading_in_time", n_shapes=1, scale=part * visited.time_s))
         laws.append(Law("fading_along", n_shapes=1, scale=part * visited.growth_m))
-    for width in PATCH_WIDTHS:
+    # Widths of a local force as parts of the growth (chosen)
+    for width in (0.06, 0.12, 0.2, 0.33):
         for centre in (np.arange(PATCH_CENTRES) + 0.5) / PATCH_CENTRES * visited.growth_m:
             laws.append(_patch_at(float(centre), width * visited.growth_m))
     # 24: periods in the grid (chosen)
@@ -310,9 +310,6 @@ VARIABLES = {
     "pressure": "pressure_Pa",
 }
 
-SPLINES_ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
-# Splines along a variable, when it is alone and when it is one of two (chosen)
-SPLINES_IN_PAIR = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
 
 # Length scales that are averaged over, as parts of the visited range (chosen)
 LENGTH_SCALES = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
@@ -516,6 +513,9 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
         lows, highs, log_scales = zip(*(ranges[name] for name in names), strict=True)
         return Domain(names, lows, highs, tuple(counts[name] for name in names), log_scales)
 
-    return [domain((name,), SPLINES_ALONE) for name in ranges] + [
-        domain(pair, SPLINES_IN_PAIR) for pair in itertools.combinations(ranges, 2)
+    # Splines along a variable, when it is alone and when it is one of two (chosen)
+    alone = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
+    in_pair = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
+    return [domain((name,), alone) for name in ranges] + [
+        domain(pair, in_pair) for pair in itertools.combinations(ranges, 2)
     ]

@@ -498,10 +498,6 @@ def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:
     return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))
 
 
-# What further trials need, in order of effort
-EFFORT_WORDS = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-
-
 def further_trials(
     design: CampaignDesign, now: EffectPower, value: float, target: float, limits: Limits | None = None
 ) -> FurtherTrials:
@@ -542,8 +538,9 @@ class _Search(DesignInformation):
     def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
         """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
         options: dict[str, list[int]] = {}
+        effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
         for effort, allowed in conditions_by_effort(self.conditions, self._best_new_vines):
-            words, chosen = EFFORT_WORDS[effort], self._design(allowed, wanted, most)
+            words, chosen = effort_words[effort], self._design(allowed, wanted, most)
             options[words] = min(options.get(words, chosen), chosen, key=lambda design: self._cost(design, wanted))
         if not options:
             return [], {}

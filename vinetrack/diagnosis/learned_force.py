@@ -206,17 +206,11 @@ def variable_weights(choices: Sequence[VariableChoice], error: float) -> dict[st
 # prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
 
 
-_WORDS = {
-    "growth": "the growth",
-    "speed": "the speed of the tail",
-    "time": "the time since release",
-    "pressure": "the pressure",
-}
-
-
 def variables_in_words(name: str) -> str:
     """A choice of variables in words."""
-    return " and ".join(_WORDS[variable] for variable in name.split("+"))
+    words = {"growth": "the growth", "speed": "the speed of the tail", "time": "the time since release",
+             "pressure": "the pressure"}  # fmt: skip
+    return " and ".join(words[variable] for variable in name.split("+"))
 
 
 def not_excluded(

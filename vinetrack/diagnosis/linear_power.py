@@ -261,8 +261,6 @@ def _stretch_starts(trial_data: FitTrial, keep: NDArray[np.bool_]) -> NDArray[np
 
 DRAWS, SEED = 4000, 5  # Draws of the normal distributions, and their seed (derived)
 
-# Factors on the between-trial standard deviations at which the information is computed (chosen)
-SD_FACTORS = (1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0)
 
 # Scores at the true standard deviations for which the inflation is tabulated (chosen)
 SCORE_GRID = np.linspace(0.0, 40.0, 401)
@@ -466,7 +464,8 @@ def error_inflation(tests: MisfitTests) -> Floats:
     fit, scores = tests.fit, tests.scores
     information = np.diag(scores.information)
     estimated = estimable(fit.solution.problem)
-    factors = [np.array(SD_FACTORS) if free else np.ones(1) for free in estimated]
+    # Factors on the between-trial standard deviations at which the information is computed (chosen)
+    factors = [np.array([1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0]) if free else np.ones(1) for free in estimated]
     spreads, penalties = [], []
     for pressure in factors[0]:
         for damping in factors[1]:

@@ -37,7 +37,6 @@ from vinetrack.inference.fit_result import Fit, TrialFit
 if TYPE_CHECKING:
     import pandas as pd
 
-FAILED_SIGMAS, MISSED_SIGMAS = 3.0, 2.0  # Significance, in standard deviations, from which a model is said to fail
 
 CONDITION_COLUMNS = (
     "vine",
@@ -191,7 +190,8 @@ def _fail(z: Floats) -> bool:
     """Whether the largest deviate (Bonferroni), or all together (Fisher's combined test), are significant."""
     from scipy.stats import chi2, norm
 
-    level = float(norm.sf(FAILED_SIGMAS))
+    # 3.0: significance, in standard deviations, from which a model is said to fail
+    level = float(norm.sf(3.0))
     p = norm.sf(z)
     together = float(chi2.sf(-2 * np.sum(np.log(np.maximum(p, 1e-300))), 2 * z.size))
     return bool(p.min() < level / z.size or together < level)
@@ -199,7 +199,8 @@ def _fail(z: Floats) -> bool:
 
 def _where(table: pd.DataFrame, fails: bool) -> list[str]:
     """Sentences about conditions; the table has the worst first."""
-    failing = table[table["z"] > min(MISSED_SIGMAS, float(table["z"].max()) - 1e-9)]
+    # 2.0: significance, in standard deviations, from which it is said to fail in a condition
+    failing = table[table["z"] > min(2.0, float(table["z"].max()) - 1e-9)]
     if not fails:
         worst = table.sort_values("z").iloc[-1]
         return [

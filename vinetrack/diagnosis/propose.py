@@ -132,8 +132,6 @@ def _fit_with(before: Fit, effect: Effect) -> Fit:
 
 
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
-_SYMBOL = {"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}
-_UNIT = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
 
 
 def table_name(learned: LearnedForce) -> str:
@@ -148,8 +146,9 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
     domain = learned.domain
     table = uniform_table(domain, learned.best.mean)
     variables = variables_in_words(domain.name)
-    symbols = ", ".join(_SYMBOL[name] for name in domain.variables)
-    units = [_UNIT[name] for name in domain.variables]
+    symbols = ", ".join({"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}[name] for name in domain.variables)
+    unit_of = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
+    units = [unit_of[name] for name in domain.variables]
     ranges = joined(
         [
             f"{variables_in_words(name)} from {low * factor:.3g} to {high * factor:.3g} {unit}"
@@ -185,7 +184,7 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
         "\n",
         "def tail_force(s, rig, a):",
         *(f"    {line}" for line in axes),
-        *(_SUM_OF_ONE if table.ndim == 1 else _SUM_OF_TWO),
+        *_sum_code(table.ndim),
         "\n",
         "WORKED = (",
         "    Worked(",
@@ -200,14 +199,15 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
     return "\n".join(part for part in parts if part is not None) + "\n"
 
 
-_SUM_OF_ONE = ("    return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])",)
-_SUM_OF_TWO = (
-    "    r0 = g0 * TABLE[i, j] + g1 * TABLE[i, j + 1] + g2 * TABLE[i, j + 2] + g3 * TABLE[i, j + 3]",
-    "    r1 = g0 * TABLE[i + 1, j] + g1 * TABLE[i + 1, j + 1] + g2 * TABLE[i + 1, j + 2] + g3 * TABLE[i + 1, j + 3]",
-    "    r2 = g0 * TABLE[i + 2, j] + g1 * TABLE[i + 2, j + 1] + g2 * TABLE[i + 2, j + 2] + g3 * TABLE[i + 2, j + 3]",
-    "    r3 = g0 * TABLE[i + 3, j] + g1 * TABLE[i + 3, j + 1] + g2 * TABLE[i + 3, j + 2] + g3 * TABLE[i + 3, j + 3]",
-    "    return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)",
-)
+def _sum_code(axes: int) -> list[str]:
+    """Lines of code that sum the nonzero splines along one axis, or along two."""
+    if axes == 1:
+        return ["    return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])"]
+    rows = [
+        f"    r{k} = " + " + ".join(f"g{m} * TABLE[i + {k}, j + {m}]" for m in range(4)).replace(" + 0", "")
+        for k in range(4)
+    ]
+    return [*rows, "    return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)"]
 
 
 def uniform_table(domain: Domain, coefficients: Floats) -> Floats:
@@ -332,18 +332,8 @@ def proposed_table(
         return ProposedTable(learned, effect, ratio, left_out(after).rms_m)
 
 
-# What a law may be multiplied by: code, symbol, and the change of the unit of the size
-_FACTORS = {
-    "position": ("s.tail_position", "x", (0, -1, 0, 0)),
-    "speed": ("s.tail_velocity", "ẋ", (0, -1, 1, 0)),
-    "pressure": ("s.pressure", "P", (0, 0, 0, -1)),
-}
-
 # State of the worked example; a convention of this file
 _WORKED_STATE = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
-
-# Endings that turn the names of a state into those of a `FittedMotion`
-_SUFFIX = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s", "pressure": "_Pa", "time": "_s"}
 
 
 @dataclass(frozen=True)
@@ -483,7 +473,13 @@ def effect_text(detected: DetectedLaw, remark: str = "") -> str:
     worked example.
     """
     law, expression = detected.law, FORMS[detected.law.kind]
-    factor_code, factor_symbol, factor_unit = _FACTORS.get(law.factor, ("", "", (0, 0, 0, 0)))
+    # What a law may be multiplied by: code, symbol, and the change of the unit of the size
+    factors = {
+        "position": ("s.tail_position", "x", (0, -1, 0, 0)),
+        "speed": ("s.tail_velocity", "ẋ", (0, -1, 1, 0)),
+        "pressure": ("s.pressure", "P", (0, 0, 0, -1)),
+    }
+    factor_code, factor_symbol, factor_unit = factors.get(law.factor, ("", "", (0, 0, 0, 0)))
     unit = _unit([a + b for a, b in zip(expression.size[2], factor_unit, strict=True)])
     size, shapes = _values(detected)
     names = [expression.size[0], *(name for name, _, _ in expression.shapes)]
@@ -544,7 +540,8 @@ def _values(detected: DetectedLaw) -> tuple[float, tuple[float, ...]]:
 
 def _force_N(detected: DetectedLaw) -> float:
     """The force of a law in the state of the worked example, from the law itself: it checks the formula of the file."""
-    state = {f"{name}{suffix}": np.array([_WORKED_STATE[name]]) for name, suffix in _SUFFIX.items()}
+    suffix = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s", "pressure": "_Pa", "time": "_s"}
+    state = {f"{name}{suffix[name]}": np.array([value]) for name, value in _WORKED_STATE.items()}
     motion = SimpleNamespace(**state, trial=SimpleNamespace(area_m2=detected.law.reference_area_m2))
     return float((detected.law.unit_force(motion) @ np.array(detected.amplitude_N))[0])  # type: ignore[arg-type]
 

@@ -47,11 +47,7 @@ Indices = NDArray[np.int_]
 CHANCE = 1e-4  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
 
 
-# Slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
-CURVE_SHAPE_PARAMETERS = 2
-
-# Number of trials from which outliers are looked for, and the largest fraction that may be outliers (chosen)
-FEWEST_TRIALS, LARGEST_SHARE = 8, 0.125
+FEWEST_TRIALS = 8  # Number of trials from which outliers are looked for (chosen)
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,8 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     vines, vine_index = np.unique(
         [name for name, is_driven in zip(names, driven, strict=True) if is_driven], return_inverse=True
     )
-    remaining = int(np.count_nonzero(driven)) - vines.size - CURVE_SHAPE_PARAMETERS
+    # 2: slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
+    remaining = int(np.count_nonzero(driven)) - vines.size - 2
     if remaining < 1:
         return []
     curves = _fit_curves(np.log(force[driven]), np.log(speed[driven]), vine_index)
@@ -100,7 +97,8 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
         for k in np.flatnonzero(np.abs(residual) > allowed).tolist()
         if all(abs(residual[j]) < allowed < abs(residual[k] - residual[j]) for j in replicates[k])
     ]
-    if len(odd) > max(2, int(LARGEST_SHARE * len(data))):
+    # 0.125: the largest fraction that may be outliers (chosen)
+    if len(odd) > max(2, int(0.125 * len(data))):
         return []
     expected = {
         k: float(curves(np.log(speed[k]), index_of[names[k]])) if names[k] in index_of else math.nan for k in odd

@@ -83,13 +83,6 @@ if TYPE_CHECKING:
 
 MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 
-# Number of best single effects from which pairs are built, and of partners tried with each (chosen)
-PAIR_BASES, PAIR_PARTNERS = 3, 4
-
-# The same for larger sets, built on the best sets of one effect fewer and, besides them, on the best whose sizes are
-# credible (chosen)
-LARGER_SET_BASES, LARGER_SET_PARTNERS = 2, 3
-
 MIN_LOG_LIKELIHOOD_GAIN = 1.0  # Difference in ln L from which a fit counts as better (chosen)
 
 Names = frozenset[str]
@@ -116,7 +109,8 @@ class EffectSets:
 
     def grow(self, size: int) -> list[LikelihoodRatio]:
         """Forward step: fit sets of this many effects, built on the best sets of one fewer."""
-        n_partners = PAIR_PARTNERS if size == 2 else LARGER_SET_PARTNERS
+        # 4, 3: partners tried with each base, of pairs and of larger sets (chosen)
+        n_partners = 4 if size == 2 else 3
         for base in self._bases(size - 1):
             names = frozenset(base.names)
             if names in self.extended:
@@ -143,8 +137,10 @@ class EffectSets:
         best_gain = max((hypothesis.delta_chi2 for hypothesis in of_size), default=0.0)
         strong = [hypothesis for hypothesis in of_size if hypothesis.delta_chi2 >= MIN_SHARE_OF_BEST_GAIN * best_gain]
         if size == 1:
-            return strong[:PAIR_BASES]
-        bases = strong[:LARGER_SET_BASES]
+            # 3: best single effects from which pairs are built (chosen)
+            return strong[:3]
+        # 2: best sets of one effect fewer from which larger ones are built, besides the best of credible sizes (chosen)
+        bases = strong[:2]
         credible = [hypothesis for hypothesis in strong if hypothesis.credible]
         return [*bases, *(best for best in credible[:1] if best not in bases)]
 
@@ -587,9 +583,6 @@ STALLED_CHI2_SHARE = 0.7
 PARTIAL_SHARE = 0.5
 
 
-NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)  # Kinds of hypotheses that are not physics
-
-
 @dataclass(frozen=True)
 class SelectionStep:
     """One round of the selection: a model, its tests, and the hypotheses compared. `answer_set` holds the hypotheses
@@ -758,7 +751,7 @@ def _single_effect_rounds(
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
     """Verdict that follows from an answer set: `artefact` where it holds no physics, else `missing` or `ambiguous`."""
-    if all(effect.kind in NONPHYSICAL_KINDS for hypothesis in adequate for effect in hypothesis.effects):
+    if all(effect.kind in ("measurement", BETWEEN_TRIALS) for hypothesis in adequate for effect in hypothesis.effects):
         return ARTEFACT
     return MISSING if len(adequate) == 1 else AMBIGUOUS
 

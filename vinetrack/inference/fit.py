@@ -380,8 +380,6 @@ def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) ->
 # ------------------------------------------------------------------------------
 # Predictions of a fitted model for trials outside the fit: only their release and origin are fitted.
 
-# Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined (chosen)
-LEAST_EIGENVALUE = 1e-4
 FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
 
 
@@ -504,7 +502,9 @@ def _fit_release_and_origin(
         scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
         scale[origin_fixed[active], ORIGIN] = scale[pressurised_in_recording[active], RELEASE] = 0.0
         scaled = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
-        inverse = np.linalg.pinv(scaled, rcond=LEAST_EIGENVALUE, hermitian=True) * scale[:, :, None] * scale[:, None, :]
+        # 1e-4: least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both
+        # determined (chosen)
+        inverse = np.linalg.pinv(scaled, rcond=1e-4, hermitian=True) * scale[:, :, None] * scale[:, None, :]
         step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])
         largest_step = 2 * frames[active]
         step[:, RELEASE] = np.clip(step[:, RELEASE], -largest_step, largest_step)

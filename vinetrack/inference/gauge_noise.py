@@ -54,16 +54,11 @@ FEWEST_SAMPLES = 9  # Samples below which a trace does not determine its noise (
 FEWEST_BLOCKS = 4
 
 
-# Standard deviations at which differences are clipped in the noise estimate, the part of the variance of normal noise
-# that remains (derived: 0.9707 + 9 · 0.0027), and iterations, of which the last changes it by 1e-4
-CLIP_SIGMAS, VARIANCE_KEPT, CLIP_ROUNDS = 3.0, 0.9950, 3
-
 NOISE_DEGREES = 2 / 4.62  # Degrees of freedom of the noise variance per sample (derived)
 
 
-# Lag at which noise is compared with that of neighbouring readings, standard deviations from which it counts as
-# correlated, and the largest correlation (chosen)
-COMPARED_LAG, CORRELATION_SIGMAS, LARGEST_CORRELATION = 4, 3.0, 0.97
+# Lag at which noise is compared with that of neighbouring readings, and its largest correlation (chosen)
+COMPARED_LAG, LARGEST_CORRELATION = 4, 0.97
 
 
 @dataclass(frozen=True)
@@ -288,8 +283,10 @@ def white_noise_sd(pressure_Pa: Floats) -> float:
     """
     third = np.diff(pressure_Pa, 3) / math.sqrt(20)
     sigma = rough_noise(pressure_Pa)
-    for _ in range(CLIP_ROUNDS):
-        sigma = math.sqrt(float(np.mean(np.minimum(third**2, (CLIP_SIGMAS * sigma) ** 2))) / VARIANCE_KEPT)
+    # 3: iterations, of which the last changes the noise by 1e-4; 0.9950: part of the variance of normal noise that
+    # remains once differences are clipped at 3.0 standard deviations (derived: 0.9707 + 9 · 0.0027)
+    for _ in range(3):
+        sigma = math.sqrt(float(np.mean(np.minimum(third**2, (3.0 * sigma) ** 2))) / 0.9950)
     return sigma
 
 
@@ -338,7 +335,8 @@ def noise_correlation(traces: Sequence[Floats]) -> float:
             counts.append(readings_Pa.size)
     if not ratios:
         return 0.0
-    threshold = CORRELATION_SIGMAS * math.sqrt(4 / NOISE_DEGREES * COMPARED_LAG / sum(counts))
+    # 3.0: standard deviations from which the noise of distant readings shows a correlation (chosen)
+    threshold = 3.0 * math.sqrt(4 / NOISE_DEGREES * COMPARED_LAG / sum(counts))
     ratio = float(np.median(ratios))
     if ratio < threshold:
         return 0.0
@@ -369,9 +367,6 @@ def whitened(values: Floats, rho: float) -> Floats:
 # where it explains the readings of each trace best. All trials share gauge and camera, so that the same offset is
 # likely: the distribution of offsets in the other trials is the prior of each (empirical Bayes: Robbins, Proc. 3rd
 # Berkeley Symp. 1, 157, 1956), since a short trace determines its own offset to a few samples at best.
-
-
-EM_ITERATIONS = 30  # Iterations of the expectation–maximisation of frequencies (measured)
 
 
 @dataclass(frozen=True)
@@ -413,7 +408,8 @@ def frequencies_in_other_trials(likelihoods: Floats) -> Floats:
     informative = likelihoods.any(axis=1)
     n_kinds = likelihoods.shape[1]
     shares: Floats = np.full(likelihoods.shape, 1 / n_kinds)
-    for _ in range(EM_ITERATIONS if np.count_nonzero(informative) > 1 else 0):
+    # 30: iterations of the expectation–maximisation of frequencies (measured)
+    for _ in range(30 if np.count_nonzero(informative) > 1 else 0):
         responsibilities = likelihoods * shares
         responsibilities = responsibilities / np.where(informative, responsibilities.sum(axis=1), 1.0)[:, None]
         counts_of_others = responsibilities.sum(axis=0) - responsibilities
@@ -497,17 +493,13 @@ def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise
 HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135, 200, 300, 450, 680, 1000)
 
 
-LARGEST_DEGREE, EXTRA_DEGREES, SLOW_SIGMAS = 6, 12, 4.0  # Largest degree of a polynomial in time (chosen)
+LARGEST_DEGREE = 6  # Largest degree of a polynomial in time (chosen)
 
 
 EXPONENTS = (1.0, 1.1, 1.2, 1.3, 1.4)  # Exponents γ with which a chamber may empty into the tube, (derived)
 
 # Degrees in time and in growth of the other kinds of curves (chosen)
 GROWTH_DEGREES = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
-
-
-# Last part of a trace whose line extrapolates it beyond its end (measured)
-END_PART, EXTRAPOLATED_PART = 0.1, 0.2
 
 
 @dataclass(frozen=True)
@@ -529,17 +521,19 @@ class DenoisedTrace:
         A constant extrapolation of a falling pressure would bias a fit of the clock offset.
         """
         last_s, span_s = self.time_s[-1], np.ptp(self.time_s)
-        late = self.time_s >= last_s - END_PART * span_s
+        # 0.1, 0.2: last part of a trace whose line extrapolates it, and by how much (measured)
+        late = self.time_s >= last_s - 0.1 * span_s
         if np.count_nonzero(late) < 2:
             return self
         curves = np.column_stack([self.pressure_Pa, self.errors_Pa])
         slope = np.polyfit(self.time_s[late] - last_s, curves[late], 1)[0]
-        end = curves[-1] + slope * EXTRAPOLATED_PART * span_s
+        beyond_s = 0.2 * span_s
+        end = curves[-1] + slope * beyond_s
         # A falling gauge pressure does not fall below zero.
         end[0] = max(end[0], min(curves[-1, 0], 0.0))
         return replace(
             self,
-            time_s=np.append(self.time_s, last_s + EXTRAPOLATED_PART * span_s),
+            time_s=np.append(self.time_s, last_s + beyond_s),
             pressure_Pa=np.append(self.pressure_Pa, end[0]),
             errors_Pa=np.vstack([self.errors_Pa, end[1:]]),
         )
@@ -592,7 +586,8 @@ class _Recorded:
         recorded = [replace(self, exponent=exponent) for exponent in exponents]
         y = whitened(np.column_stack([each._linearised(self.readings.values_Pa) for each in recorded]), self.noise.rho)
         size, degrees = len(y), self.noise.degrees
-        polynomials = _polynomials(size, min(LARGEST_DEGREE + EXTRA_DEGREES, size // 3))
+        # 12: further degrees that a residual may not show (chosen)
+        polynomials = _polynomials(size, min(LARGEST_DEGREE + 12, size // 3))
         time_only = [kind + 1 < polynomials.shape[1] for kind in range(LARGEST_DEGREE + 1)]
         with_growth = [self.clock is not None and sum(of) <= size // 3 - 2 for of in GROWTH_DEGREES]
         values = np.full((len(recorded), len(time_only) + len(with_growth)), math.inf)
@@ -777,7 +772,8 @@ def _polynomials(count: int, degree: int) -> Floats:
 
 def _is_noise(residual_Pa: Floats, noise: GaugeNoise, fitted: int, slow: Floats) -> bool:
     """Whether a curve with so many parameters leaves no slow or local part and no more than the noise."""
-    if np.any(np.abs(slow.T @ residual_Pa) > _quantile_Pa(SLOW_SIGMAS, noise)):
+    # 4.0: standard deviations from which a slow residual is more than noise (chosen)
+    if np.any(np.abs(slow.T @ residual_Pa) > _quantile_Pa(4.0, noise)):
         return False
     # A corner that is cut leaves residuals only in the samples around it.
     total = np.concatenate([[0.0], np.cumsum(residual_Pa)])

@@ -454,9 +454,6 @@ def _adapted_steps(response: Floats, previous: Floats) -> Floats:
 # Starting values of a fit: release and origin from the frames at rest, B and n from a coarse grid search.
 
 
-# Factors of the grid, relative to the B that would balance the drive at the observed speed (chosen)
-DAMPING_FACTORS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.1)
-
 POINTS_USED = 60  # Points of each trial that the grid search uses (chosen)
 
 
@@ -537,7 +534,8 @@ def _scan_damping(
             for k in np.unique(damping_index)
         }
         best: dict[int, tuple[float, float]] = {}
-        for factor in DAMPING_FACTORS:
+        # Factors of the grid, relative to the B that would balance the drive at the observed speed (chosen)
+        for factor in (0.2, 0.4, 0.6, 0.8, 0.95, 1.1):
             for k, B in guess.items():
                 free = layout.free[k]
                 values[k] = free.to_scaled(float(np.clip(factor * B, free.lower, free.upper)))

@@ -87,9 +87,6 @@ CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
 
 SLOW_NOISE = 0.99  # Noise correlation above which a fit has absorbed misfit as noise (chosen)
 
-# Between-trial standard deviations of pressure and ln B that are fixed while the noise correlation is (chosen)
-TRACK_CORRELATION_SD = (5e-4, 1e-3)
-
 
 def solve_from_scratch(
     predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, thorough: bool
@@ -145,8 +142,9 @@ def _solve_at_track_correlation(
     """
     if fixed_terms.noise is not None:
         return None
+    # 5e-4, 1e-3: between-trial standard deviations of pressure and ln B while the noise correlation is fixed (chosen)
     correlation_fixed = FixedTerms(
-        spread=fixed_terms.spread or TRACK_CORRELATION_SD, correlation=track_correlation(predictor.data)
+        spread=fixed_terms.spread or (5e-4, 1e-3), correlation=track_correlation(predictor.data)
     )
     state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
     try:
@@ -258,8 +256,7 @@ def start_at_fixed_noise(
 # all free at once; they are added to the trace, and the model is fitted again, until they converge. −2 ln L is
 # evaluated at the most likely a, with Σ a² for their prior.
 
-# Maximum number of rounds (measured)
-MOST_ROUNDS, CONVERGED_SIGMAS = 4, 0.1
+MOST_ROUNDS = 4  # Maximum number of rounds (measured)
 
 
 def with_fitted_trace_errors(
@@ -275,7 +272,8 @@ def with_fitted_trace_errors(
         if is_poor_fit(predictor, solution):
             break
         step = trace_error_step(predictor, solution)
-        if not np.max(np.abs(step), initial=0.0) > CONVERGED_SIGMAS:
+        # 0.1: standard deviations of a step of the errors at which they have converged (chosen)
+        if not np.max(np.abs(step), initial=0.0) > 0.1:
             break
         corrected = [_corrected(trial_data, more) for trial_data, more in zip(predictor.data, step, strict=True)]
         corrected_predictor = Predictor(predictor.layout, corrected, predictor.host)

@@ -203,15 +203,7 @@ def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
     return [np.ascontiguousarray(column[:, -1]) for column in columns]
 
 
-# Candidate releases of a trial recorded at rest, relative to the current one (chosen)
-NEARBY_RELEASES_FRAMES = np.concatenate([np.arange(-14.0, 15.0), [-0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6]])
-
-
 LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release jumps to another minimum (derived)
-
-
-# Least and largest change of origin and deviations
-STEP_LIMITS = np.array([-np.inf, -0.3, -0.3]), np.array([np.inf, 0.3, 0.3])
 
 
 class ReleaseSearch:
@@ -336,7 +328,8 @@ def _best_release(
     information = square[:, :-1, :-1] + np.diag(precision)
     shared_information, gradient = square[:, ORIGIN:-1, ORIGIN:-1], square[:, ORIGIN:-1, -1]
     slope = gradient - (precision * (effects - centre))[:, ORIGIN:]
-    step = np.clip(np.linalg.solve(information[:, ORIGIN:, ORIGIN:], slope[..., None])[..., 0], *STEP_LIMITS)
+    largest = np.array([np.inf, 0.3, 0.3])  # Largest change of origin and deviations (chosen)
+    step = np.clip(np.linalg.solve(information[:, ORIGIN:, ORIGIN:], slope[..., None])[..., 0], -largest, largest)
     effects[:, ORIGIN:] += step
     residual_squares = square[:, -1, -1] - np.sum(
         step * (2 * gradient - (shared_information @ step[..., None])[..., 0]), axis=1
@@ -351,7 +344,9 @@ def _best_release(
 def _candidate_releases(trial_data: FitTrial, release_s: float) -> Floats:
     """Candidate releases of a trial, s, shape (n,); the last is the current one."""
     if trial_data.shows_rest:
-        return np.append(release_s + trial_data.frame_s * NEARBY_RELEASES_FRAMES, release_s)
+        # Candidate releases of a trial recorded at rest, frames from the current one, which comes last (chosen)
+        frames = [*np.arange(-14.0, 15.0), -0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6, 0.0]
+        return release_s + trial_data.frame_s * np.array(frames)
     duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
     # 60: candidate releases of a trial recorded only in motion (chosen)
     return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, 60), release_s)
