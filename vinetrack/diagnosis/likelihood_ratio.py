@@ -70,10 +70,9 @@ class Difference:
 
 def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
     """p-value of a gain where trials do not differ. For fixed coefficients by the F test, LR = N ln(1 + q F / dof),
-    because χ² would be anticonservative for few trials. For random effects of given standard deviations exp(gain / 2) would
-    be a Bayes factor K, with P(K > 1/α) ≤ α by Markov's inequality, but for the parameters and the scatter of trials,
-    which both hypotheses fit: simulated with 8 to 24 trials in 2 to 6 groups, α of 0.1 to 0.01 were false alarms at most
-    0.07 times as often. Returns 0 to 1.
+    because χ² would be anticonservative for few trials. For random effects of given standard deviations exp(gain / 2)
+    would be a Bayes factor K, with P(K > 1/α) ≤ α by Markov's inequality, were it not for parameters and scatter, which
+    both hypotheses fit: in simulations of 8 to 24 trials in 2 to 6 groups, α was exceeded by no more than 0.07 α.
     """
     from scipy.stats import f as fisher
 

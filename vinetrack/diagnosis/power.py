@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from vinetrack.core.notebook import plot
 from vinetrack.core.records import Trial
 from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.experiment.schema import COLUMNS
+from vinetrack.inference.fit_result import JsonRecord, OrNaN, or_open
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,11 +31,8 @@ if TYPE_CHECKING:
 PROBABILITIES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 
 
-JSON_NAMES = {"least": "least_plausible", "largest": "largest_plausible"}  # Fields of a power under other names there
-
-
 @dataclass(frozen=True)
-class EffectPower:
+class EffectPower(JsonRecord):
     """Detectable sizes of one effect. `sizes` are values of the parameter, SI, at which the effect is detected with
     `PROBABILITIES`; infinite where no size is detectable.
     """
@@ -43,12 +42,12 @@ class EffectPower:
     parameter: str
     symbol: str
     unit: str
-    zero: float
-    least: float
-    largest: float
-    sizes: tuple[float, ...]
-    taken_for: Mapping[str, float] = field(default_factory=dict)
-    named_alone: float = math.nan
+    zero: OrNaN
+    least: Annotated[OrNaN, Field(alias="least_plausible")]
+    largest: Annotated[OrNaN, Field(alias="largest_plausible")]
+    sizes: tuple[Annotated[float, or_open(math.inf)], ...]
+    taken_for: Mapping[str, OrNaN] = field(default_factory=dict)
+    named_alone: OrNaN = math.nan
     other_values: tuple[float, ...] = ()
 
     def size_at(self, probability: float) -> float:
@@ -75,26 +74,12 @@ class EffectPower:
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `power.effects`."""
-        content = {JSON_NAMES.get(name, name): value for name, value in vars(self).items()}
-        return content | {
+        return super().to_json() | {
             "size_50": self.size_at(0.5),
             "size_90": self.size_at(0.9),
             "found_at_largest_plausible": self.probability_at(self.largest),
             "probabilities": PROBABILITIES,
         }
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> EffectPower:
-        """Read what `to_json` wrote."""
-        names = ("zero", "least", "largest", "named_alone")
-        values: dict[str, Any] = {name: or_nan(entry.get(JSON_NAMES.get(name, name))) for name in names}
-        values |= {key: str(entry.get(key) or "") for key in ("effect", "kind", "parameter", "symbol", "unit")}
-        return cls(
-            **values,
-            sizes=tuple(math.inf if size is None else float(size) for size in entry.get("sizes") or ()),
-            taken_for={str(name): or_nan(value) for name, value in (entry.get("taken_for") or {}).items()},
-            other_values=tuple(entry.get("other_values") or ()),
-        )
 
 
 @dataclass(frozen=True)

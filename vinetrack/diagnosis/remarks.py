@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, PlainSerializer
 
 
 def in_words(told: Any) -> str:
@@ -42,6 +44,9 @@ class Remark:
     def from_json(cls, content: Mapping[str, Any] | None) -> Remark:
         """Read what `to_json` wrote."""
         return cls(content["code"], {k: v for k, v in content.items() if k != "code"}) if content else cls()
+
+
+StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)]
 
 
 def remark(code: str, **facts: Any) -> Remark:

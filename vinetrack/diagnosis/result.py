@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from vinetrack.core.notebook import plot
 from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.power import Power
-from vinetrack.diagnosis.remarks import Remark, in_words, remark
-from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.diagnosis.remarks import Remark, StoredRemark, in_words, remark
+from vinetrack.inference.fit_result import Fit, JsonRecord, Number, OrNaN
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -114,26 +116,26 @@ CONTAINS, CONTAINS_AND_FITS_NO_BETTER = "contains", "contains_and_fits_no_better
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Candidate(JsonRecord):
     """One candidate effect: a row of the ranking. `delta_chi2` is the fall of −2 ln L when it is added (predicted by
     the linear model where only `screened`), and `sigma` its significance as a normal deviate, with one degree of
     freedom for each size.
     """
 
     effect: str
-    kind: str
-    status: str
-    delta_chi2: float = math.nan
-    sigma: float = math.nan
+    kind: str = ""
+    status: str = ""
+    delta_chi2: OrNaN = math.nan
+    sigma: OrNaN = math.nan
     numbers: tuple[Number, ...] = ()
     plausible: bool = True
     in_answer_set: bool = False
-    reason: Remark = field(default_factory=Remark)
-    largest: Mapping[str, float] = field(default_factory=dict)
+    reason: StoredRemark = field(default_factory=Remark)
+    largest: Mapping[str, OrNaN] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
-    posterior_weight: float = math.nan
-    confounded_by: tuple[Confounder, ...] = ()
-    log_bayes: float = math.nan
+    posterior_weight: OrNaN = math.nan
+    confounded_by: Annotated[tuple[Confounder, ...], Field(exclude=True)] = ()
+    log_bayes: OrNaN = math.nan
 
     def is_richer_form_of(self, name: str) -> bool:
         """Whether it was set aside because it contains another effect as a limit."""
@@ -141,44 +143,15 @@ class Candidate:
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
-        return {
-            "effect": self.effect,
-            "kind": self.kind,
-            "status": self.status,
-            "delta_chi2": self.delta_chi2,
-            "sigma": self.sigma,
-            "numbers": [number.to_json() for number in self.numbers],
-            "plausible": self.plausible,
-            "in_answer_set": self.in_answer_set,
-            "reason": str(self.reason),
-            "reason_code": self.reason.to_json(),
-            "largest": dict(self.largest),
-            "posterior_weight": self.posterior_weight,
-            "log_bayes": self.log_bayes,
-            "confounded_by": [confounder.to_json() for confounder in self.confounded_by],
-            "along": [number.to_json() for number in self.along],
-        }
+        confounders = [confounder.to_json() for confounder in self.confounded_by]
+        entry = super().to_json()
+        return {**entry, "reason": str(self.reason), "reason_code": entry["reason"], "confounded_by": confounders}
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
         """Read an entry of `ranking`; absent keys take their defaults."""
-        numbers = tuple(Number.from_json(number) for number in entry.get("numbers") or ())
-        return cls(
-            effect=str(entry["effect"]),
-            kind=str(entry.get("kind") or ""),
-            status=str(entry.get("status") or ""),
-            delta_chi2=or_nan(entry.get("delta_chi2")),
-            sigma=or_nan(entry.get("sigma")),
-            numbers=numbers,
-            plausible=bool(entry.get("plausible", True)),
-            in_answer_set=bool(entry.get("in_answer_set")),
-            reason=Remark.from_json(entry.get("reason_code")),
-            largest={str(name): or_nan(value) for name, value in (entry.get("largest") or {}).items()},
-            along=tuple(Number.from_json(number) for number in entry.get("along") or ()),
-            posterior_weight=or_nan(entry.get("posterior_weight")),
-            confounded_by=read_confounders(entry.get("confounded_by") or (), numbers),
-            log_bayes=or_nan(entry.get("log_bayes")),
-        )
+        read = super().from_json({**entry, "reason": entry.get("reason_code"), "confounded_by": ()})
+        return replace(read, confounded_by=read_confounders(entry.get("confounded_by") or (), read.numbers))
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, TypeAdapter
 
 from vinetrack.core.notebook import html_table, plot
 from vinetrack.core.records import Floats, Track, Trial
@@ -311,34 +312,55 @@ def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[FreePa
     return numbers, column
 
 
-NUMBER_KEYS = {
-    "parameter": "key", "vine": "vine", "symbol": "symbol", "unit": "unit", "value": "value", "sigma": "sigma",
-    "low_95": "low", "high_95": "high", "interval": "method", "bound": "bound", "lower_bound": "lower",
-    "upper_bound": "upper",
-}  # fmt: skip
-"""Keys of a number in the files, and the fields that they hold."""
+OrNaN = Annotated[float, BeforeValidator(or_nan)]  # A number of a JSON file, where null means that it is not known
+
+
+def or_open(end: float) -> BeforeValidator:
+    """A number of a JSON file, where null means this end of the numbers."""
+    return BeforeValidator(lambda value: end if value is None else value)
+
+
+class JsonRecord:
+    """A dataclass that a JSON file holds, each field under its name or its alias; absent keys take their defaults."""
+
+    def to_json(self) -> dict[str, Any]:
+        """As the file holds it."""
+        adapter = _adapter(type(self))  # type: ignore[arg-type]
+        entry: dict[str, Any] = adapter.dump_python(self, by_alias=True, warnings=False)
+        return entry
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Self:
+        """Read what `to_json` wrote; a number that is null is NaN."""
+        read: Self = _adapter(cls).validate_python(entry)  # type: ignore[arg-type]
+        return read
+
+
+@cache
+def _adapter(record: type) -> TypeAdapter[Any]:
+    return TypeAdapter(record)
 
 
 @dataclass(frozen=True)
-class Number:
+class Number(JsonRecord):
     """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval. `vine` is blank if the
     number applies to all. `method` tells how the interval was found: `linear`, `profile` near a bound, `none` if the
     data do not determine it.
     """
 
-    key: str
+    key: Annotated[str, Field(alias="parameter")]
     vine: str
     symbol: str
     unit: str
-    value: float
-    sigma: float
-    low: float
-    high: float
-    dof: float
-    method: str
-    bound: float = math.nan
-    lower: float = -math.inf
-    upper: float = math.inf
+    value: OrNaN
+    sigma: OrNaN
+    low: Annotated[OrNaN, Field(alias="low_95")]
+    high: Annotated[OrNaN, Field(alias="high_95")]
+    dof: Annotated[float, Field(exclude=True)] = math.nan
+    method: Annotated[str, Field(alias="interval")] = "linear"
+    bound: OrNaN = math.nan
+    lower: Annotated[float, or_open(-math.inf), Field(alias="lower_bound")] = -math.inf
+    upper: Annotated[float, or_open(math.inf), Field(alias="upper_bound")] = math.inf
 
     @property
     def name(self) -> str:
@@ -349,32 +371,6 @@ class Number:
     def title(self) -> str:
         """Symbol, with the vine in brackets if it belongs to one."""
         return f"{self.symbol} ({self.vine})" if self.vine else self.symbol
-
-    def to_json(self) -> dict[str, Any]:
-        """As `fit.json` and `diagnosis.json` hold it, SI."""
-        return {key: getattr(self, name) for key, name in NUMBER_KEYS.items()}
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Number:
-        """Read what `to_json` wrote; unknown numbers are NaN, degrees of freedom too."""
-        value, sigma, low, high, bound = (
-            or_nan(entry.get(key)) for key in ("value", "sigma", "low_95", "high_95", "bound")
-        )
-        return cls(
-            key=str(entry["parameter"]),
-            vine=str(entry.get("vine") or ""),
-            symbol=str(entry["symbol"]),
-            unit=str(entry["unit"]),
-            value=value,
-            sigma=sigma,
-            low=low,
-            high=high,
-            dof=math.nan,
-            method=str(entry.get("interval") or ("linear" if math.isfinite(low) else "none")),
-            bound=bound,
-            lower=-math.inf if entry.get("lower_bound") is None else float(entry["lower_bound"]),
-            upper=math.inf if entry.get("upper_bound") is None else float(entry["upper_bound"]),
-        )
 
     @property
     def ends_at(self) -> str:

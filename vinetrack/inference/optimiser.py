@@ -318,9 +318,10 @@ def solve(
             predictor, problem, cross_products, state, step, effect_step, damping, penalised_squares
         )
         if accepted is None:
-            # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth.
-            converged = variances_moved < CONVERGED_VARIANCES
-            if converged:
+            # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
+            # step should gain much, it is no minimum, but nothing more can be done.
+            if variances_moved < CONVERGED_VARIANCES:
+                converged = predicted_decrease < far_from_optimum
                 break
             continue
         try:

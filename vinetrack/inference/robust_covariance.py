@@ -394,7 +394,7 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
         names = [f"{trial.vine}, {trial.specimen}" if column == "specimen" else trial.day for trial in trials]
         if all(getattr(trial, column) for trial in trials) and len(set(names)) >= FEWEST_CLUSTERS:
             return names
-    return [trial.name for trial in trials]
+    return [str(i) for i in range(len(trials))]  # Not their names: a planned trial may be there several times
 
 
 def group_scatter(single: Floats, groups: Sequence[str], fitted: int) -> Floats:
