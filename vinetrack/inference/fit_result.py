@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -345,7 +345,7 @@ def _adapter(record: type) -> TypeAdapter[Any]:
 class Number(JsonRecord):
     """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval. `vine` is blank if the
     number applies to all. `method` tells how the interval was found: `linear`, `profile` near a bound, `none` if the
-    data do not determine it.
+    data do not determine it. `shared` is the part of the standard error from what all trials share, by its source.
     """
 
     key: Annotated[str, Field(alias="parameter")]
@@ -361,6 +361,7 @@ class Number(JsonRecord):
     bound: OrNaN = math.nan
     lower: Annotated[float, or_open(-math.inf), Field(alias="lower_bound")] = -math.inf
     upper: Annotated[float, or_open(math.inf), Field(alias="upper_bound")] = math.inf
+    shared: Annotated[Mapping[str, OrNaN], Field(alias="sigma_shared")] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -371,6 +372,11 @@ class Number(JsonRecord):
     def title(self) -> str:
         """Symbol, with the vine in brackets if it belongs to one."""
         return f"{self.symbol} ({self.vine})" if self.vine else self.symbol
+
+    @property
+    def shared_sigma(self) -> float:
+        """The part of the standard error that all trials share, of all sources together."""
+        return math.hypot(*self.shared.values())
 
     @property
     def ends_at(self) -> str:
@@ -447,7 +453,7 @@ class NumberTable:
         return f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
 
     def _repr_html_(self) -> str:
-        head = ("", "value", "standard error", "95 % interval", "unit")
+        head = ("", "value", "standard error", "of it shared", "95 % interval", "unit")
         return html_table(head, [number_row(number) for number in self.numbers], self.heading, self.messages)
 
     def __getitem__(self, name: str) -> Number:
@@ -551,7 +557,7 @@ class Fit(NumberTable):
 
 def numbers_text(fit: Any) -> list[str]:
     """The numbers of a fit, its noise and its messages as lines of text."""
-    lines = aligned([("", "value", "error", "95 % interval", "unit"), *map(number_row, fit.numbers)])
+    lines = aligned([("", "value", "error", "of it shared", "95 % interval", "unit"), *map(number_row, fit.numbers)])
     lines += [_spread_line(name, spread) for name, spread in fit.spreads.items()]
     lines.append(
         f"noise {fit.noise_m * 1e3:.3g} mm, correlation {fit.noise_correlation:.2f};"
@@ -564,21 +570,20 @@ def numbers_text(fit: Any) -> list[str]:
 
 
 def number_row(number: Number) -> tuple[str, ...]:
-    """A number as texts in its display unit: name, value, `± standard error`, 95 % interval, unit."""
+    """A number as texts in its display unit: name, value, `± standard error`, its shared part, 95 % interval, unit."""
     unit, factor = display_unit(number.unit)
     if math.isfinite(number.bound):
-        return number.title, f"{number.bound * factor:.4g}", "at its bound", "", unit
+        return number.title, f"{number.bound * factor:.4g}", "at its bound", "", "", unit
     if not (math.isfinite(number.sigma) and number.sigma > 0):
-        return number.title, f"{number.value * factor:.4g}", "open", "", unit
+        return number.title, f"{number.value * factor:.4g}", "open", "", "", unit
     digits = decimals(number.sigma * factor)
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
-    return number.title, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}", unit
+    error, shared = (f"± {sigma * factor:.{digits}f}" for sigma in (number.sigma, number.shared_sigma))
+    return number.title, value, error, shared if number.shared else "", f"{low} to {high}", unit
 
 
 def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Rows of (name, value, error, interval, unit) as aligned lines of text; values to the right, others to
-    the left.
-    """
+    """Rows of texts as aligned lines; the second column, values, to the right, others to the left."""
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     lines = []
     for row in rows:

@@ -13,8 +13,8 @@ priors. Its likelihood compares hypotheses without crediting any of them with wh
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,18 +75,26 @@ LOG_STEP = 0.1  # Step of derivatives in the logarithm of a positive number (cho
 class Precision:
     """Covariance of the free parameters, scaled, shape (n_free, n_free), infinite for undetermined ones. `degrees`,
     shape (n_free,), are the degrees of freedom of the errors. `insensitive` marks parameters without influence on the
-    trajectories, `collinear` those of which only a combination with others is determined.
+    trajectories, `collinear` those of which only a combination with others is determined. `shared` is the part of the
+    variance that all trials share, by its source.
     """
 
     covariance: Floats
     degrees: Floats
     insensitive: np.ndarray
     collinear: np.ndarray
+    shared: Mapping[str, Floats] = field(default_factory=dict)
 
     def first(self, count: int) -> Precision:
         """The same of the first `count` parameters, the others integrated out."""
-        covariance = self.covariance[:count, :count]
-        return Precision(covariance, self.degrees[:count], self.insensitive[:count], self.collinear[:count])
+        shared = {name: variance[:count] for name, variance in self.shared.items()}
+        return Precision(
+            self.covariance[:count, :count],
+            self.degrees[:count],
+            self.insensitive[:count],
+            self.collinear[:count],
+            shared,
+        )
 
 
 def precision(solution: Solution) -> Precision:

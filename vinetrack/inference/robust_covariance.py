@@ -41,6 +41,8 @@ PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to 
 FILM_ERROR = 0.02  # Least standard deviation of the mass of a vine's film, relative (chosen)
 
 
+LENS = "lens"  # Source of the smooth errors of position
+
 # Largest number of half waves along the growth in the slow error of a tracker that all trials share (chosen)
 HALF_WAVES = 6
 
@@ -49,13 +51,14 @@ HALF_WAVES = 6
 class Systematics:
     """Displacement of the positions of each trial by one standard deviation of each systematic error. An error of one
     payload or of one set pressure affects its own trials alone, and there are as many as conditions: a trial has
-    columns only for those that affect it.
+    columns only for those that affect it. `sources`, shape (count,), names where each comes from.
     """
 
     columns: list[Floats]
     places: NDArray[np.int_]
     count: int
     estimated_m: list[Floats] | None = None
+    sources: Sequence[str] = ()
 
     @classmethod
     def none(cls, points: Sequence[int]) -> Systematics:
@@ -90,21 +93,23 @@ def systematics_of(
     """All systematic errors of a fit."""
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     recorded = recorded_pressures(predictor, solution)
-    parts = [
-        _payload_errors(predictor, solution),
-        _set_pressure_errors(predictor, solution),
-        recorded,
-        *([film_errors(predictor, solution, trials)] if film else []),
-        _of_every_trial(_tracker_errors(predictor, grown)),
-        *([_of_every_trial(position_shapes(predictor, grown))] if positions else []),
-    ]
+    named = {
+        "payloads": _payload_errors(predictor, solution),
+        "set pressures": _set_pressure_errors(predictor, solution),
+        "gauge": recorded,
+        **({"film": film_errors(predictor, solution, trials)} if film else {}),
+        "tracking": _of_every_trial(_tracker_errors(predictor, grown)),
+        **({LENS: _of_every_trial(position_shapes(predictor, grown))} if positions else {}),
+    }
+    parts = list(named.values())
     *begins, total = np.cumsum([0, *(part.count for part in parts)]).tolist()
     places = [
         np.where(part.places < part.count, begin + part.places, total)
         for part, begin in zip(parts, begins, strict=True)
     ]
     columns = [np.hstack(of_trial) for of_trial in zip(*(part.columns for part in parts), strict=True)]
-    return Systematics(columns, np.hstack(places), total, recorded.estimated_m)
+    sources = [name for name, part in named.items() for _ in range(part.count)]
+    return Systematics(columns, np.hstack(places), total, recorded.estimated_m, sources)
 
 
 def _of_every_trial(columns: list[Floats]) -> Systematics:
@@ -303,7 +308,15 @@ def widened_covariance(
     )
     unknown = np.flatnonzero(~np.isfinite(np.diag(model_precision.covariance)))
     covariance[unknown, unknown] = np.inf
-    return replace(model_precision, covariance=covariance, degrees=degrees)
+    sources = np.array(systematics.sources)
+    shared = {name: np.sum(moved[:, sources == name] ** 2, axis=1) for name in dict.fromkeys(systematics.sources)}
+    if extended is not None:
+        # What the parameters would be known better by if the errors of the lens, the last unknowns, were known.
+        first = solution.problem.prior_mean.size
+        across = plain[:first, first:] @ np.linalg.pinv(plain[first:, first:], hermitian=True)
+        lens = np.sum(across * plain[:first, first:], axis=1) * ratio[:first] ** 2
+        shared[LENS] = np.append(lens, np.zeros(len(plain) - first))
+    return replace(model_precision, covariance=covariance, degrees=degrees, shared=shared)
 
 
 def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:

@@ -66,7 +66,7 @@ from vinetrack.inference.position_errors import (
     smooth_errors,
     student,
 )
-from vinetrack.inference.robust_covariance import recorded_pressures, too_few_clusters, widened_covariance
+from vinetrack.inference.robust_covariance import LENS, recorded_pressures, too_few_clusters, widened_covariance
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -416,6 +416,7 @@ def fit_messages(
             f"the residuals are {math.sqrt(chi2):.3g} times the noise of the tracks{although}:"
             " an effect is missing, or the tracks have slow errors larger than their noise"
         )
+    messages += _shared_messages(numbers)
     sd = np.sqrt(np.diag(between))
     # 1.0: standard deviation between trials, in errors of the shared number, from which the fit says that trials
     # disagree
@@ -428,6 +429,23 @@ def fit_messages(
         where = ", ".join(disagreements)
         messages.append(f"trials disagree by more than their noise, in {where}: they get nearly equal weights")
     return (*messages, *_notes_on_data(predictor.data))
+
+
+def _shared_messages(numbers: Sequence[Number]) -> list[str]:
+    """Which numbers a measurement would improve more than further trials."""
+    remedies = {
+        "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
+        "tracking": "film sharper edges", LENS: "calibrate the lens with a board",
+    }  # fmt: skip
+    mostly = [number for number in numbers if number.shared and number.shared_sigma**2 > 0.5 * number.sigma**2]
+    by_remedy: dict[str, list[str]] = {}
+    for number in mostly:
+        largest = max(number.shared, key=lambda source: number.shared[source])
+        by_remedy.setdefault(remedies[largest], []).append(number.title)
+    return [
+        f"most of the error of {', '.join(titles)} comes from what all trials share: {remedy}"
+        for remedy, titles in by_remedy.items()
+    ]
 
 
 def _notes_on_data(data: Sequence[FitTrial]) -> list[str]:
@@ -582,11 +600,13 @@ def _numbers(
             method = "profile"
         low, high = max(low, problem.lower[k]), min(high, problem.upper[k])
         at = [b for b in (problem.lower[k], problem.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
+        slope = number.derivative(number.from_scaled(float(theta[k])))
+        shared = {name: math.sqrt(v[k]) * slope for name, v in precision_of_fit.shared.items() if v[k] > 0}
         numbers.append(
             Number(
                 **{name: getattr(number, name) for name in ("key", "vine", "symbol", "unit")},
                 value=number.from_scaled(float(theta[k])),
-                sigma=float(sigma[k]) * number.derivative(number.from_scaled(float(theta[k]))),
+                sigma=float(sigma[k]) * slope,
                 low=_bound_in_SI_units(number, low),
                 high=_bound_in_SI_units(number, high),
                 dof=float(dof[k]),
@@ -594,6 +614,7 @@ def _numbers(
                 bound=_bound_in_SI_units(number, at[0]) if at else math.nan,
                 lower=_bound_in_SI_units(number, problem.lower[k]),
                 upper=_bound_in_SI_units(number, problem.upper[k]),
+                shared=shared if math.isfinite(sigma[k]) else {},
             )
         )
     return tuple(numbers)
