@@ -7,7 +7,6 @@ that end near the best are fitted to all trials.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     MAX_INFLATION,
     LikelihoodRatio,
     NestedForm,
-    best_of,
     likelihood_ratio,
     simpler_forms,
 )
@@ -40,7 +38,6 @@ from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import EXPONENT, YIELD_PRESSURE, Fit, ParameterMap, make_layout
 from vinetrack.inference.marginal_likelihood import deviance, marginal
 from vinetrack.inference.optimiser import (
-    POOR_FIT,
     STAGNATION_DECREASE,
     FixedTerms,
     first_state,
@@ -231,9 +228,7 @@ def best_subset_fit(
     return best
 
 
-def full_fit(
-    before: Fit, start: SubsetFit, best: float = -math.inf, *, reset: bool = False, rescue: bool = True
-) -> Fit | None:
+def full_fit(before: Fit, start: SubsetFit, best: float = -math.inf, *, rescue: bool = True) -> Fit | None:
     """Fit a hypothesis to all trials from where its subset fit ended; None where the fit fails."""
     model = before.model.with_effects(start.effects)
     goal = (
@@ -248,7 +243,6 @@ def full_fit(
             yields_Pa=start.yields_Pa,
             most_iterations=14,
             thorough=False,
-            afresh=reset,
             led=rescue,
             goal=goal,
         )
@@ -264,42 +258,15 @@ def full_fit(
 
 
 def restart_exponents(fit: Fit) -> Fit:
-    """Refit a model from several exponents of the damping law; return the better of this and the given fit."""
-    starts = exponent_starts(fit)
-    if len(starts) == 1:
+    """Refit a model from several exponents n of the damping law; return the better of this and the given fit."""
+    if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
         return fit
     fitter = SubsetFitter(fit)
-    # 0.02: fall of −2 ln L per point of a subset fit from which its start is worth a full fit (chosen)
-    return _restart(fitter, starts, fitter.null_deviance(), 0.02 * fitter.n_points)
-
-
-def exponent_starts(fit: Fit) -> list[Start]:
-    """Starts from several exponents n of the damping law; the fit's own values alone where n is not free."""
-    if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
-        return [((), {})]
-    # (0.2, 0.4, 0.7): exponents from which a model is started (chosen)
-    return [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
-
-
-def restart_without(fit: Fit, larger: Fit) -> Fit:
-    """Refit a model from the values of a larger model's fit; return the better of this and the given fit. The refit is
-    made where a subset fit from there recovers half of the larger model's advantage.
-    """
-    fitter, names = SubsetFitter(fit), set(fit.model.parameter_names)
-    added = [effect for effect in larger.model if effect.name not in fit.model]
     null_deviance = fitter.null_deviance()
-    with_effects = fitter.fit_hypothesis(added, larger.model.values, iterations=1)
-    # 1.0: least fall of −2 ln L of a subset fit from which its start is worth a full fit (chosen)
-    required_fall = math.inf if with_effects is None else max(1.0, 0.5 * (null_deviance - with_effects.deviance))
-    start = {key: value for key, value in larger.model.values.items() if key in names}
-    return _restart(fitter, [((), start)], null_deviance, required_fall)
-
-
-def _restart(fitter: SubsetFitter, starts: Sequence[Start], null_deviance: float, required_fall: float) -> Fit:
-    """Refit a model from other starts if the deviance of its subset fit falls enough; return the better fit."""
-    fit = fitter.fit
-    subset_fit = best_subset_fit(fitter, starts, null_deviance)
-    if subset_fit is None or subset_fit.deviance > null_deviance - required_fall:
+    # (0.2, 0.4, 0.7): exponents from which a model is started (chosen)
+    subset_fit = best_subset_fit(fitter, [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)], null_deviance)
+    # 0.02: fall of −2 ln L per point of a subset fit from which its start is worth a full fit (chosen)
+    if subset_fit is None or subset_fit.deviance > null_deviance - 0.02 * fitter.n_points:
         return fit
     refitted = full_fit(fit, subset_fit, fit.log_likelihood)
     return refitted if refitted is not None and refitted.log_likelihood > fit.log_likelihood else fit
@@ -378,8 +345,6 @@ def with_curves(fit: Fit) -> Fit:
 Report = Callable[[str], None]  # Called with a few words on what is being done
 
 
-MIN_SHARE_OF_SUBSET_GAIN = 0.1  # Share of the subset fit's gain that the fit to all trials must reach (chosen)
-
 FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
 
 ALIKE_COSINE = 0.95  # Cosine from which two effects count as alike (chosen)
@@ -387,7 +352,7 @@ ALIKE_COSINE = 0.95  # Cosine from which two effects count as alike (chosen)
 MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
 
 # −2 ln L by which a subset fit may end behind the best and still be fitted to all trials (chosen)
-SUBSET_REACH, ALIKE_REACH_FACTOR = 40.0, 5.0
+SUBSET_REACH = 40.0
 
 MAX_FULL_FITS = 7  # Candidates fitted to all trials after their subset fits, at most (chosen)
 
@@ -397,8 +362,7 @@ STARTS_PER_EFFECT = 3  # Shapes of an effect from which it is fitted (chosen)
 @dataclass
 class CandidateFits:
     """Fits of single effects added to one model. Subset fits and full fits are made once each. `subset_fits` and
-    `fitted` (full fits) are by name; `failed` are effects whose fits failed, `same_minimum` those whose other starts
-    ended in the same minimum.
+    `fitted` (full fits) are by name; `failed` are effects whose fits failed.
     """
 
     tests: MisfitTests
@@ -406,8 +370,6 @@ class CandidateFits:
     subset_fits: dict[str, SubsetFit] = field(default_factory=dict)
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     failed: set[str] = field(default_factory=set)
-    same_minimum: set[str] = field(default_factory=set)
-    started: dict[tuple[tuple[str, ...], str, bool], bool] = field(default_factory=dict)
     nested_checked: list[Fit] = field(default_factory=list)
     nested_labels: set[str] = field(default_factory=set)
     nested_tried: set[NestedForm] = field(default_factory=set)
@@ -467,17 +429,11 @@ class CandidateFits:
         gain = max(self.null_deviance - best.deviance, 0.0)
         # 0.1: the same as a share of the gain of the best subset fit (chosen)
         reach = max(SUBSET_REACH, 0.1 * gain)
-        alike = [fit for fit in ranked if self.tests.cosine(fit.names[0], best.names[0]) > ALIKE_COSINE]
-        within_reach = [
-            fit
-            for fit in ranked
-            if fit.deviance - best.deviance < (ALIKE_REACH_FACTOR * reach if fit in alike else reach)
-        ]
+        within_reach = [fit for fit in ranked if fit.deviance - best.deviance < reach]
         chosen = [fit for fit in within_reach if not fit.far_beyond_plausible] or within_reach
         for subset_fit in chosen if all_of_them else chosen[: self.max_full_fits]:
             self._fit(subset_fit)
         self._fit_simpler_forms()
-        self._refit_rivals_from_best()
         return list(self.fitted.values())
 
     def fit_to_all_trials(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
@@ -492,28 +448,6 @@ class CandidateFits:
                 self._fit_from_prediction(name)
         self._fit_simpler_forms()
         return list(self.fitted.values())
-
-    def _refit_rivals_from_best(self) -> None:
-        """Refit hypotheses just outside the answer set from where the best ended: its releases may suit them too. Where
-        trials begin slowly, a minute difference between starts may decide which minimum a fit settles in.
-        """
-        credible = self.credible_fits
-        if not credible or is_poor_fit((best := best_of(credible)).fit.predictor, best.fit.solution):
-            return
-        rivals = [
-            rival
-            for rival in credible
-            if ANSWER_SET_DELTA_CHI2 < rival.deviance_excess(best) < SUBSET_REACH * ALIKE_REACH_FACTOR
-        ]
-        for rival in sorted(rivals, key=lambda rival: rival.deviance_excess(best))[:STARTS_PER_EFFECT]:
-            model = self.tests.fit.model.with_effects(rival.effects)
-            values = {
-                key: rival.fit.model.values[key] for key in model.parameter_names if key.split(".")[0] in rival.names
-            }
-            with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
-                fit = refit(best.fit, model, start=values, thorough=False)
-                if fit.log_likelihood > rival.fit.log_likelihood:
-                    self.fitted[rival.label] = likelihood_ratio(self.tests.fit, rival.effects, fit)
 
     def _fit_simpler_forms(self) -> None:
         """Fit the simpler forms of effects that contain one, from where the larger form ended. A larger form that is
@@ -612,19 +546,8 @@ class CandidateFits:
         small_gain = hypothesis.delta_chi2 < 0.5 * best
         return small_gain and is_poor_fit(hypothesis.fit.predictor, hypothesis.fit.solution)
 
-    def _negligible_sizes(self, effects: Sequence[Effect]) -> dict[str, Value]:
-        """Parameter values at which the effects hardly act."""
-        values: dict[str, Value] = {}
-        for effect in effects:
-            indices = self.tests.ranked_shapes(effect.name)
-            if indices:
-                shape = self.tests.sensitivities.shapes[indices[0]]
-                predicted = float(self.tests.predicted_gains[1][indices[0]])
-                values |= start_values(shape, math.copysign(abs(shape.step), predicted))
-        return values
-
     def _fit(self, start: SubsetFit) -> None:
-        """Fit a hypothesis to all trials from a start; repeated from others if it gains less than it should."""
+        """Fit a hypothesis to all trials from a start, unless it is known from a better one."""
         name = "+".join(start.names)
         from_subset = math.isfinite(start.deviance)
         if name in self.fitted and from_subset:
@@ -632,65 +555,10 @@ class CandidateFits:
         self.report(f"fitting {name}")
         # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
         best = max((known.fit.log_likelihood for known in self.credible_fits), default=-math.inf)
-        rescue = from_subset or not self.has_adequate_fit
-        if not self._is_new_start(start, rescue=rescue):
-            return
-        hypothesis = self._fit_from(start, best, rescue=rescue)
-        expected = max(self.null_deviance - start.deviance, 0.0) if from_subset else 0.0
-        if hypothesis is not None:
-            required = MIN_SHARE_OF_SUBSET_GAIN * expected or -_same_minimum_tolerance(hypothesis.fit)
-            if hypothesis.delta_chi2 < required:
-                hypothesis = self._restarted(start, hypothesis, best, rescue=rescue)
+        fit = full_fit(self.tests.fit, start, best, rescue=from_subset or not self.has_adequate_fit)
+        hypothesis = None if fit is None else likelihood_ratio(self.tests.fit, start.effects, fit)
         if hypothesis is None or hypothesis.delta_chi2 < FAILED_FIT_DELTA_CHI2:
             self.failed.add(name)
         elif name not in self.fitted or hypothesis.delta_chi2 > self.fitted[name].delta_chi2:
             self.fitted[name] = hypothesis
             drop_curves(self.fitted)
-
-    def _restarted(
-        self, start: SubsetFit, hypothesis: LikelihoodRatio, best: float, *, rescue: bool
-    ) -> LikelihoodRatio:
-        """Return the best fit of a hypothesis over this and other starts, in case the first start misled it. The first
-        restart is from sizes at which it hardly acts, or from the same values with the state reset where it began
-        there. If that ends in the same minimum, the start is not to blame, and no other start is tried.
-        """
-        name = "+".join(start.names)
-        if name in self.same_minimum:
-            return hypothesis
-        negligible = SubsetFit(start.effects, math.nan, self._negligible_sizes(start.effects))
-        starts = [(negligible, False), (start, True)] if negligible.values != start.values else [(start, True)]
-        fits = [hypothesis]
-        for restart, reset in starts:
-            if not self._is_new_start(restart, reset=reset, rescue=rescue):
-                if restart is start:
-                    self.same_minimum.add(name)
-                continue
-            other = self._fit_from(restart, best, reset=reset, rescue=rescue)
-            if other is not None:
-                fits.append(other)
-                tolerance = _same_minimum_tolerance(other.fit, hypothesis.fit)
-                if abs(other.delta_chi2 - hypothesis.delta_chi2) < tolerance:
-                    self.same_minimum.add(name)
-                    break
-        return max(fits, key=lambda fitted: fitted.delta_chi2)
-
-    def _is_new_start(self, start: SubsetFit, *, rescue: bool, reset: bool = False) -> bool:
-        """Whether no full fit began there yet; where the model is far off, `refit` always resets the state."""
-        key = start.names, repr(sorted(start.values.items())), reset or self.tests.fit.chi2_per_dof > POOR_FIT
-        if key in self.started and (self.started[key] or not rescue):
-            return False
-        self.started[key] = rescue
-        return True
-
-    def _fit_from(self, start: SubsetFit, best: float, *, rescue: bool, reset: bool = False) -> LikelihoodRatio | None:
-        fit = full_fit(self.tests.fit, start, best, reset=reset, rescue=rescue)
-        return None if fit is None else likelihood_ratio(self.tests.fit, start.effects, fit)
-
-
-def _same_minimum_tolerance(*fits: Fit) -> float:
-    """Difference in −2 ln L below which two fits of one hypothesis count as the same minimum."""
-    if not all(is_poor_fit(fit.predictor, fit.solution) for fit in fits):
-        return -FAILED_FIT_DELTA_CHI2
-    n_points = sum(trial.time_s.size for trial in fits[0].predictor.data)
-    # 0.01: δχ² per point below which two fits that are far off count as the same minimum (derived)
-    return max(-FAILED_FIT_DELTA_CHI2, 0.01 * n_points)

@@ -26,7 +26,6 @@ from vinetrack.diagnosis.candidate_fits import (
     best_subset_fit,
     full_fit,
     restart_exponents,
-    restart_without,
     start_values,
 )
 from vinetrack.diagnosis.force_inversion import uniform_splines
@@ -44,7 +43,6 @@ from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, learn_missing_force, missing_force
 from vinetrack.diagnosis.remarks import Remark, joined, remark
 from vinetrack.diagnosis.score_test import shapes_of
-from vinetrack.diagnosis.selection import MAX_RESTARTS, MIN_LOG_LIKELIHOOD_GAIN
 from vinetrack.dynamics.model import Model, check_needs, make_model
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
 from vinetrack.inference.fit import refit
@@ -94,13 +92,8 @@ def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tup
     """
     if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
         before = restart_exponents(before)
-    for _ in range(1 + MAX_RESTARTS):
-        report(f"fitting it with {effect.name}")
-        after = _fit_with(before, effect)
-        refitted = restart_without(before, after)
-        if refitted.log_likelihood <= before.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
-            break
-        before = refitted
+    report(f"fitting it with {effect.name}")
+    after = _fit_with(before, effect)
     return before, after
 
 

@@ -8,7 +8,6 @@ is added: first single effects are tried, then sets of two to five. If no set pa
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,13 +23,8 @@ from vinetrack.diagnosis.candidate_fits import (
     MIN_SHARE_OF_BEST_GAIN,
     CandidateFits,
     Report,
-    SubsetFitter,
-    best_subset_fit,
     drop_curves,
-    exponent_starts,
-    full_fit,
     restart_exponents,
-    restart_without,
     with_curves,
 )
 from vinetrack.diagnosis.drift import drift
@@ -537,39 +531,20 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
 
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
-    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails. Trial effects may have
-    absorbed the misfit until no tail pushes. Where trials scatter much, the rule is therefore also tried from other
-    exponents, without the fitted deviations, on one trial of every condition first.
-    """
-    taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
-    scattered = taut and has_excess_scatter(fit)
-    if not scattered and not pushes(fit):
+    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails."""
+    if not pushes(fit):
         return None
     data = [
         replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
-    slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
-    subset_fit = None
-    if scattered:
-        fitter = SubsetFitter(slack)
-        subset_fit = best_subset_fit(fitter, exponent_starts(slack), math.inf)
-        # 1.0: rise of −2 ln L per point, on one trial of every condition, from which the rule is refuted
-        # without a full fit where trials scatter much (derived)
-        allowed_rise = 1.0 * fitter.n_points
-        if subset_fit is not None and subset_fit.deviance > SubsetFitter(fit).null_deviance() + allowed_rise:
-            return None
-    fits = []
-    with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
-        fits.append(refit(slack, thorough=False))
-    if subset_fit is not None:
-        fits += [other for other in (full_fit(slack, subset_fit, reset=True),) if other is not None]
-    if not fits:
+    try:
+        after = refit(replace(fit, predictor=Predictor(fit.predictor.layout, data)), thorough=False)
+    except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
-    after = max(fits, key=lambda known: known.log_likelihood)
     return likelihood_ratio(fit, (TAIL_SLACK,), after)
 
 
-MAX_RESTARTS = 2  # Times that the selection is repeated from a better minimum of the model (chosen)
+MAX_BACKWARD_STEPS = 2  # Times that a search over sets goes on from a smaller set (chosen)
 
 # Standard deviations by which a score must exceed its threshold to count although no refit confirms it
 CLEAR_SCORE_EXCESS = 1.0
@@ -603,11 +578,11 @@ class SelectionStep:
     unstated_differences: tuple[LikelihoodRatio, ...] = ()
 
 
-def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, restarts: int = 0) -> list[SelectionStep]:
+def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[SelectionStep]:
     """Select the effects that a model lacks. If the model's fit is only a local optimum, any added effect seems to
     help.
     """
-    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and not restarts:
+    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
         report("fitting the model from other starts")
         fit = restart_exponents(fit)
     report("testing the model")
@@ -636,10 +611,6 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, resta
     only_suspected = not tests.rejects_model and not stated_difference
     if only_suspected and (not hypotheses or best_of(hypotheses).sigma < SEARCH_SIGMAS):
         return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
-    if hypotheses and restarts < MAX_RESTARTS and best_of(hypotheses) not in between:
-        refitted = restart_without(fit, best_of(hypotheses).fit)
-        if refitted.log_likelihood > fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
-            return select_effects(refitted, effects, report, restarts=restarts + 1)
     rounds = None if _may_be_improved(hypotheses) else _single_effect_rounds(tests, search, hypotheses)
     if rounds is not None:
         return rounds
@@ -781,7 +752,7 @@ def _effect_set_rounds(
         if stalled:
             break
         # An effect added early may have stood in for two added later: go on from a smaller set if that is now better.
-        step_back = size > 2 and backward_steps < MAX_RESTARTS and sets.prune(of_this_size[0])
+        step_back = size > 2 and backward_steps < MAX_BACKWARD_STEPS and sets.prune(of_this_size[0])
         size, backward_steps = (size - 1, backward_steps + 1) if step_back else (size + 1, backward_steps)
     fitted = tuple(sets.fitted.values())
     reasons = _rejection_reasons((*singles[:1], *sets.of_size(2)[:1], best_so_far), rejected)
