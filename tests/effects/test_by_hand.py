@@ -128,17 +128,8 @@ def by_hand(times: np.ndarray) -> tuple[np.ndarray, list[tuple[float, float]]]:
 
         stops.terminal = True  # type: ignore[attr-defined]
         stops.direction = -1  # type: ignore[attr-defined]
-        done = solve_ivp(
-            slope,
-            (start, until),
-            [x, 0.0],
-            "LSODA",
-            rtol=1e-10,
-            atol=1e-13,
-            events=stops,
-            dense_output=True,
-            max_step=2e-3,
-        )
+        how = {"rtol": 1e-10, "atol": 1e-13, "dense_output": True, "max_step": 2e-3}
+        done = solve_ivp(slope, (start, until), [x, 0.0], "LSODA", events=stops, **how)
         end = float(done.t[-1])
         inside = (times > start) & (times <= end)
         y[inside] = done.sol(times[inside])[0] / 2

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from by_hand import BARE, LOADED, N, Vine, whole_catalogue
 from numba import njit
+from own_effect import NAME, write_effect
 
 import vinetrack
 from vinetrack.core.records import Bend, Trial
@@ -70,27 +71,13 @@ def test_each_effect_and_all_together(name: str, vine: Vine) -> None:
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
 
 
-DRIFT = '''"""Drift: a force that does not let go.
-
-    tail force −F
-"""
-
-from vinetrack.effects import Parameter
-
-PARAMETERS = (Parameter("F", "F", "N", 0.5),)
-
-
-def tail_force(s, rig, F):
-    return -F + 0.0 * s.time
-'''
-
-FALL = """
+FALL = f"""
 import numpy as np
 import vinetrack as vt
 from vinetrack.core.records import Trial
 trial = Trial(name="ball", travel_ratio=1.0, payload_kg=1.0)
 model = vt.base_model() - "pressure_drive" - "eversion_damping" - "yield_pressure"
-model += vt.effects.own_effects(["drift.py"])["drift"]
+model += vt.effects.own_effects(["{NAME}.py"])["{NAME}"]
 print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist())
 """
 
@@ -103,7 +90,7 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
     for place in (PACKAGE.parent, copy):
         folder = tmp_path / f"with_{place.name}"
         folder.mkdir()
-        (folder / "drift.py").write_text(DRIFT, encoding="utf-8")
+        write_effect(folder)
         environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache)}
         run = subprocess.run(
             [sys.executable, "-c", FALL], env=environment, cwd=folder, capture_output=True, text=True, check=True
