@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from vinetrack.experiment.folder import (
     trial_order,
 )
 from vinetrack.experiment.schema import COLUMNS, CellError, read_cell, with_names
-from vinetrack.tracks.importers import load_track
+from vinetrack.tracks.importers import TrackError, load_track, read_track
 
 # Corrections by hand are read, refused in words, and reach the trial.
 
@@ -148,6 +149,21 @@ def test_a_sheet_gives_one_trial_its_own(tmp_path: Path) -> None:
 def test_what_cannot_be_read_is_refused(column: str, text: str) -> None:
     with pytest.raises(CellError):
         read_cell(COLUMNS[column], text)
+
+
+REAL = os.environ.get("VINETRACK_REAL_DATA", "")
+
+
+@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
+def test_either_of_two_point_masses_of_a_real_project() -> None:
+    path = Path(REAL) / "falling_cups" / "cups.trk"
+    with pytest.raises(TrackError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
+        read_track(path, point_mass="cup")
+    third, seventh = (read_track(path, point_mass=name) for name in ("cup 3", "Cup 7"))
+    # The heavier stack falls further over the same frames.
+    common = min(third.time_s.size, seventh.time_s.size)
+    assert np.ptp(seventh.lead_position_m[:common]) > np.ptp(third.lead_position_m[:common])
+    assert 5 <= read_track(path, point_mass="cup 3", frames_used=(2, 8)).time_s.size < third.time_s.size
 
 
 # What a sheet says of specimens, days and the order of trials, and what `check` warns of.
