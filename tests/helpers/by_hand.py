@@ -104,8 +104,8 @@ def followed(
 ) -> Callable[[Floats], Floats]:
     """Tail travel against time by SciPy, from rest to x = `stop`.
 
-    `acceleration(t, x, v)`, or `acceleration(t, x, v, P)` with `chamber` = its first pressure and Ṗ(t, x, v, P). Ends
-    without the answer's tail after `stop`; its last time is kept as the attribute `end`.
+    `acceleration(t, x, v)`, or `acceleration(t, x, v, P)` with `chamber` = its first pressure and Ṗ(t, x, v, P). Its
+    last time, at `stop`, is kept as the attribute `end`, (x, ẋ) against time as `state`.
     """
 
     def slope(t: float, s: Floats) -> list[float]:
@@ -126,7 +126,7 @@ def followed(
     def travel(times: Floats) -> Floats:
         return np.asarray(done.sol(times)[0])
 
-    travel.end = float(done.t[-1])  # type: ignore[attr-defined]
+    travel.end, travel.state = float(done.t[-1]), done.sol  # type: ignore[attr-defined]
     return travel
 
 
