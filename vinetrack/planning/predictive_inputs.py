@@ -106,7 +106,7 @@ def exponent_sigma() -> float:
     >>> round(exponent_sigma(), 3)
     0.012
     """
-    dof = sum(published.CONDITIONS) / len(published.CONDITIONS) - 2
+    dof = (8 + 11) / 2 - 2  # 8 to 11: the printed numbers of pressures of a scale
     variances = [published.EXPONENT**2 * (1 - R2) / R2 / dof for R2 in published.DAMPING_R2.values()]
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
@@ -625,7 +625,7 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
         if sigma > 0:
             words = f"stated to {sigma / 1e3:.2g} kPa"
             sources.add_uncertainty("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
-    elif _printed_scale(trial) == published.YIELD_PRESSURE_SCALE:
+    elif _printed_scale(trial) == 4:  # the vine whose yield pressure is printed
         sources.set(YIELD, YIELD_PRESSURE_PA, f"printed, {published.SOURCE}")
         words = f"printed to a whole number: ±{PRINTED_YIELD_SIGMA_PA / 1e3:.2g} kPa"
         sources.add_uncertainty("printed P_y", words, "P_y printed", shifted(YIELD, PRINTED_YIELD_SIGMA_PA))
