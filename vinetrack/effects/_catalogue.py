@@ -207,7 +207,6 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
         parameters=tuple(getattr(module, "PARAMETERS", ())),
         functions=MappingProxyType(functions),
         needs=tuple(getattr(module, "NEEDS", ())),
-        easily_taken_for=tuple(getattr(module, "EASILY_TAKEN_FOR", ())),
         worked=tuple(getattr(module, "WORKED", ())),
         path=path.resolve(),
         in_trace=bool(getattr(module, "IN_TRACE", False)),
@@ -324,7 +323,6 @@ def explanation(effect: Effect) -> list[str]:
     facts = [
         ("Sizes that result from slips in the sheet", "; ".join(slips)),
         ("Needs of the trial sheet", ", ".join(effect.needs)),
-        ("Easily taken for", ", ".join(effect.easily_taken_for)),
         ("Replaces, while in the model", ", ".join(effect.replaces)),
         ("A pressure measured during growth", "already includes it" if effect.in_trace else ""),
         ("File", str(effect.path)),
