@@ -20,7 +20,7 @@ from vinetrack.core import published
 from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.core.tables import write_csv, write_text
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.dynamics.audit import pressure_along
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model, Value, make_model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.experiment.schema import COLUMNS
@@ -114,7 +114,7 @@ def grow(trials: Sequence[Trial], truth: GroundTruth) -> list[VirtualTrial]:
         gauge_Pa = None
         if truth.trace_sigma_kPa is not None:
             velocity_m_s = moved[i].lead_velocity_m_s[:stop]
-            gauge_Pa = pressure_along(own_model, true[i], time_s - release[i], lead_m, velocity_m_s)
+            gauge_Pa = evaluate(own_model, true[i], time_s - release[i], lead_m, velocity_m_s).pressure_Pa
             gauge_Pa = gauge_Pa + 1e3 * truth.trace_sigma_kPa * draw.standard_normal(stop)
         seen_m = origin_m + moved[i].observed_position_m[:stop] + noise_m
         track = plain_track(time_s, seen_m, pressure_Pa=gauge_Pa)

@@ -17,7 +17,7 @@ import pandas as pd
 from scipy.optimize import brentq
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate, pressure_along
+from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.effects import EffectError, catalogue
@@ -623,8 +623,8 @@ def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gam
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
     model = _with(inputs.model, "supply_refill", tau=tau_s, gamma=gamma)
     (moved,), _ = grown(model, [trial], host=host_for(inputs.model))
-    pressure = pressure_along(model, trial, moved.time_s, moved.lead_position_m, moved.lead_velocity_m_s)
-    return 1 - float(np.min(pressure)) / trial.pressure_Pa
+    terms = evaluate(model, trial, moved.time_s, moved.lead_position_m, moved.lead_velocity_m_s)
+    return 1 - float(np.min(terms.pressure_Pa)) / trial.pressure_Pa
 
 
 def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma: float) -> float:
