@@ -71,9 +71,6 @@ def test_terms_along_a_motion_by_hand() -> None:
     assert terms.acceleration_m_s2[0] == pytest.approx((sum(tip.values()) / 2 + mass * 9.81) / mass, rel=1e-12)
 
 
-# ---- one compiled form for all effects of the catalogue ----
-
-
 def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp_path: Path) -> None:
     own = own_effects([write_effect(tmp_path)])
     named_as_another = load_effect(write_effect(tmp_path).rename(tmp_path / "air_drag.py"))

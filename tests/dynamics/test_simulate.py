@@ -24,9 +24,6 @@ VINE = replace(LOADED, payload_kg=0.0)
 MODEL = base_model().with_values({"eversion_damping.B": HANGING.B, "eversion_damping.n": N})
 
 
-# ---- closed forms, and SciPy ----
-
-
 def test_a_dropped_ball_falls_half_g_t_squared() -> None:
     ball = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
     times_s = np.linspace(0, 2, 41)
@@ -68,9 +65,6 @@ def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial: Trial, B:
     np.testing.assert_allclose(found.lead_position_m[:-1], truth(times) / 2, rtol=0, atol=rel * trial.length_m)
 
 
-# ---- end of growth, many at once ----
-
-
 def test_after_the_end_of_growth_it_stays_at_its_length() -> None:
     found = simulate(MODEL, VINE, np.linspace(0, 5, 300))
     after = found.time_s > found.end_time_s
@@ -94,9 +88,6 @@ def test_many_at_once_agree_with_each_alone() -> None:
     for trial, times_s, trace, found in zip(trials, times, traces, together, strict=True):
         alone = simulate(MODEL, trial, times_s, trace=trace)
         np.testing.assert_array_equal(found.lead_position_m, alone.lead_position_m)
-
-
-# ---- breakpoints ----
 
 
 BAND = '''"""Band: a force that grows from a place along the way.
@@ -132,8 +123,6 @@ def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path
     # Steps across the breakpoint err by 1.3e-5, those that end there by 2.7e-6: the tolerance of a step and no more.
     np.testing.assert_allclose(found.lead_position_m, truth, rtol=5e-6)
 
-
-# ---- a tail that cannot push ----
 
 A, LAMBDA, L, PAYLOAD, P_Y, B = HANGING.A, HANGING.lam, HANGING.L, HANGING.payload, HANGING.P_y, HANGING.B
 MU = 0.5

@@ -44,8 +44,6 @@ def test_capstan_friction_as_printed_is_a_constant() -> None:
     )
 
 
-# ---- what happens to the gas between gauge and tip ----
-
 V0 = 3.7e-3
 A_IN = math.pi * 6e-3**2 / 4
 
@@ -102,8 +100,6 @@ def test_a_measured_pressure_already_holds_what_happens_in_the_chamber(name: str
     np.testing.assert_array_equal(simulated(LOADED, {name: 1.2}, times, trace).lead_position_m, plain)
     assert np.max(np.abs(simulated(LOADED, {name: 1.2}, times).lead_position_m - plain)) > 1e-4
 
-
-# ---- stick and slip ----
 
 P_S = 8e3
 UP_AND_DOWN = (np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), np.array([2e3, 12e3, 1e3, 1e3, 11e3, 11e3]))
@@ -162,8 +158,6 @@ def test_released_above_p_s_it_leaves_no_trace(P_s: float) -> None:
     got = simulated(LEVEL, {"static_yield.P_s": P_s}, times).lead_position_m
     np.testing.assert_array_equal(got, simulated(LEVEL, {}, times).lead_position_m)
 
-
-# ---- faults of the measurement ----
 
 TIMES = np.linspace(0, 0.15, 50)
 FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)

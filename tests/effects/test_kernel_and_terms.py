@@ -129,8 +129,6 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice() -> None:
     np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)
 
 
-# ---- mixtures of effects at random plausible sizes ----
-
 TIMES = np.linspace(0.0, 0.3, 200)
 DRAWN_LAST = ("film_mass", "payload_mass")
 """Effects that came after the seeds: the others keep the sizes that these seeds always gave them."""

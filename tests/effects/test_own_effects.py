@@ -183,9 +183,6 @@ def test_effects_of_one_name_are_read_again_when_their_file_changes(tmp_path: Pa
     assert (first.parameters[0].default, second.parameters[0].default) == (0.8, 0.9)
 
 
-# ---- own effects are programs ----
-
-
 @pytest.fixture
 def effect_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))

@@ -239,9 +239,6 @@ def test_the_smooth_error_allowed_of_a_drop_of_47_m_is_not_a_tenth_of_a_millimet
     assert vt.diagnose(write(tmp_path, sheet, f"model: [gravity, air_drag]\n{setting}\n")).verdict == verdict
 
 
-# `check_experiment`: tracks opened, videos handed on, and how problems are listed.
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -323,9 +320,6 @@ def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(fol
     assert format_problems(found) == ["error: experiment.yaml, trial a and 1 more: capture_fps is the rate of playback"]
 
 
-# Experiment folders that cannot be read at all: everything is said at once.
-
-
 @pytest.mark.parametrize("column", ["trial", "diameter_mm", "thickness_um", "length_mm", "yield_pressure_kPa"])
 def test_a_missing_column_stops_the_experiment_with_one_problem(folder: Path, column: str) -> None:
     cells = [line.split(",") for line in GOOD.splitlines()]
@@ -363,9 +357,6 @@ def test_all_problems_of_sheet_and_settings_come_at_once(folder: Path) -> None:
 def test_broken_settings_bring_no_false_alarms_about_the_sheet(folder: Path) -> None:
     write(folder, "trial,track,pressure_kPa\na,a.csv,\n", "diameter_mm: 24\nlength_mm: [\n")
     assert {problem.file for problem in stopped(folder)} == {"experiment.yaml"}
-
-
-# `vinetrack check` on what an experiment says of effects: its model, its candidates, files of its own.
 
 
 BASE = "pressure_drive, gravity, eversion_damping, yield_pressure"

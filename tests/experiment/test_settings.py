@@ -149,9 +149,6 @@ def test_a_wrong_run_setting_is_named(values: dict[str, Any], column: str) -> No
     assert [problem.column for problem in caught.value.problems] == [column]
 
 
-# What `vinetrack settings` lists is what is read.
-
-
 def test_every_key_of_both_files_is_listed_once() -> None:
     names = [entry.name for entry in setting_entries(ExperimentSettings)] + [entry.name for entry in column_entries()]
     assert {name for name in names if names.count(name) > 1} == {"axis"}  # of all trials, and of one

@@ -56,9 +56,6 @@ def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path, line: s
     assert "corrections.csv" in {problem.file for problem in stopped.value.problems}
 
 
-# Which columns of the sheet make two trials different conditions, and which leave them replicates.
-
-
 TRIAL = Trial(
     name="a", diameter_m=0.024, thickness_m=200e-6, length_m=0.28, pressure_Pa=28e3, yield_pressure_Pa=3e3, inlet_m=8e-3
 )
@@ -121,9 +118,6 @@ def test_the_yield_pressure_belongs_to_the_vine() -> None:
     assert [trial.condition for trial in named] == ["24mm-200um-280mm_28kPa_0g", "12mm-100um-280mm_28kPa_0g"]
 
 
-# Columns that belong to one trial alone: its axis in the picture, the frames used, the point mass it is.
-
-
 def test_a_sheet_gives_one_trial_its_own(tmp_path: Path) -> None:
     (trial,) = one(tmp_path, frames_used="5:15", axis="161,40:151.5,799:20").trials
     assert trial.axis is not None
@@ -164,9 +158,6 @@ def test_either_of_two_point_masses_of_a_real_project() -> None:
     common = min(third.time_s.size, seventh.time_s.size)
     assert np.ptp(seventh.lead_position_m[:common]) > np.ptp(third.lead_position_m[:common])
     assert 5 <= read_track(path, point_mass="cup 3", frames_used=(2, 8)).time_s.size < third.time_s.size
-
-
-# What a sheet says of specimens, days and the order of trials, and what `check` warns of.
 
 
 PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)

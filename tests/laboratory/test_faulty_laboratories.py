@@ -39,9 +39,6 @@ def drawn(seed: int = SEED, wants: Wants = BARE) -> tuple[Laboratory, np.random.
     return careful(plan(draw, replace(wants, trials=FEW), lambda settings: True), draw), draw  # noqa: ARG005
 
 
-# Campaigns.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROWS)
 def test_every_row_makes_a_campaign_that_moves(name):
@@ -68,9 +65,6 @@ def test_a_folder_is_one_that_the_package_reads(tmp_path):
     assert json.loads((tmp_path / "truth" / "one.json").read_text())["row"] == "trace_clock"
 
 
-# Order, specimens, days.
-
-
 def test_wear_follows_the_order_of_each_vine():
     laboratory, draw = drawn()
     before = faults.in_rising_order(laboratory, draw)
@@ -80,9 +74,6 @@ def test_wear_follows_the_order_of_each_vine():
         assert [b.physics.B / a.physics.B for a, b in pairs] == pytest.approx([1 + 0.02 * k for k in range(len(pairs))])
         pressures = [a.setting.pressure_kPa for a, _ in pairs]
         assert pressures == sorted(pressures)
-
-
-# Camera, valve, tail.
 
 
 def test_a_row_that_is_read_late_shows_what_was_there_then():
@@ -124,8 +115,6 @@ def test_a_ball_falls_as_the_equation_of_motion_has_it():
     assert np.all(fallen(np.array([-1.0, 0.0]), mass, diameter, C_D) == 0)
 
 
-# Judgement.
-
 LENS = Should(("artefact", "ambiguous", "adequate"), any_of=("lens",), true=("lens",))
 WORN = Should(("artefact",), any_of=("*order*",), only=("*order*",), true=("*order*",))
 BOTH = Should(("missing", "ambiguous"), ("drag",), all_of=("drag", "inlet"), true=("drag", "inlet"), holds=("drag.C",))
@@ -164,9 +153,6 @@ def test_a_fault_that_hardly_shows_need_not_be_named():
     should = Should(("artefact",), any_of=("lens",), true=("lens",))
     assert judge(answer("adequate"), should, {"visible_sigma": 3.0}).right
     assert not judge(answer("adequate"), should, {"visible_sigma": 30.0}).right
-
-
-# Visibility.
 
 
 @pytest.mark.slow

@@ -208,9 +208,6 @@ def test_same_seed_same_pictures_other_seed_others():
     assert (one != other).mean() > 0.5
 
 
-# What is written can be read again by other software, and is what was rendered.
-
-
 DEMO = replace(preset("demo"), camera=Camera(width_px=320, height_px=128))
 SETTINGS = {"n_frames": 24, "capture_fps": 1069.0, "seed": 7}
 
@@ -252,9 +249,6 @@ def test_ffv1_and_pictures_lose_nothing(tmp_path, bit_depth):
     pictures = sorted((tmp_path / "trial").iterdir())
     assert len(pictures) == 24
     assert (cv2.imread(str(pictures[9]), cv2.IMREAD_UNCHANGED) == rendered(scene, 9)).all()
-
-
-# Targets are drawn where a camera of OpenCV's sees them, with the pattern OpenCV prints.
 
 
 CAMERA = Camera(focal_px=1300, k1=-0.25, k2=0.08, tilt_x_deg=7, tilt_y_deg=-9)

@@ -42,9 +42,6 @@ def nature(**changes: object) -> GroundTruth:
 EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
 
 
-# ---- what nature does ----
-
-
 def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_seed_others() -> None:
     def same(one: VirtualTrial, other: VirtualTrial) -> bool:
         moved = np.array_equal(one.track.lead_position_m, other.track.lead_position_m)
@@ -127,9 +124,6 @@ def test_a_hidden_measurement_effect_shows_in_the_track_and_not_in_the_truth() -
     for grown in grow(few()[:1], wrong):
         seen = grown.track.lead_position_m - grown.origin_m
         np.testing.assert_allclose(seen, 1.05 * grown.true_lead_position_m, atol=1e-12)
-
-
-# ---- files ----
 
 
 def test_what_is_written_reads_back_without_a_word(tmp_path: Path) -> None:

@@ -88,9 +88,6 @@ def test_with_a_payload_speed_is_that_of_the_payload() -> None:
     assert choice.prediction.final.y_over_L == 1.0
 
 
-# The chamber that keeps the pressure, against the gas law worked by hand and against a vine grown out of it.
-
-
 @pytest.mark.parametrize("gamma", GAMMAS.values())
 @pytest.mark.parametrize("loss", [0.01, 0.05, 0.5])
 def test_a_chamber_that_is_sized_loses_just_what_it_may(gamma: float, loss: float) -> None:
@@ -117,9 +114,6 @@ def test_a_quick_supply_saves_a_chamber() -> None:
     volumes = [supplied_chamber(inputs, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
     assert volumes[0] < volumes[1] < closed
     assert supplied_loss(inputs, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
-
-
-# Which trials are looked at for the next experiment: within the limits, held by the film, able to grow.
 
 
 def made(pressure_kPa: float, **more: object) -> Trial:

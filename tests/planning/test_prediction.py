@@ -139,9 +139,6 @@ def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> Non
     )
 
 
-# Predictive inputs: which source a number comes from, and that draws have the spread and covariance that are said.
-
-
 B, N = "eversion_damping.B", "eversion_damping.n"
 
 
@@ -244,9 +241,6 @@ def test_sizes_of_effects_are_numbers_or_ranges(text: str, sizes: dict[str, Size
     assert read_sizes(text)[1] == sizes
 
 
-# The guesses for vines nobody has measured: they join what is printed, and say how far they may be off.
-
-
 def printed(scale: int) -> tuple[float, float]:
     return 1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]
 
@@ -267,9 +261,6 @@ def test_the_error_of_the_guess_is_that_of_a_regression_read_off_beyond_its_poin
         row = np.array([1.0, math.log(guess.damping_prior(*size))])
         expected = guess.damping_scatter() * math.sqrt(1 + row @ np.linalg.inv(design.T @ design) @ row)
         assert guess.damping_log_sigma(*size) == pytest.approx(expected)
-
-
-# A pressure in psi under the name of kPa shows in the speeds; other films do not.
 
 
 PSI = 6.894757
@@ -300,9 +291,6 @@ def test_a_wrong_unit_of_pressure_is_suspected_and_a_right_one_is_not(
     found = pressure_problems(pairs)
     assert len(found) == bool(suspected)
     assert all(problem.severity == "warning" and suspected in problem.message for problem in found)
-
-
-# What speaks against a vine: one case a hazard, and none where there is none.
 
 
 SAFE = dict(zip(SIZES, (18, 150, 250, 24), strict=True)) | {"growth_angle_deg": 180, "chamber_l": 50}
