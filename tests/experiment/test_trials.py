@@ -21,7 +21,7 @@ from vinetrack.experiment.folder import (
     read_experiment,
     trial_order,
 )
-from vinetrack.experiment.schema import COLUMNS, CellError, read_cell, with_names
+from vinetrack.experiment.schema import COLUMNS, read_cell, with_names
 from vinetrack.tracks.importers import TrackError, load_track, read_track
 
 # Corrections by hand are read, refused in words, and reach the trial.
@@ -133,18 +133,6 @@ def test_a_sheet_gives_one_trial_its_own(tmp_path: Path) -> None:
     assert (axis.from_px, axis.via_px, axis.to_px) == ((161.0, 40.0), ((170.0, 300.0),), (151.5, 799.0))
 
 
-@pytest.mark.parametrize(
-    ("column", "text"),
-    [
-        *(("axis", text) for text in ("161,40", "161,40:165,40", "161,40:151,799:0", "161,40:162,41:151,799")),
-        *(("axis", "161,40:162:151,799"), ("frames_used", "20:5"), ("frames_used", "a:5")),
-    ],
-)
-def test_what_cannot_be_read_is_refused(column: str, text: str) -> None:
-    with pytest.raises(CellError):
-        read_cell(COLUMNS[column], text)
-
-
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")
 
 
@@ -163,21 +151,18 @@ def test_either_of_two_point_masses_of_a_real_project() -> None:
 PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)
 
 
-def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10, rows: tuple[int, ...] = ()) -> Path:
-    """Ten trials of one vine at five pressures, in the order of `rows`."""
-    folder.mkdir(exist_ok=True)
+def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10) -> Path:
+    """Ten trials of one vine at five rising pressures."""
     (folder / "a.csv").write_text(TRACK)
-    lines = [f"t{i},a.csv,24,200,280,{PRESSURES[i]},3,{cells[i]}" for i in rows or range(10)]
+    lines = [f"t{i},a.csv,24,200,280,{PRESSURES[i]},3,{cells[i]}" for i in range(10)]
     return write(folder, f"{HEADER}{columns}\n" + "\n".join(lines) + "\n")
 
 
 def test_the_columns_reach_the_trial(tmp_path: Path) -> None:
     cells = tuple(f",tube {i % 2},monday,{10 - i}" for i in range(10))
-    experiment = read_experiment(written(tmp_path / "x", ",specimen,day,order", cells))
-    assert [(one.specimen, one.day, one.order) for one in experiment.trials[:2]] == [
-        ("tube 0", "monday", 10.0),
-        ("tube 1", "monday", 9.0),
-    ]
+    experiment = read_experiment(written(tmp_path, ",specimen,day,order", cells))
+    second = experiment.trials[1]
+    assert (second.specimen, second.day, second.order) == ("tube 1", "monday", 9.0)
     ranks, stated = trial_order(experiment.trials)
     assert stated
     assert ranks.tolist() == list(range(9, -1, -1))
@@ -185,15 +170,11 @@ def test_the_columns_reach_the_trial(tmp_path: Path) -> None:
 
 
 def test_rows_are_the_order_where_the_sheet_has_none(tmp_path: Path) -> None:
-    trials = read_experiment(written(tmp_path / "x")).trials
+    trials = read_experiment(written(tmp_path)).trials
     ranks, stated = trial_order(trials)
     assert not stated
     assert ranks.tolist() == list(range(10))
     assert order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
-
-
-BY_SIZE = tuple(f",{pressure}" for pressure in PRESSURES)
-DRAWN = tuple(f",{i + 1}" for i in np.random.default_rng(1).permutation(10))
 
 
 @pytest.mark.parametrize(
@@ -201,13 +182,13 @@ DRAWN = tuple(f",{i + 1}" for i in np.random.default_rng(1).permutation(10))
     [
         ("", ("",) * 10, ["confounded"]),  # the rows are in order of pressure
         ("order", tuple(f",{i + 1}" for i in range(10)), ["confounded"]),
-        ("order", DRAWN, []),
-        ("specimen", BY_SIZE, ["confounded"]),
+        ("order", tuple(f",{i + 1}" for i in np.random.default_rng(1).permutation(10)), []),
+        ("specimen", tuple(f",{pressure}" for pressure in PRESSURES), ["confounded"]),
         ("specimen", tuple(f",{i % 2}" for i in range(10)), []),
     ],
 )
 def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(
     tmp_path: Path, column: str, cells: tuple[str, ...], codes: list[str]
 ) -> None:
-    found = check_experiment(written(tmp_path / "x", f",{column}" if column else "", cells))
+    found = check_experiment(written(tmp_path, f",{column}" if column else "", cells))
     assert [problem.code for problem in found if problem.column == (column or "order")] == codes

@@ -98,13 +98,12 @@ def record(
     rho: float = 0.0,
     rest_frames: int = 40,
     end_frames: int = 0,
-    capture_fps: float = CAPTURE_FPS,
 ) -> Recording:
     """Sample a vine: still frames before release, `end_frames` flat ones once it is grown, arbitrary zeros."""
     solution, duration_s = motion(vine)
-    release_s = (rest_frames + rng.uniform()) / capture_fps
-    n = int(np.floor((release_s + duration_s) * capture_fps)) + 1 + end_frames
-    time_s = np.arange(n) / capture_fps
+    release_s = (rest_frames + rng.uniform()) / CAPTURE_FPS
+    n = int(np.floor((release_s + duration_s) * CAPTURE_FPS)) + 1 + end_frames
+    time_s = np.arange(n) / CAPTURE_FPS
     since = np.clip(time_s - release_s, 0, duration_s)
     tail, tail_speed = solution(since)
     lead, lead_speed = tail / 2, tail_speed / 2

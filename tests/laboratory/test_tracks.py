@@ -13,7 +13,6 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory import __main__ as command
 from vinetrack.laboratory.filming import make_filming, recording_experiment
 from vinetrack.laboratory.tracks import (
     GroundTruth,
@@ -24,7 +23,6 @@ from vinetrack.laboratory.tracks import (
     isometric_vine,
     read_ground_truth,
     write_experiment,
-    write_tracks,
 )
 from vinetrack.tracks.importers import load_track
 
@@ -139,19 +137,6 @@ def test_what_is_written_reads_back_without_a_word(tmp_path: Path) -> None:
         np.testing.assert_allclose(track.lead_position_m, one.track.lead_position_m, atol=1e-8)
         np.testing.assert_allclose(np.diff(track.time_s), np.diff(one.track.time_s), atol=2e-9)
         assert track.pressure_Pa is not None
-
-
-def test_the_demonstration_can_be_grown(tmp_path: Path) -> None:
-    """Every trial of the shipped sheet, filmed or tracked, moves as the demonstration's nature says."""
-    demo = read_experiment(ROOT / "data" / "demo")
-    hidden = read_ground_truth(command.DEMO)
-    grown = grow(demo.trials, hidden)
-    assert len(grown) == len(demo.trials) > 5
-    for one in grown:
-        assert one.track.time_s.size > 30
-        assert one.true_lead_position_m[-1] > 0.9 * one.stated.length_m
-    write_tracks(grown, tmp_path)
-    assert {path.stem for path in tmp_path.iterdir()} == {trial.name for trial in demo.trials}
 
 
 PAPER = ROOT / "data" / "paper"
