@@ -139,9 +139,8 @@ def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> I
         diameter_mm = _mean([1e3 * trial.diameter_m for trial in vines])
         yield row_of("thickness_R{R}", thickness_um, published_as=published.THICKNESS_UM[R], mark=mark, R=R)
         yield row_of("diameter_R{R}", diameter_mm, published_as=published.DIAMETER_MM[R], mark=mark, R=R)
-        # Printed settings of the heat press, °C, and of the laser, %, by scale.
-        yield row_of("press_R{R}", published_as={1: 110.0, 2: 82.0, 3: 96.0, 4: 96.0}[R], R=R)
-        yield row_of("laser_R{R}", published_as={1: 60.0, 2: 76.0, 3: 81.0, 4: 86.0}[R], R=R)
+        yield row_of("press_R{R}", published_as={1: 110.0, 2: 82.0, 3: 96.0, 4: 96.0}[R], R=R)  # °C, as printed
+        yield row_of("laser_R{R}", published_as={1: 60.0, 2: 76.0, 3: 81.0, 4: 86.0}[R], R=R)  # %, as printed
     for R, vines in by_scale.items():
         replicates = pd.Series([round(trial.pressure_Pa, 3) for trial in vines], dtype=float).value_counts()
         yield row_of("pressures_R{R}", float(len(replicates)) if vines else nan, mark=mark, R=R)
