@@ -10,10 +10,10 @@ import csv
 import json
 from pathlib import Path
 
-import av
 import numpy as np
 import pandas as pd
 from commanded import succeed as run
+from plain_scene import write_video
 
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
@@ -125,13 +125,7 @@ def film_of(experiment: Path, results: Path, trial: str) -> Path:
 def write_bars(path: Path, ends_px: np.ndarray, width: int = 960, height: int = 96) -> Path:
     """Write a clip with a bright bar on dark grey in every frame, from the left to the given end."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for end_px in ends_px:
-            picture = np.full((height, width), 40, np.uint8)
-            picture[30:66, : max(round(float(end_px)), 0)] = 200
-            frame = av.VideoFrame.from_ndarray(np.stack([picture] * 3, axis=2), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
+    frames = np.full((len(ends_px), height, width), 40, np.uint8)
+    for frame, end_px in zip(frames, ends_px, strict=True):
+        frame[30:66, : max(round(float(end_px)), 0)] = 200
+    return write_video(path, frames, options={"crf": "12"}, playback_fps=30)
