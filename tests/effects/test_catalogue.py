@@ -11,7 +11,7 @@ import pytest
 
 import vinetrack.effects as effects
 from vinetrack.effects import BASE_EFFECTS, Effect, State, catalogue, find_effect, load_effect
-from vinetrack.effects._own import _RIG, _STATE
+from vinetrack.effects._catalogue import _RIG, _STATE
 
 FOLDER = Path(effects.__file__).parent
 FILES = sorted(path for path in FOLDER.glob("*.py") if not path.stem.startswith("_"))

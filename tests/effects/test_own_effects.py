@@ -19,8 +19,7 @@ from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import Effect, EffectError, air_drag, catalogue, load_effect
-from vinetrack.effects._catalogue import _is_independent_of_path
-from vinetrack.effects._own import behaviour_faults, own_effects
+from vinetrack.effects._catalogue import _is_independent_of_path, behaviour_faults, own_effects
 
 BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
 

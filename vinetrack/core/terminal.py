@@ -20,11 +20,6 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 
-_NUMBER = re.compile(
-    r"[<>~≤≥≈]?\s*[+\-−±×]?\s*\d[\d.,]*(?:[eE][+\-−]?\d+)?\s*[%×]?(?:\s*±\s*[\d.,]+(?:[eE][+\-]?\d+)?)?"
-)
-
-
 def colour_wanted(stream: TextIO) -> bool:
     """Whether to use colour on a stream."""
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
@@ -71,7 +66,8 @@ def table(
 def _is_numeric(cells: Sequence[str]) -> bool:
     """Whether all cells of a column are numbers or placeholders for a missing one, and at least one is a number."""
     values = [cell for cell in map(str.strip, cells) if cell not in ("", "–", "-", "—", "nan", "open")]
-    return bool(values) and all(_NUMBER.fullmatch(cell) for cell in values)
+    number = r"[<>~≤≥≈]?\s*[+\-−±×]?\s*\d[\d.,]*(?:[eE][+\-−]?\d+)?\s*[%×]?(?:\s*±\s*[\d.,]+(?:[eE][+\-]?\d+)?)?"
+    return bool(values) and all(re.fullmatch(number, cell) for cell in values)
 
 
 class Progress(Generic[Item]):

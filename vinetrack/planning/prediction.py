@@ -548,14 +548,13 @@ def _best(
         inputs = vine_inputs[int(i) * axes[1].size + int(j)]
         if round_number == 0:
             others = np.column_stack([axes[0], speeds.max(axis=1)])
-        spans = [_neighbours(axis, int(k), span) for axis, k, span in zip(axes, (i, j), limits, strict=True)]
+        # From the grid value below the optimum to the one above, within the limits.
+        spans = [
+            (max(low, float(axis[max(k - 1, 0)])), min(high, float(axis[min(k + 1, axis.size - 1)])))
+            for axis, k, (low, high) in zip(axes, (int(i), int(j)), limits, strict=True)
+        ]
     assert inputs is not None
     return inputs, others
-
-
-def _neighbours(axis: Floats, k: int, limits: tuple[float, float]) -> tuple[float, float]:
-    """Range from the grid value below the optimum to the one above, within the limits."""
-    return max(limits[0], float(axis[max(k - 1, 0)])), min(limits[1], float(axis[min(k + 1, axis.size - 1)]))
 
 
 def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
