@@ -45,10 +45,10 @@ FLOORS = (
 
 BUDGETS = {
     "cli": (649, 4, 7),
-    "core": (1447, 9, 58),
+    "core": (1443, 9, 57),
     "diagnosis": (11826, 23, 182),
     "dynamics": (2501, 8, 28),
-    "effects": (2587, 44, 143),
+    "effects": (2580, 43, 143),
     "experiment": (1948, 7, 17),
     "figures": (3054, 9, 40),
     "inference": (6742, 14, 82),
@@ -59,7 +59,7 @@ BUDGETS = {
     "pages": (3486, 8, 33),
     "paper": (885, 3, 18),
     "pipeline": (3478, 11, 16),
-    "planning": (2440, 5, 19),
+    "planning": (2439, 5, 19),
     "report": (871, 3, 13),
     "results": (267, 2, 8),
     "tracks": (1764, 4, 29),
