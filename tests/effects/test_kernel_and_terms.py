@@ -91,7 +91,7 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
         folder = tmp_path / f"with_{place.name}"
         folder.mkdir()
         write_effect(folder)
-        environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache)}
+        environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache), "NUMBA_CACHE_DIR": ""}
         run = subprocess.run(
             [sys.executable, "-c", FALL], env=environment, cwd=folder, capture_output=True, text=True, check=True
         )
