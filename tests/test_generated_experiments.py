@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 from generated_experiments import is_let_through, run_through, write_experiment
+from plain_scene import write_video
 
 from vinetrack.core.records import Trial
 from vinetrack.video.frames import RecordingError
@@ -54,16 +53,8 @@ BAD_CLIPS = {
 @pytest.mark.parametrize("name", BAD_CLIPS)
 def test_a_bad_clip_is_refused_in_a_sentence(tmp_path: Path, name: str) -> None:
     """Warnings are errors in tests: nothing is computed from an empty stretch on the way."""
-    path = tmp_path / "a.mkv"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 160, 64, "gray"
-        stream.time_base = Fraction(1, 30)
-        for i, picture in enumerate(BAD_CLIPS[name]):
-            frame = av.VideoFrame.from_ndarray(np.clip(picture, 0, 255).astype(np.uint8), format="gray")
-            frame.pts = i
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    frames = np.clip(BAD_CLIPS[name], 0, 255).astype(np.uint8)
+    path = write_video(tmp_path / "a.mkv", frames, "ffv1", "gray", playback_fps=30)
     trial = Trial(name="a", video=path, capture_fps=1000.0, m_per_px=2e-4, diameter_m=0.004, length_m=0.03)
     with pytest.raises(RecordingError):
         track_recording(trial)

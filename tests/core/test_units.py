@@ -7,20 +7,15 @@ import math
 import pytest
 
 from vinetrack.core.units import (
-    PREDICTION_UNITS,
-    SLIDER_UNITS,
     UNITS,
     convert,
     decimals,
-    display_unit,
     interval,
     number,
     split_unit,
     with_error,
     with_interval,
 )
-
-# Units: exact by definition, and read from the ending of a name.
 
 
 def test_inches_pounds_and_psi_are_exact_by_definition() -> None:
@@ -56,15 +51,6 @@ def test_the_longest_ending_that_is_a_unit_is_the_unit() -> None:
     assert split_unit("kPa") == ("kPa", "")
 
 
-def test_what_a_table_does_not_show_otherwise_stays_si() -> None:
-    assert display_unit("m") == ("m", 1.0)
-    assert display_unit("m", SLIDER_UNITS) == ("mm", 1e3)
-    assert display_unit("s", PREDICTION_UNITS) == ("ms", 1e3)
-
-
-# Numbers as people read them.
-
-
 def test_a_number_has_three_digits_and_an_exponent_only_where_needed() -> None:
     values = (0.37, 1069.0, 0.0, -2.345, 1.5e-7, math.nan, None)
     assert [number(value) for value in values] == ["0.370", "1069", "0", "-2.35", "1.50e-07", "–", "–"]
@@ -88,9 +74,6 @@ def test_a_value_ends_where_its_error_does(value: float, sigma: float, text: str
 
 def test_an_interval_shows_both_ends_to_the_same_digit() -> None:
     assert interval([0.36512, 0.37449]) == "0.3651 to 0.3745"
-
-
-def test_half_an_interval() -> None:
     assert with_interval(0.4001, [0.359, 0.4412]) == "0.400 (95 %: 0.359 to 0.441)"
     assert with_interval(0.4001, [None, None]) == "0.400"
 

@@ -49,18 +49,12 @@ def test_a_key_is_set_and_comments_stay(before: str, key: str, value: object, af
     assert with_value(before, key, value) == after
 
 
-def test_a_block_is_cleared() -> None:
+def test_a_block_is_cleared_and_what_cannot_be_set_without_harm_is_refused() -> None:
     after = with_value(COMMENTED, "calibration", None)
     assert parse_yaml(after, "").content == {"capture_fps": 1000, "calibration": None}
     assert "# the last line" in after
-
-
-def test_what_cannot_be_set_without_harm_is_refused() -> None:
     with pytest.raises(ExperimentError):
         with_value("a: &x {p: 1}\nb: *x\n", "b", {"p": 2})
-
-
-# The model saved to experiment.yaml: one key changes, everything else stays to the byte.
 
 
 def test_line_ends_and_the_mark_at_the_beginning_stay(tmp_path: Path) -> None:

@@ -11,9 +11,8 @@ from by_hand import LOADED
 
 from vinetrack.core.records import Bend, Kinematics, Trial
 from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, measured_motion
-from vinetrack.dynamics.model import base_model
+from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import simulate
-from vinetrack.effects import catalogue
 
 A = math.pi * 24e-3**2 / 4
 BASE = base_model().with_values({"eversion_damping.B": 6.44})
@@ -34,52 +33,46 @@ def row(found: Audit, term: str) -> pd.Series:
     return rows.iloc[0]
 
 
-def test_air_drag_by_hand() -> None:
+def test_terms_by_hand() -> None:
+    motion = steady(trial())
+    found = audit(BASE, [motion])
     # ¼ × 1.2 × A × 1 × 2² over ½ × 28000 × A = 1.2/14000
-    drag = row(audit(BASE, [steady(trial())]), "air_drag")
+    drag = row(found, "air_drag")
     assert drag["share_of_drive"] == pytest.approx(-1.2 / 14000, rel=1e-9)
     assert drag["force_N"] == pytest.approx(-1.2 * A, rel=1e-9)
-
-
-def test_depletion_by_hand_is_largest_at_the_end() -> None:
-    # adiabatic, at 0.95 of 0.28 m: V₀/(V₀ + A y)
+    # Adiabatic, largest at the end, 0.95 of 0.28 m: V₀/(V₀ + A y).
     y = 0.95 * 0.28
     P = (28e3 + 101_325) * (3.7e-3 / (3.7e-3 + A * y)) ** 1.4 - 101_325
-    depletion = row(audit(BASE, [steady(trial())]), "reservoir_depletion")
+    depletion = row(found, "reservoir_depletion")
     assert depletion["share_of_drive"] == pytest.approx((P - 28e3) / 28e3, rel=1e-9)
-    assert depletion["y_over_L"] == pytest.approx(0.95)
-    assert depletion["time_s"] == pytest.approx(y / 2.0)
-
-
-def test_gas_inertia_holds_the_mass_it_adds_times_the_acceleration() -> None:
-    motion = steady(trial())
+    assert (depletion["y_over_L"], depletion["time_s"]) == pytest.approx((0.95, y / 2.0))
+    # The gas adds a mass times the acceleration, and what it takes along.
     rho = (28e3 + 101_325) / (287 * 293)
     m = 18.0956e-3 * (0.28 - motion.lead_position_m) + 35.6e-3
     a = (0.5 * 25e3 * A - 0.5 * 6.44 * 4.0**0.37 + m * 9.81) / m
     force = -0.5 * rho * A * 0.5 * 4 - 0.25 * rho * A * motion.lead_position_m * a
-    gas = row(audit(BASE, [motion]), "gas_inertia")
-    assert gas["force_N"] == pytest.approx(force[np.argmax(np.abs(force))], rel=1e-5)
-
-
-def test_tail_stretch_is_given_as_a_displacement_of_the_edge() -> None:
-    # ½ (L T₁ + y (PA − 2 T₁))/(EπDt) at the last point, y = 0.95 L, with T₁ = ½ × 25000 A − ½ × 6.44 × 4^0.37
+    assert row(found, "gas_inertia")["force_N"] == pytest.approx(force[np.argmax(np.abs(force))], rel=1e-5)
+    # A displacement: ½ (L T₁ + y (PA − 2 T₁))/(EπDt) at the last point, T₁ = ½ × 25000 A − ½ × 6.44 × 4^0.37.
     tension = 0.5 * 25e3 * A - 0.5 * 6.44 * 4.0**0.37
-    stretch = row(audit(BASE, [steady(trial())]), "tail_stretch")
-    strain_per_newton = 4e-8 / (math.pi * 24e-3 * 200e-6)
-    expected = 0.5 * strain_per_newton * (0.28 * tension + 0.95 * 0.28 * (28e3 * A - 2 * tension))
+    stretch = row(found, "tail_stretch")
+    expected = 0.5 * 4e-8 / (math.pi * 24e-3 * 200e-6) * (0.28 * tension + y * (28e3 * A - 2 * tension))
     assert stretch["shift_m"] == pytest.approx(expected, rel=1e-9)
     assert math.isnan(stretch["force_N"])
 
 
-def test_effects_of_the_model_are_not_audited() -> None:
-    found = audit(BASE + catalogue()["supply_refill"] + catalogue()["air_drag"], [steady(trial())])
-    assert not {"air_drag", "supply_refill", "reservoir_depletion", "gravity"} & set(found.table["term"])
-    assert "reservoir" not in {each.rule for each in found.violations}
-
-
-def test_a_measured_pressure_includes_effects_in_the_chamber() -> None:
-    found = audit(BASE, [steady(trial(), pressure=np.linspace(28e3, 20e3, 101))])
-    assert not {"supply_refill", "reservoir_depletion", "leak"} & set(found.table["term"])
+@pytest.mark.parametrize(
+    ("model", "pressure", "absent"),
+    [
+        (BASE + "supply_refill" + "air_drag", None, {"air_drag", "supply_refill", "reservoir_depletion", "gravity"}),
+        (BASE, np.linspace(28e3, 20e3, 101), {"supply_refill", "reservoir_depletion", "leak"}),
+    ],
+    ids=["in the model", "in the measured pressure"],
+)
+def test_what_is_in_the_model_or_the_measured_pressure_is_not_audited(
+    model: Model, pressure: np.ndarray | None, absent: set[str]
+) -> None:
+    found = audit(model, [steady(trial(), pressure=pressure)])
+    assert not absent & set(found.table["term"])
     assert "reservoir" not in {each.rule for each in found.violations}
 
 

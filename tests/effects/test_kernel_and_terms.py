@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from by_hand import BARE, LOADED, N, Vine, whole_catalogue
 from numba import njit
+from own_effect import NAME, write_effect
 
 import vinetrack
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.equations import TrialArrays
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import Model, base_model, effects_on
+from vinetrack.dynamics.model import Model, effects_on
 from vinetrack.dynamics.simulate import simulate, trial_inputs
 from vinetrack.effects import Effect, catalogue
 
@@ -55,9 +56,13 @@ def accelerations(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])
-@pytest.mark.parametrize("name", catalogue())
-def test_each_effect(name: str, vine: Vine) -> None:
-    model = whole_catalogue(sizes_of(name))
+@pytest.mark.parametrize("name", [*catalogue(), "all"])
+def test_each_effect_and_all_together(name: str, vine: Vine) -> None:
+    every = [other for other, effect in catalogue().items() if effect.kind != "base" and other != "supply_refill"]
+    names = every if name == "all" else [name]
+    # A payload that weighs far less than stated: nothing is taken from the film.
+    less = {"payload_mass.delta": -20e-3} if name == "payload_mass" else {}
+    model = whole_catalogue({key: size for one in names for key, size in sizes_of(one).items()} | less)
     trial = vine.trial(bends=BENDS)
     time, y = np.linspace(0.01, 0.1, 25), np.linspace(0.01, 0.95 * vine.L, 25)
     v = np.linspace(0.2, 12.0, 25)
@@ -66,27 +71,13 @@ def test_each_effect(name: str, vine: Vine) -> None:
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
 
 
-DRIFT = '''"""Drift: a force that does not let go.
-
-    tail force −F
-"""
-
-from vinetrack.effects import Parameter
-
-PARAMETERS = (Parameter("F", "F", "N", 0.5),)
-
-
-def tail_force(s, rig, F):
-    return -F + 0.0 * s.time
-'''
-
-FALL = """
+FALL = f"""
 import numpy as np
 import vinetrack as vt
 from vinetrack.core.records import Trial
 trial = Trial(name="ball", travel_ratio=1.0, payload_kg=1.0)
 model = vt.base_model() - "pressure_drive" - "eversion_damping" - "yield_pressure"
-model += vt.effects.own_effects(["drift.py"])["drift"]
+model += vt.effects.own_effects(["{NAME}.py"])["{NAME}"]
 print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist())
 """
 
@@ -99,8 +90,8 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
     for place in (PACKAGE.parent, copy):
         folder = tmp_path / f"with_{place.name}"
         folder.mkdir()
-        (folder / "drift.py").write_text(DRIFT, encoding="utf-8")
-        environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache)}
+        write_effect(folder)
+        environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache), "NUMBA_CACHE_DIR": ""}
         run = subprocess.run(
             [sys.executable, "-c", FALL], env=environment, cwd=folder, capture_output=True, text=True, check=True
         )
@@ -109,17 +100,6 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
     assert said[0] == said[1]
     assert compiled[0] == compiled[1]
     assert any(name.endswith(".nbc") for name, _ in compiled[0])
-
-
-@pytest.mark.slow
-def test_all_together() -> None:
-    names = [name for name, effect in catalogue().items() if effect.kind != "base" and name != "supply_refill"]
-    model = whole_catalogue({key: size for name in names for key, size in sizes_of(name).items()})
-    time, y, v = np.linspace(0.01, 0.1, 25), np.linspace(0.01, 0.27, 25), np.linspace(0.2, 12.0, 25)
-    trial = LOADED.trial(bends=BENDS)
-    terms = evaluate(model, trial, time, y, v)
-    got = accelerations(model, trial, time, y, v)
-    np.testing.assert_allclose(got, terms.acceleration_m_s2, rtol=1e-9)
 
 
 @pytest.mark.parametrize("tau", [1e-4, 0.02, 1.0])
@@ -148,23 +128,6 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice() -> None:
     compiled = accelerations(model, vine.trial(), rest, np.array([vine.L]), rest)
     np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delta", [-20e-3, -LOADED.payload], ids=["in part", "all of it"])
-def test_what_a_payload_lacks_is_not_taken_from_the_film(delta: float) -> None:
-    vine = LOADED
-    model = base_model() + catalogue()["payload_mass"]
-    model = model.with_values({"eversion_damping.B": vine.B, "eversion_damping.n": 0.37, "payload_mass.delta": delta})
-    x, v = np.array([0.0, 0.5, 2.0]) * vine.L, np.full(3, 0.3)
-    terms = evaluate(model, vine.trial(), np.zeros(3), x / 2, v / 2)
-    lighter = Vine(**{**vine.__dict__, "payload": vine.payload + delta})
-    floor = evaluate(base_model().with_values({"eversion_damping.B": 1.0}), lighter.trial(), np.zeros(3), x / 2, v / 2)
-    np.testing.assert_allclose(terms.inertia_kg, floor.inertia_kg, rtol=1e-9)
-    compiled = accelerations(model, vine.trial(), np.zeros(3), x / 2, v / 2)
-    np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)
-
-
-# ---- mixtures of effects at random plausible sizes ----
 
 TIMES = np.linspace(0.0, 0.3, 200)
 DRAWN_LAST = ("film_mass", "payload_mass")

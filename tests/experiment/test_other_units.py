@@ -27,17 +27,6 @@ def test_psi_bar_and_inches_become_kpa_and_millimetres(tmp_path: Path) -> None:
     assert "6.89476" in said["pressure_psi"].message
 
 
-def test_the_bounds_of_the_column_hold_after_conversion(tmp_path: Path) -> None:
-    read = one(tmp_path, diameter_mm=None, diameter_in="25")
-    assert "diameter_mm '635' is above 300 mm" in read.failed["a"]
-
-
-def test_a_quantity_in_two_units_keeps_that_of_the_sheet(tmp_path: Path) -> None:
-    read = one(tmp_path, diameter_in="2")
-    assert read.trials[0].diameter_m == 24 / 1000
-    assert ("twice", "diameter_in") in [(problem.code, problem.column) for problem in read.problems]
-
-
 def test_a_key_of_the_settings_in_another_unit_is_converted_and_said(tmp_path: Path) -> None:
     read = one(tmp_path, "yield_pressure_psi: 0.435\n", yield_pressure_kPa=None)
     assert read.trials[0].yield_pressure_Pa == pytest.approx(0.435 * PSI, rel=1e-12)
@@ -46,18 +35,19 @@ def test_a_key_of_the_settings_in_another_unit_is_converted_and_said(tmp_path: P
     assert problem.column == "yield_pressure_psi"
 
 
-@pytest.mark.parametrize(
-    "blank", ["yield_pressure_kPa:\nyield_pressure_psi: 0.435", "yield_pressure_kPa: 3\nyield_pressure_psi:"]
-)
-def test_a_blank_key_gives_way_to_the_same_quantity_in_another_unit(tmp_path: Path, blank: str) -> None:
-    """As the set-up page writes them: the unit of a quantity is changed, the line of the other one stays."""
-    (trial,) = one(tmp_path, blank, yield_pressure_kPa=None).trials
-    assert trial.yield_pressure_Pa == pytest.approx(3000, rel=1e-3)
-
-
-def test_a_blank_column_gives_way_to_the_same_quantity_in_another_unit(tmp_path: Path) -> None:
+def test_the_bounds_hold_after_conversion_and_of_two_units_that_with_a_value_counts(tmp_path: Path) -> None:
+    assert "diameter_mm '635' is above 300 mm" in one(tmp_path, diameter_mm=None, diameter_in="25").failed["a"]
+    read = one(tmp_path, diameter_in="2")
+    assert read.trials[0].diameter_m == 24 / 1000
+    assert ("twice", "diameter_in") in [(problem.code, problem.column) for problem in read.problems]
     (trial,) = one(tmp_path, pressure_kPa="", pressure_psi="4").trials
     assert trial.pressure_Pa == pytest.approx(4 * PSI, rel=1e-14)
+    # As the set-up page writes keys: the unit of a quantity is changed, the line of the other one stays.
+    for blank in ("yield_pressure_kPa:\nyield_pressure_psi: 0.435", "yield_pressure_kPa: 3\nyield_pressure_psi:"):
+        (trial,) = one(tmp_path, blank, yield_pressure_kPa=None).trials
+        assert trial.yield_pressure_Pa == pytest.approx(3000, rel=1e-3)
+    with pytest.raises(ExperimentError):
+        one(tmp_path, "yield_pressure_psi: 0.435\nyield_pressure_kPa: 3\n", yield_pressure_kPa=None)
 
 
 NUMBERS = [column for column in COLUMNS.values() if column.kind == "number" and other_units(column.name)]
@@ -82,8 +72,3 @@ def test_keys_of_groups_and_ranges_are_converted(tmp_path: Path) -> None:
     assert settings.limits.pressure_kPa == pytest.approx((6.894757, 34.473786))
     assert (settings.limits.diameter_mm, settings.limits.hoop_stress_MPa) == ((25.4, 50.8), 7)
     assert (settings.ambient_pressure_kPa, settings.axis.width_mm) == (100, 20)
-
-
-def test_a_key_in_two_units_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError):
-        one(tmp_path, "yield_pressure_psi: 0.435\nyield_pressure_kPa: 3\n", yield_pressure_kPa=None)

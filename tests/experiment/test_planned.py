@@ -14,12 +14,6 @@ from vinetrack.experiment.sheet import planned_sheet, planned_trial
 VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
 
 
-def refused(**values: str) -> list[str]:
-    with pytest.raises(ExperimentError) as caught:
-        planned_trial({**VINE, **values})
-    return [str(problem) for problem in caught.value.problems]
-
-
 def test_a_trial_of_texts_is_in_si() -> None:
     trial = planned_trial({**VINE, "payload_g": "35.6", "chamber_l": "3.7", "growth_angle_deg": "90"}).trials[0]
     assert (trial.diameter_m, trial.thickness_m, trial.length_m) == pytest.approx((0.024, 2e-4, 0.28))
@@ -34,17 +28,6 @@ def test_a_yield_pressure_that_is_not_given_is_not_known() -> None:
     assert (given.yield_pressure_Pa, given.yield_pressure_sigma_Pa) == (3e3, 200.0)
 
 
-def test_a_body_that_moves_as_a_whole_is_not_predicted() -> None:
-    assert any("--travel-ratio" in line for line in refused(travel_ratio="1"))
-
-
-def test_a_sheet_needs_no_recordings(tmp_path: Path) -> None:
-    (tmp_path / "trials.csv").write_text("trial,diameter_mm,thickness_um,length_mm,pressure_kPa\na,24,200,280,28\n")
-    planned = planned_sheet(tmp_path)
-    assert [trial.name for trial in planned.trials] == ["a"]
-    assert planned.folder == tmp_path
-
-
 def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path: Path) -> None:
     header, *rows = GOOD.splitlines()
     more = [rows[0].replace("a,a.csv", "c,c.csv"), rows[1].replace("b,b.csv", "d,d.csv")]
@@ -53,28 +36,26 @@ def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path: Path) -
     assert [trial.name for trial in trials] == ["a", "b"]
 
 
-def test_shared_settings_and_the_model_are_those_of_the_experiment(tmp_path: Path) -> None:
-    settings = (
-        "chamber_l: 2\ntail_slack: free\nmodel: [pressure_drive, gravity, eversion_damping, yield_pressure, leak]\n"
-    )
-    planned = planned_sheet(write(two_vines(tmp_path), GOOD, settings))
+def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_path: Path) -> None:
+    folder = write(two_vines(tmp_path), GOOD, "chamber_l: 2\nmodel: [pressure_drive, gravity, leak]\n")
+    planned = planned_sheet(folder)
     assert planned.trials[0].chamber_m3 == pytest.approx(2e-3)
-    assert planned.trials[0].tail_slack == "free"
     assert planned.settings.model[-1] == "leak"
-
-
-def test_a_fault_of_a_sheet_names_file_line_trial_and_column(tmp_path: Path) -> None:
-    folder = write(two_vines(tmp_path), GOOD.replace(",28,", ",28000,"))
+    write(folder, GOOD.replace(",28,", ",28000,"))
     with pytest.raises(ExperimentError) as caught:
         planned_sheet(folder)
     (problem,) = caught.value.problems
     assert (problem.file, problem.line, problem.trial, problem.column) == ("trials.csv", 2, "a", "pressure_kPa")
+    with pytest.raises(ExperimentError) as caught:
+        planned_trial({**VINE, "travel_ratio": "1"})  # a body that moves as a whole is not predicted
+    assert any("--travel-ratio" in str(problem) for problem in caught.value.problems)
 
 
-def test_a_column_that_no_sheet_has_is_named_and_not_passed_over(tmp_path: Path) -> None:
+def test_a_sheet_needs_no_recordings_and_an_unknown_column_is_not_passed_over(tmp_path: Path) -> None:
     """A payload under a wrong name would else be taken for none."""
-    text = "diameter_mm,thickness_um,length_mm,pressure_kPa,payload_gr\n24,200,280,28,35.6\n"
-    (tmp_path / "ideas.csv").write_text(text.replace("d", "trial,d", 1).replace("\n24", "\na,24"), encoding="utf-8")
+    text = "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,payload_gr\na,24,200,280,28,35.6\n"
+    (tmp_path / "ideas.csv").write_text(text, encoding="utf-8")
     planned = planned_sheet(tmp_path / "ideas.csv")
-    (line,) = (str(problem) for problem in planned.problems)
-    assert "payload_gr" in line
+    assert ([trial.name for trial in planned.trials], planned.folder) == (["a"], tmp_path)
+    (problem,) = planned.problems
+    assert "payload_gr" in str(problem)

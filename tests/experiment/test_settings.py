@@ -12,16 +12,9 @@ from pydantic import BaseModel
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import read_yaml
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.experiment.reference import (
-    column_entries,
-    reference_page,
-    setting_entries,
-)
+from vinetrack.experiment.reference import column_entries, reference_page, setting_entries
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import ExperimentSettings, RunSettings, read_experiment_settings, run_settings
-
-# Settings of an experiment and of a run: every fault named with its key, its line and what is allowed.
-
 
 CONFIG = Path(__file__).parents[2] / "config" / "config.yaml"
 
@@ -42,18 +35,12 @@ def test_no_file_gives_the_defaults(tmp_path: Path) -> None:
     settings = read_experiment_settings(tmp_path / "experiment.yaml")
     assert settings.model == ("pressure_drive", "gravity", "eversion_damping", "yield_pressure") == BASE_EFFECTS
     assert (settings.ambient_pressure_kPa, settings.tail_slack, settings.mass_loss) == (101.325, "taut", "geometric")
-    assert settings.candidates is None
-    assert not settings.strict
-    assert settings.calibration is None
+    assert (settings.candidates, settings.strict, settings.calibration) == (None, False, None)
 
 
 def test_settings_cover_exactly_the_columns_of_the_sheet() -> None:
     assert set(SHARED) == set(COLUMNS) - {"trial", "video", "track", "order", "axis", "frames_used", "point_mass"}
     assert set(SHARED) <= set(ExperimentSettings.model_fields)
-
-
-def test_a_window_is_not_taken_for_a_number_in_base_sixty(tmp_path: Path) -> None:
-    assert read(tmp_path, "steady: 1:20\n").steady == (1.0, 20.0)
 
 
 @pytest.mark.parametrize(
@@ -71,6 +58,7 @@ def test_every_kind_of_calibration(tmp_path: Path, text: str) -> None:
     assert settings.calibration.kind in text
     assert settings.axis is not None
     assert settings.axis.to_px == (5.0, 1.0)
+    assert read(tmp_path, "steady: 1:20\n").steady == (1.0, 20.0)  # no number in base sixty
 
 
 def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path: Path) -> None:
@@ -82,15 +70,12 @@ def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path: Path) ->
     assert (limits.thickness_um, limits.trials, limits.hoop_stress_MPa) == (None, 4, 7.8)
 
 
-def test_a_key_written_twice_is_refused(tmp_path: Path) -> None:
-    (problem,) = draft_problems(tmp_path, "strict: true\npayload_g: 1\nstrict: false\n")
-    assert (problem.column, problem.line) == ("strict", 3)
-
-
 @pytest.mark.parametrize("text", ["- a\n- b\n", "just text\n", "3\n", "payload_g: [1, 2\nuse: yes\n"])
 def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
     (problem,) = draft_problems(tmp_path, text)
     assert problem.file == "experiment.yaml"
+    (problem,) = draft_problems(tmp_path, "strict: true\npayload_g: 1\nstrict: false\n")
+    assert (problem.column, problem.line) == ("strict", 3)
 
 
 NOT_ALLOWED = {
@@ -127,10 +112,6 @@ def test_a_value_that_is_not_allowed_is_named_with_its_key(tmp_path: Path, key: 
     assert problem.column.startswith(key)
 
 
-def test_the_shipped_config_holds_the_defaults() -> None:
-    assert run_settings(read_yaml(CONFIG).content) == RunSettings()
-
-
 def _keys(model: type[BaseModel]) -> dict[str, Any]:
     return {
         name: _keys(type(field.default)) if isinstance(field.default, BaseModel) else None
@@ -138,7 +119,8 @@ def _keys(model: type[BaseModel]) -> dict[str, Any]:
     }
 
 
-def test_the_shipped_config_holds_every_key() -> None:
+def test_the_shipped_config_holds_every_key_at_its_default() -> None:
+    assert run_settings(read_yaml(CONFIG).content) == RunSettings()
     content = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
     shipped = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in content.items()}
     assert shipped == _keys(RunSettings)
@@ -165,9 +147,6 @@ def test_a_wrong_run_setting_is_named(values: dict[str, Any], column: str) -> No
     with pytest.raises(ExperimentError) as caught:
         run_settings(values)
     assert [problem.column for problem in caught.value.problems] == [column]
-
-
-# What `vinetrack settings` lists is what is read.
 
 
 def test_every_key_of_both_files_is_listed_once() -> None:

@@ -8,7 +8,7 @@ Nothing here but `simulated` uses the package's own physics.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.kernel import Trace
-from vinetrack.dynamics.model import Model, base_model, host_for, make_model
+from vinetrack.dynamics.model import Model, base_model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate
 
 G = 9.81
@@ -53,11 +53,9 @@ class Vine:
         """Tail and payload; the tests stop before the film's mass comes to its floor."""
         return self.lam * self.L - self.lam / 2 * x + self.payload
 
-    def base(self, x: float, v: float, *, P: float | None = None, A: float | None = None) -> float:
+    def base(self, x: float, v: float) -> float:
         """Right side of Eq. (2): ½(P − P_y)A + m g cosθ − ½Bẋⁿ."""
-        P = self.P if P is None else P
-        A = self.A if A is None else A
-        return 0.5 * (P - self.P_y) * A + self.m(x) * G * self.down - 0.5 * self.B * max(v, 0.0) ** N
+        return 0.5 * (self.P - self.P_y) * self.A + self.m(x) * G * self.down - 0.5 * self.B * max(v, 0.0) ** N
 
     def trial(self, **others: object) -> Trial:
         fields: dict[str, object] = {
@@ -81,9 +79,9 @@ BARE = Vine(D=12e-3, t=100e-6, L=0.30, P=40e3, P_y=5e3, B=1.83)
 LEVEL = Vine(D=24e-3, t=200e-6, L=0.28, P=28e3, P_y=3e3, B=6.44, payload=35.6e-3, down=0.0)
 
 
-def whole_catalogue(sizes: Mapping[str, float], names: Sequence[str] | None = None) -> Model:
+def whole_catalogue(sizes: Mapping[str, float]) -> Model:
     """Every effect at no size but those whose sizes are given, and the base effects."""
-    model = make_model(names) if names else host_for(base_model())
+    model = host_for(base_model())
     nothing = {f"{e.name}.{p.name}": p.zero for e in model for p in e.parameters if e.kind != "base"}
     return model.with_values({**nothing, **sizes})
 
@@ -106,8 +104,8 @@ def followed(
 ) -> Callable[[Floats], Floats]:
     """Tail travel against time by SciPy, from rest to x = `stop`.
 
-    `acceleration(t, x, v)`, or `acceleration(t, x, v, P)` with `chamber` = its first pressure and Ṗ(t, x, v, P). Ends
-    without the answer's tail after `stop`; its last time is kept as the attribute `end`.
+    `acceleration(t, x, v)`, or `acceleration(t, x, v, P)` with `chamber` = its first pressure and Ṗ(t, x, v, P). Its
+    last time, at `stop`, is kept as the attribute `end`, (x, ẋ) against time as `state`.
     """
 
     def slope(t: float, s: Floats) -> list[float]:
@@ -121,24 +119,14 @@ def followed(
 
     there.terminal = True  # type: ignore[attr-defined]
     start = [0.0, 0.0] if chamber is None else [0.0, 0.0, chamber[0]]
-    done = solve_ivp(
-        slope,
-        (0.0, until),
-        start,
-        "LSODA",
-        rtol=1e-10,
-        atol=[1e-13, 1e-12, 1e-6][: len(start)],
-        dense_output=True,
-        events=there,
-        max_step=max_step,
-    )
+    how = {"rtol": 1e-10, "atol": [1e-13, 1e-12, 1e-6][: len(start)], "dense_output": True, "max_step": max_step}
+    done = solve_ivp(slope, (0.0, until), start, "LSODA", events=there, **how)
     assert done.success, done.message
-    end = float(done.t[-1])
 
     def travel(times: Floats) -> Floats:
         return np.asarray(done.sol(times)[0])
 
-    travel.end = end  # type: ignore[attr-defined]
+    travel.end, travel.state = float(done.t[-1]), done.sol  # type: ignore[attr-defined]
     return travel
 
 
@@ -149,14 +137,13 @@ def assert_same_motion(
     *,
     share: float = 0.9,
     chamber: tuple[float, Callable[..., float]] | None = None,
-    trace: Trace | None = None,
     **others: object,
 ) -> None:
     """Lead positions agree to 10⁻⁵ of the distance, up to `share` of the length; and the effect does something."""
     travel = followed(acceleration, 2 * share * vine.L, chamber=chamber)
     times = np.linspace(0.0, travel.end, 61)  # type: ignore[attr-defined]
     truth = travel(times) / 2
-    got = simulated(vine, sizes, times, trace, **others).lead_position_m
+    got = simulated(vine, sizes, times, **others).lead_position_m
     assert np.max(np.abs(got - truth)) < 1e-5 * truth[-1]
     without = simulated(vine, {}, times, **others).lead_position_m
     assert np.max(np.abs(without - truth)) > 1e-4 * truth[-1]

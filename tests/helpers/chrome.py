@@ -16,7 +16,6 @@ import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from tornado.websocket import WebSocketClientConnection, websocket_connect
@@ -84,16 +83,9 @@ class Chrome:
     def __enter__(self) -> Chrome:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._socket.close()
-        self._process.terminate()
-        try:
-            self._process.wait(20)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait(20)
+        end(self._process)
         self._loop.close()
         self._scratch.cleanup()
 
@@ -127,9 +119,9 @@ class Chrome:
         elif method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def size(self, width: int, height: int, *, mobile: bool = False) -> None:
+    def size(self, width: int, height: int) -> None:
         """Size of the window, CSS pixels."""
-        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=mobile)
+        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def open(self, address: str) -> None:
         """Go to a page and wait until it has loaded."""
@@ -166,16 +158,19 @@ class Chrome:
         self.mouse("press", x, y)
         self.mouse("release", x, y)
 
-    def picture(self, path: Path, *, whole: bool = False) -> None:
-        """Save what is seen, or the whole page, as PNG."""
-        more: dict[str, Any] = {}
-        if whole:
-            size = self.send("Page.getLayoutMetrics")["cssContentSize"]
-            more = {
-                "captureBeyondViewport": True,
-                "clip": {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1},
-            }
-        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png", **more)["data"]))
+    def picture(self, path: Path) -> None:
+        """Save what is seen as PNG."""
+        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
+
+
+def end(process: subprocess.Popen[Any]) -> None:
+    """End a process that was started here, by force after 20 s."""
+    process.terminate()
+    try:
+        process.wait(20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait(20)
 
 
 async def _connect(address: str) -> WebSocketClientConnection:

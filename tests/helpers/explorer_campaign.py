@@ -10,10 +10,11 @@ import csv
 import json
 from pathlib import Path
 
-import av
 import numpy as np
 import pandas as pd
 from commanded import succeed as run
+from hand_diagnosis import diagnosis, next_experiment
+from plain_scene import write_video
 
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
@@ -60,41 +61,10 @@ def make_results(experiment: Path, results: Path) -> Path:
 
 def write_diagnosis(results: Path) -> Path:
     """Write a `diagnosis.json` with a tie and a next trial."""
-    ranking = [
-        {"effect": "reservoir_depletion", "delta_chi2": 4000.0, "in_answer_set": True, "reason": ""},
-        {"effect": "leak", "delta_chi2": 3995.0, "in_answer_set": True, "reason": ""},
-        {"effect": "air_drag", "delta_chi2": 12.0, "in_answer_set": False, "reason": "excluded"},
-        {"effect": "inlet_loss", "delta_chi2": None, "in_answer_set": False, "reason": "needs inlet_mm"},
-    ]
-    content = {
-        "verdict": "ambiguous",
-        "explanation": "Either of two effects explains these trials.",
-        "answer_set": ["reservoir_depletion", "leak"],
-        "rounds": [{"model": [], "verdict": "ambiguous", "ranking": ranking}],
-        "cosines": {
-            "effects": ["reservoir_depletion", "leak", "air_drag"],
-            "matrix": [[1.0, 0.97, 0.2], [0.97, 1.0, -0.75], [0.2, -0.75, None]],
-        },
-        "next_experiment": {
-            "text": "Grow the 24 mm vine at 60 kPa from a chamber of 4 L.",
-            "trials": [
-                {
-                    "pressure_kPa": 60.0,
-                    "payload_g": 0.0,
-                    "diameter_mm": 24.0,
-                    "thickness_um": 200.0,
-                    "chamber_l": 4.0,
-                    "replicates": 3,
-                    "new_vine": False,
-                    "changed": ["chamber_l"],
-                },
-            ],
-            "separation_sigma": {"reservoir_depletion | leak": 12.3},
-            "calibration": None,
-        },
-    }
+    advice = next_experiment() | {"text": "Grow the 24 mm vine at 60 kPa from a chamber of 4 L."}
+    advice["trials"][0] |= {"chamber_l": 4.0, "changed": ["chamber_l"], "new_vine": False}
     path = results / "diagnosis.json"
-    path.write_text(json.dumps(content), encoding="utf-8")
+    path.write_text(json.dumps(diagnosis("ambiguous", next_experiment=advice)), encoding="utf-8")
     return path
 
 
@@ -125,13 +95,7 @@ def film_of(experiment: Path, results: Path, trial: str) -> Path:
 def write_bars(path: Path, ends_px: np.ndarray, width: int = 960, height: int = 96) -> Path:
     """Write a clip with a bright bar on dark grey in every frame, from the left to the given end."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for end_px in ends_px:
-            picture = np.full((height, width), 40, np.uint8)
-            picture[30:66, : max(round(float(end_px)), 0)] = 200
-            frame = av.VideoFrame.from_ndarray(np.stack([picture] * 3, axis=2), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
+    frames = np.full((len(ends_px), height, width), 40, np.uint8)
+    for frame, end_px in zip(frames, ends_px, strict=True):
+        frame[30:66, : max(round(float(end_px)), 0)] = 200
+    return write_video(path, frames, options={"crf": "12"}, playback_fps=30)

@@ -12,12 +12,12 @@ def words(figure: Figure) -> str:
     return "\n".join(text.get_text() for text in figure.findobj(Text))
 
 
-def assert_nothing_is_cut_off(figure: Figure, legends_outside: bool = True) -> None:
+def assert_nothing_is_cut_off(figure: Figure) -> None:
     with look():
         figure.draw_without_rendering()
         drawn, edge = figure.get_tightbbox(), figure.bbox_inches.padded(0.02)
         assert edge.x0 <= drawn.x0 <= drawn.x1 <= edge.x1
         assert edge.y0 <= drawn.y0 <= drawn.y1 <= edge.y1
         for legend in [*figure.legends, *(ax.get_legend() for ax in figure.axes if ax.get_legend())]:
-            for ax in figure.axes if legends_outside else ():
+            for ax in figure.axes:
                 assert not legend.get_window_extent().padded(-1).overlaps(ax.get_window_extent().padded(-1))

@@ -12,7 +12,6 @@ from vinetrack.effects import Effect, own_effects
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import (
     BASE,
-    CAPTURE_FPS,
     GroundTruth,
     VirtualTrial,
     campaign,
@@ -41,12 +40,10 @@ def sheet(
     scales: Sequence[int] = (2, 4),
     replicates: int = 3,
     payloads_g: Sequence[float] = (0.0,),
-    chamber_m3: float = 3.7e-3,
-    capture_fps: float = CAPTURE_FPS,
 ) -> list[Trial]:
     """Isometric vines at a few pressures each, with these payloads."""
     trials = [
-        replace(trial, chamber_m3=chamber_m3, capture_fps=capture_fps)
+        replace(trial, chamber_m3=3.7e-3)
         for scale in scales
         for payload_g in payloads_g
         for trial in campaign(

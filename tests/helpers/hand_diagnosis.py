@@ -145,14 +145,6 @@ def ladder(*added: str) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def laws() -> pd.DataFrame:
-    row = {"vine": "v", "n_low_95": 0.35, "n_high_95": 0.45, "B": 1.8, "B_low_95": 1.7, "B_high_95": 1.9, "n_trials": 5}
-    models = ("+".join(BASE), "+".join([*BASE, "reservoir_depletion"]))
-    methods = ("log_log", "both_axes")
-    rows = [row | {"model": m, "method": k, "n": 0.4 - 0.03 * i} for i, m in enumerate(models) for k in methods]
-    return pd.DataFrame(rows)
-
-
 def moved() -> pd.DataFrame:
     columns = {"model": "m", "vine": "", "symbol": "n", "unit": "1", "parameter": "eversion_damping.n"}
     rows = [

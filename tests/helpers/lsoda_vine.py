@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from by_hand import followed
 
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.schema import with_names
@@ -41,29 +41,18 @@ def grown_position(
     """
     area = math.pi * trial.diameter_m**2 / 4
     film = trial.film_density_kg_m3 * math.pi * trial.diameter_m * trial.thickness_m
+    gravity = 9.81 * math.cos(trial.growth_angle_rad)
 
-    def drive(x: float) -> float:
-        pressure_Pa = trial.pressure_Pa if pressure_along is None else pressure_along(x / 2)
-        return 0.5 * (pressure_Pa * pressure_gain - trial.yield_pressure_Pa) * area
-
-    def rate(_t: float, state: np.ndarray) -> list[float]:
-        x, v = state
+    def acceleration(_t: float, x: float, v: float) -> float:
+        pressure_Pa = pressure_gain * (trial.pressure_Pa if pressure_along is None else pressure_along(x / 2))
         mass = film * trial.length_m - 0.5 * film * x + trial.payload_kg
-        gravity = 9.81 * math.cos(trial.growth_angle_rad)
-        return [v, (drive(x) - 0.5 * B * max(v, 0.0) ** n) / mass + gravity]
+        return (0.5 * (pressure_Pa - trial.yield_pressure_Pa) * area - 0.5 * B * v**n) / mass + gravity
 
-    def end(_t: float, state: np.ndarray) -> float:
-        return float(state[0] - 2 * 0.96 * trial.length_m)
-
-    end.terminal = True  # type: ignore[attr-defined]
-    last = float(time_s[-1])
-    run = solve_ivp(rate, (0, last), [0, 0], "LSODA", rtol=1e-9, atol=1e-10, dense_output=True, events=end)
-    out = np.where(time_s <= run.t[-1], run.sol(np.clip(time_s, 0, run.t[-1]))[0] / 2, np.nan)
-    return np.where(time_s < 0, 0.0, out)
+    travel = followed(acceleration, 2 * 0.96 * trial.length_m, until=float(time_s[-1]))
+    return np.where(time_s <= travel.end, travel(np.clip(time_s, 0, travel.end)) / 2, np.nan)
 
 
 def as_track(time_s: np.ndarray, position_m: np.ndarray, pressure_Pa: np.ndarray | None = None) -> Track:
-    """A bare track of these positions."""
     return plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
 
 

@@ -14,10 +14,10 @@ from vinetrack.video.track import Tracking, track_frames
 FPS = 1000.0
 
 
-def in_memory(luma: np.ndarray, name: str = "scene.mp4") -> Frames:
+def in_memory(luma: np.ndarray) -> Frames:
     """Frames (n, height, width) as those of a sound container of eight bits."""
     n, height, width = luma.shape
-    recording = Recording(Path(name), "container", width, height, 8, n)
+    recording = Recording(Path("scene.mp4"), "container", width, height, 8, n)
     return Frames(recording, recording.whole, luma, np.arange(n), np.zeros(n, dtype=bool))
 
 

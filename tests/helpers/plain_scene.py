@@ -194,11 +194,11 @@ def write_video(
     return path
 
 
-def write_images(folder: Path, frames: np.ndarray, suffix: str = ".png", first: int = 1, step: int = 1) -> Path:
+def write_images(folder: Path, frames: np.ndarray, suffix: str = ".png", step: int = 1) -> Path:
     """Write frames as a folder of numbered images."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, picture in enumerate(frames):
-        cv2.imwrite(str(folder / f"frame_{first + i * step:04d}{suffix}"), picture)
+        cv2.imwrite(str(folder / f"frame_{1 + i * step:04d}{suffix}"), picture)
     return folder
 
 

@@ -10,10 +10,9 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
-from chrome import Chrome, until
+from chrome import Chrome, end, until
 
 PROGRAM = "from vinetrack.cli.main import main; main()"
 
@@ -57,16 +56,9 @@ class Served:
     def __enter__(self) -> Served:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
-            self.process.terminate()
-            try:
-                self.process.wait(20)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait(20)
+            end(self.process)
         self._reader.join(10)
         if self.process.stdout is not None:
             self.process.stdout.close()

@@ -1,7 +1,7 @@
 """Truth for the tests of `motion`: everting vines integrated by SciPy, and noise of known statistics.
 
-m(x) ẍ = ½(P − P_y)A + m g − ½B ẋⁿ with m = λL + m_pay − (λ/2)x, integrated by Radau (rtol 1e-10): none of the
-package's own integrators or effects take part.
+m(x) ẍ = ½(P − P_y)A + m g − ½B ẋⁿ with m = λL + m_pay − (λ/2)x, integrated to 1e-10: none of the package's own
+integrators or effects take part.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from by_hand import followed
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 from vinetrack.core.records import Track, plain_track
 
@@ -20,6 +21,7 @@ G = 9.81
 N_EXPONENT = 0.37
 B_PRINTED = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}
 CAPTURE_FPS = 1069.0
+make_track = plain_track
 
 Floats = NDArray[np.float64]
 
@@ -62,23 +64,13 @@ class Vine:
 @lru_cache(maxsize=512)
 def motion(vine: Vine):
     """Dense solution (x, ẋ)(t) of one vine from rest, and the time at which it is fully grown (99.9 % of L)."""
-    b, length = B_PRINTED[vine.scale], vine.length_m
+    b = B_PRINTED[vine.scale]
 
-    def slope(_t: float, state: Floats) -> list[float]:
-        x, v = state
-        mass = max(float(vine.mass_kg(x)), 1e-9)
-        force = 0.5 * vine.drive_N + mass * G - 0.5 * b * max(v, 0.0) ** N_EXPONENT
-        return [v, force / mass]
+    def acceleration(_t: float, x: float, v: float) -> float:
+        return (0.5 * vine.drive_N - 0.5 * b * v**N_EXPONENT) / float(vine.mass_kg(x)) + G
 
-    def grown(_t: float, state: Floats) -> float:
-        return state[0] - 2 * 0.999 * length
-
-    grown.terminal = True
-    limit_s = 20 * 2 * length / vine.tail_speed_m_s
-    solution = solve_ivp(
-        slope, (0, limit_s), [0.0, 0.0], "Radau", rtol=1e-10, atol=1e-13, dense_output=True, events=grown
-    )
-    return solution.sol, float(solution.t[-1])
+    travel = followed(acceleration, 2 * 0.999 * vine.length_m, until=40 * vine.length_m / vine.tail_speed_m_s)
+    return travel.state, travel.end
 
 
 @dataclass(frozen=True)
@@ -92,18 +84,10 @@ class Recording:
     grown_s: float
 
 
-def make_track(time_s: Floats, lead_position_m: Floats) -> Track:
-    """A plain track without flags."""
-    return plain_track(np.asarray(time_s, dtype=float), np.asarray(lead_position_m, dtype=float))
-
-
 def ar1(n: int, sd: float, rho: float, rng: np.random.Generator) -> Floats:
     """Stationary AR(1) noise of marginal standard deviation `sd`."""
-    from scipy.signal import lfilter
-
-    burn = 60
-    innovations = rng.standard_normal(n + burn) * sd * math.sqrt(1 - rho**2)
-    return lfilter([1.0], [1.0, -rho], innovations)[burn:]
+    innovations = rng.standard_normal(n + 60) * sd * math.sqrt(1 - rho**2)
+    return lfilter([1.0], [1.0, -rho], innovations)[60:]
 
 
 def record(
@@ -114,13 +98,12 @@ def record(
     rho: float = 0.0,
     rest_frames: int = 40,
     end_frames: int = 0,
-    capture_fps: float = CAPTURE_FPS,
 ) -> Recording:
     """Sample a vine: still frames before release, `end_frames` flat ones once it is grown, arbitrary zeros."""
     solution, duration_s = motion(vine)
-    release_s = (rest_frames + rng.uniform()) / capture_fps
-    n = int(np.floor((release_s + duration_s) * capture_fps)) + 1 + end_frames
-    time_s = np.arange(n) / capture_fps
+    release_s = (rest_frames + rng.uniform()) / CAPTURE_FPS
+    n = int(np.floor((release_s + duration_s) * CAPTURE_FPS)) + 1 + end_frames
+    time_s = np.arange(n) / CAPTURE_FPS
     since = np.clip(time_s - release_s, 0, duration_s)
     tail, tail_speed = solution(since)
     lead, lead_speed = tail / 2, tail_speed / 2

@@ -13,7 +13,6 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory import __main__ as command
 from vinetrack.laboratory.filming import make_filming, recording_experiment
 from vinetrack.laboratory.tracks import (
     GroundTruth,
@@ -24,7 +23,6 @@ from vinetrack.laboratory.tracks import (
     isometric_vine,
     read_ground_truth,
     write_experiment,
-    write_tracks,
 )
 from vinetrack.tracks.importers import load_track
 
@@ -42,30 +40,16 @@ def nature(**changes: object) -> GroundTruth:
 EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
 
 
-def same(one: VirtualTrial, other: VirtualTrial) -> bool:
-    return np.array_equal(one.track.lead_position_m, other.track.lead_position_m) and one.release_s == other.release_s
+def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_seed_others() -> None:
+    def same(one: VirtualTrial, other: VirtualTrial) -> bool:
+        moved = np.array_equal(one.track.lead_position_m, other.track.lead_position_m)
+        return moved and (one.release_s, one.true) == (other.release_s, other.true)
 
-
-# ---- seeds ----
-
-
-def test_the_same_seed_gives_the_same_numbers_and_another_others() -> None:
-    trials = few()
-    one, again, other = grow(trials, nature(seed=3)), grow(trials, nature(seed=3)), grow(trials, nature(seed=4))
-    assert all(same(a, b) for a, b in zip(one, again, strict=True))
-    assert not any(same(a, b) for a, b in zip(one, other, strict=True))
-
-
-def test_leaving_a_trial_out_changes_no_other() -> None:
-    trials = few()
-    rest = [trial for i, trial in enumerate(trials) if i != 3]
-    whole = {grown.stated.name: grown for grown in grow(trials, nature(seed=5, yield_error_kPa=0.2))}
-    for grown in grow(rest, nature(seed=5, yield_error_kPa=0.2)):
-        assert same(grown, whole[grown.stated.name])
-        assert grown.true == whole[grown.stated.name].true
-
-
-# ---- what nature does ----
+    trials, hidden = few(), nature(seed=5, yield_error_kPa=0.2)
+    whole = grow(trials, hidden)
+    rest = grow([trial for i, trial in enumerate(trials) if i != 3], hidden)
+    assert all(map(same, whole[:3] + whole[4:], rest))
+    assert not any(map(same, whole, grow(trials, replace(hidden, seed=4))))
 
 
 def test_without_scatter_and_noise_a_track_is_the_model_seen_from_an_unknown_origin() -> None:
@@ -100,20 +84,18 @@ def test_scatter_of_damping_and_pressure_is_as_stated() -> None:
     assert np.std(release % 1) == pytest.approx(math.sqrt(1 / 12), rel=0.1)
 
 
-@pytest.mark.parametrize("correlation", [0.6])
-def test_noise_has_the_stated_deviation_and_correlation(correlation: float) -> None:
+def test_noise_has_the_stated_deviation_and_correlation() -> None:
     """Rest frames alone, 4000 of them: errors of 2 % for the deviation (or more), 0.016 for the latter."""
-    hidden = nature(
-        seed=11, noise_m=2e-4, noise_correlation=correlation, release_frames=(4000, 4000), longest_frames=4000
-    )
+    at_rest = {"release_frames": (4000, 4000), "longest_frames": 4000}
+    hidden = nature(seed=11, noise_m=2e-4, noise_correlation=0.6, **at_rest)
     noise = grow(few()[:1], hidden)[0]
     assert (noise.true_lead_position_m == 0).all()
     residual = noise.track.lead_position_m - noise.origin_m
     assert residual.std() == pytest.approx(2e-4, rel=0.08)
     assert abs(residual.mean()) < 2e-5
     centred = residual - residual.mean()
-    assert centred[1:] @ centred[:-1] / (centred @ centred) == pytest.approx(correlation, abs=0.06)
-    assert centred[2:] @ centred[:-2] / (centred @ centred) == pytest.approx(correlation**2, abs=0.08)
+    assert centred[1:] @ centred[:-1] / (centred @ centred) == pytest.approx(0.6, abs=0.06)
+    assert centred[2:] @ centred[:-2] / (centred @ centred) == pytest.approx(0.36, abs=0.08)
 
 
 def test_a_recorded_pressure_is_what_drove_it_and_noise() -> None:
@@ -142,9 +124,6 @@ def test_a_hidden_measurement_effect_shows_in_the_track_and_not_in_the_truth() -
         np.testing.assert_allclose(seen, 1.05 * grown.true_lead_position_m, atol=1e-12)
 
 
-# ---- files ----
-
-
 def test_what_is_written_reads_back_without_a_word(tmp_path: Path) -> None:
     grown = grow(few(), nature(seed=1, trace_sigma_kPa=0.05))
     write_experiment(grown, tmp_path / "e", "chamber_l: 3.7\n")
@@ -158,19 +137,6 @@ def test_what_is_written_reads_back_without_a_word(tmp_path: Path) -> None:
         np.testing.assert_allclose(track.lead_position_m, one.track.lead_position_m, atol=1e-8)
         np.testing.assert_allclose(np.diff(track.time_s), np.diff(one.track.time_s), atol=2e-9)
         assert track.pressure_Pa is not None
-
-
-def test_the_demonstration_can_be_grown(tmp_path: Path) -> None:
-    """Every trial of the shipped sheet, filmed or tracked, moves as the demonstration's nature says."""
-    demo = read_experiment(ROOT / "data" / "demo")
-    hidden = read_ground_truth(command.DEMO)
-    grown = grow(demo.trials, hidden)
-    assert len(grown) == len(demo.trials) > 5
-    for one in grown:
-        assert one.track.time_s.size > 30
-        assert one.true_lead_position_m[-1] > 0.9 * one.stated.length_m
-    write_tracks(grown, tmp_path)
-    assert {path.stem for path in tmp_path.iterdir()} == {trial.name for trial in demo.trials}
 
 
 PAPER = ROOT / "data" / "paper"

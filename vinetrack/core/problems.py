@@ -12,7 +12,6 @@ from typing import Any
 
 CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
 
-
 # Reason given for a trial or stage that an unexpected exception stopped
 INTERNAL_ERROR = "an internal error of the program; the traceback is in the log of this stage"
 

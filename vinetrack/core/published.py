@@ -1,7 +1,7 @@
 """Published numbers: Alvarez et al., IEEE Robotics and Automation Letters, 2025.
 
-Only printed numbers are listed here; the priors for other vines derived from them are in
-`vinetrack.planning.predictive_inputs`.
+Only printed numbers are listed here; those with one use stand where they are used, and the priors for other vines
+derived from them in `vinetrack.planning.predictive_inputs`.
 """
 
 from __future__ import annotations
@@ -17,18 +17,9 @@ EXPONENT = 0.37  # Damping exponent n, one for all scales (published)
 THICKNESS_UM = {1: 50.0, 2: 100.0, 3: 150.0, 4: 200.0}
 DIAMETER_MM = {1: 6.0, 2: 12.0, 3: 18.0, 4: 24.0}  # The four isometric vines of Table I
 
-PRESS_TEMPERATURE_DEGC = {1: 110.0, 2: 82.0, 3: 96.0, 4: 96.0}
-LASER_POWER_PERCENT = {1: 60.0, 2: 76.0, 3: 81.0, 4: 86.0}  # Fabrication settings of the four vines
-
-CONDITIONS = (8, 11)  # Pressures per scale in the damping fit, fewest and most (published)
-
-TRIALS = (4, 5)  # Trials per pressure, fewest and most (published; read by `paper/rows.csv`)
-
-REPLICATES = 4  # N of Figs. 4, 5, 8 and 9 (published)
-
 STEADY_FEWEST_POINTS, STEADY_CV = 3, 0.03  # Definition of a steady window (published)
 
-YIELD_PRESSURE_KPA, YIELD_PRESSURE_SCALE = 3.0, 4  # Yield pressure of the 24 mm × 200 µm vine, R = 4 (published)
+YIELD_PRESSURE_KPA = 3.0  # Yield pressure of the 24 mm × 200 µm vine, R = 4 (published)
 
 CAPTURE_FPS = 1069.0  # Frames a second of the recordings (published)
 
@@ -51,29 +42,22 @@ FINAL_SPEED_AT_MM = 120.0  # Travel at which the final speed of Fig. 5 is evalua
 
 FINAL_SPEED_THICKNESS_UM = 150.0  # Wall of the vines of Fig. 5 (published)
 
-STEADY_SPEED_KPA, STEADY_SPEED_R2, STEADY_SPEED_P_VALUE = 24.0, 0.935, 0.32  # Steady speed against scale (published)
+STEADY_SPEED_KPA, STEADY_SPEED_R2 = 24.0, 0.935  # Steady speed against scale (published)
 
 THICKNESS_SERIES_DIAMETER_MM = 12.0  # Diameter of the vines whose B is plotted against thickness (Fig. 7B) (published)
 
-# Energy efficiency with payload (Fig. 9): pressure, growth and diameters (published)
-EFFICIENCY_KPA, EFFICIENCY_AT_MM, EFFICIENCY_DIAMETERS_MM = 34.0, 150.0, (12.0, 18.0)
+EFFICIENCY_KPA = 34.0  # Pressure of the energy efficiency with payload, Fig. 9 (published)
 
 # The fastest vine, without payload, at a pressure just below its burst pressure
 FAST_VINE = {"thickness_um": 100.0, "diameter_mm": 25.0, "length_mm": 400.0, "pressure_kPa": 62.0}
-
-# Speed of its leading edge, measured and predicted by the authors
-FAST_VINE_MEASURED_M_S, FAST_VINE_PREDICTED_M_S = 60.0, 56.0
 
 # One vine of the dye injector
 INJECTOR = {"thickness_um": 50.0, "diameter_mm": 2.5, "length_mm": 12.5, "pressure_kPa": 48.0}
 
 INJECTOR_CHAMBER_MM = (20.0, 15.0)  # Length and diameter of its chamber (published)
 
-INJECTOR_CHANGE = 0.017  # Printed relative change of its pressure (published)
-
+# A vine whose drag is stated to stay small up to its pressure (published)
 DRAG_EXAMPLE = {"thickness_um": 50.0, "diameter_mm": 24.0, "length_mm": 150.0, "pressure_kPa": 56.0}
-# A vine whose drag is stated to stay below this fraction of the driving force up to its pressure (published)
-DRAG_COEFFICIENT, DRAG_SHARE = 0.82, 0.05
 
 
 def scale_of(diameter_mm: float, thickness_um: float) -> int | None:

@@ -23,7 +23,6 @@ Bools = NDArray[np.bool_]
 # Flags of a point of a track; several are joined by `;` in this order
 FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "corrected", "gap", "retimed", "after_end")
 
-
 # Flags of points that are not measurements of the leading edge
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 
@@ -31,14 +30,10 @@ UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
 
-CORRECTION_ACTIONS = ("move", "drop", "confirm")  # Manual corrections of a point of a track
-
 
 @dataclass(frozen=True)
 class Correction:
-    """A manual correction of one frame of a recording: one of CORRECTION_ACTIONS, and for `move` the new position.
-    `edge_px` is measured along the growth axis of the trial, as in the track; NaN if the point is not moved.
-    """
+    """A correction of one frame by hand: `move` to `edge_px` along the growth axis, else NaN, `drop` or `confirm`."""
 
     frame: int
     action: str

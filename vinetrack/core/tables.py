@@ -152,7 +152,6 @@ STANDARD_OUTPUT = Path("-")  # convention of commands: this name means standard 
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # Such as 1,069 or 1.069
-_SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", re.ASCII)
 
 
 class TableError(InputError):
@@ -344,7 +343,7 @@ def safe_join(folder: Path, relative: str) -> Path:
 
 def result_file(folder: Path, name: str, suffix: str) -> Path:
     """Return the path of a result named after a trial, vine or condition; refuse a name that could leave `folder`."""
-    if not _SAFE_NAME.fullmatch(name):
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", name):
         raise TableError(f"{name[:40]!r} cannot name a file", "use letters, digits, _ and -")
     return folder / f"{name}{suffix}"
 

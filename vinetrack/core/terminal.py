@@ -20,28 +20,20 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 
-SEVERITY_COLOURS = {"error": "31", "warning": "33"}  # Red and yellow, as codes of a terminal
-
-_NUMBER = re.compile(
-    r"[<>~≤≥≈]?\s*[+\-−±×]?\s*\d[\d.,]*(?:[eE][+\-−]?\d+)?\s*[%×]?(?:\s*±\s*[\d.,]+(?:[eE][+\-]?\d+)?)?"
-)
-_NO_VALUE = frozenset({"", "–", "-", "—", "nan", "open"})
-
-
-def colour_wanted(stream: TextIO | None = None) -> bool:
+def colour_wanted(stream: TextIO) -> bool:
     """Whether to use colour on a stream."""
-    stream = stream or sys.stdout
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return False
     return stream.isatty()
 
 
-def severity_first(line: str, stream: TextIO | None = None) -> str:
+def severity_first(line: str, stream: TextIO) -> str:
     """Return a line of `format_problems` with its first word in the colour of its severity."""
     word, colon, message = line.partition(":")
-    if word not in SEVERITY_COLOURS or not colour_wanted(stream):
+    colours = {"error": "31", "warning": "33"}  # Red and yellow, as codes of a terminal
+    if word not in colours or not colour_wanted(stream):
         return line
-    return f"\x1b[{SEVERITY_COLOURS[word]};1m{word}\x1b[0m{colon}{message}"
+    return f"\x1b[{colours[word]};1m{word}\x1b[0m{colon}{message}"
 
 
 def table(
@@ -58,9 +50,7 @@ def table(
     body = [[str(cell) for cell in row] for row in rows]
     above = [list(line) for line in (header, units) if line]
     lines = [*above, *body]
-    if not lines:
-        return []
-    count = max(map(len, lines))
+    count = max(map(len, lines), default=0)
     lines = [line + [""] * (count - len(line)) for line in lines]
     columns = list(zip(*lines, strict=True))
     sides = align or "".join(">" if _is_numeric(column[len(above) :]) else "<" for column in columns)
@@ -75,8 +65,9 @@ def table(
 
 def _is_numeric(cells: Sequence[str]) -> bool:
     """Whether all cells of a column are numbers or placeholders for a missing one, and at least one is a number."""
-    values = [cell for cell in map(str.strip, cells) if cell not in _NO_VALUE]
-    return bool(values) and all(_NUMBER.fullmatch(cell) for cell in values)
+    values = [cell for cell in map(str.strip, cells) if cell not in ("", "–", "-", "—", "nan", "open")]
+    number = r"[<>~≤≥≈]?\s*[+\-−±×]?\s*\d[\d.,]*(?:[eE][+\-−]?\d+)?\s*[%×]?(?:\s*±\s*[\d.,]+(?:[eE][+\-]?\d+)?)?"
+    return bool(values) and all(re.fullmatch(number, cell) for cell in values)
 
 
 class Progress(Generic[Item]):
@@ -132,14 +123,11 @@ class Progress(Generic[Item]):
             self._bar.stop()
 
 
-def progress(
-    work: Iterable[Item] | int, description: str, *, total: int | None = None, unit: str = "trial"
-) -> Progress[Item]:
+def progress(work: Iterable[Item] | int, description: str, unit: str = "trial") -> Progress[Item]:
     """Return a progress bar over the elements of `work`, or over a number of steps."""
     if isinstance(work, int):
         return Progress(None, work, description, unit)
-    count = len(work) if total is None and isinstance(work, Sized) else total
-    return Progress(work, count, description, unit)
+    return Progress(work, len(work) if isinstance(work, Sized) else None, description, unit)
 
 
 def waiting(description: str) -> Progress[None]:

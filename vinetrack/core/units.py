@@ -35,9 +35,6 @@ GAS_CONSTANT_AIR_J_KG_K = 287.0  # Derived: 8.314 J/(mol·K) over 0.02896 kg/mol
 # Used by terminal, report, figures and explorer alike.
 
 
-_SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
 def decimals(sigma: float) -> int:
     """Return the number of decimals that shows two digits of an error, at most 12; 0 for an error of 0 or NaN."""
     # 12: derived: an error below 1e-11 is the rounding of a double of order 1e5
@@ -51,13 +48,12 @@ def or_nan(value: Any) -> float:
 
 def number(value: float | None, digits: int = 3) -> str:
     """Return `value` to `digits` significant digits, without exponent from 0.0001 to 999999; "–" for None and NaN."""
-    fixed_exponents = (-4, 6)  # Decimal exponents written without "e" (convention)
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
         return "0"
     exponent = math.floor(math.log10(abs(value)))
-    if not fixed_exponents[0] <= exponent < fixed_exponents[1]:
+    if not -4 <= exponent < 6:
         return f"{value:.{digits - 1}e}"
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
 
@@ -75,7 +71,8 @@ def with_error(value: float | None, sigma: float | None) -> str:
         shown = max(places - power, 0)
         scaled = value * 10.0**power
         scaled = 0.0 if abs(scaled) < 0.5 * 10.0**-shown else scaled  # no "-0.0"
-        return f"({scaled:.{shown}f} ± {sigma * 10.0**power:.{shown}f})·10⁻{str(power).translate(_SUPERSCRIPTS)}"
+        raised = str(power).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        return f"({scaled:.{shown}f} ± {sigma * 10.0**power:.{shown}f})·10⁻{raised}"
     return f"{value:.{max(places, 0)}f} ± {sigma:.{max(places, 0)}f}"
 
 
@@ -84,8 +81,7 @@ def interval(bounds: Sequence[float | None] | None) -> str:
     if bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return "–"
     low, high = (float(bound) for bound in bounds if bound is not None)
-    width = high - low
-    places = min(max(1 - math.floor(math.log10(width)), 0), 6) if width > 0 else 2
+    places = min(decimals(high - low), 6) if high > low else 2
     return f"{low:.{places}f} to {high:.{places}f}"
 
 
@@ -97,7 +93,7 @@ def with_interval(value: float | None, bounds: Sequence[float | None] | None, sh
         return number(value)
     low, high = (float(bound) for bound in bounds if bound is not None)
     half = float(f"{(high - low) / 2:.1e}")  # 0.00999 rounds to 0.010
-    places = min(max(1 - math.floor(math.log10(half)), 0), 6) if half > 0 else 3
+    places = min(decimals(half), 6) if half > 0 else 3
     return f"{value:.{places}f}" + (f" (95 %: {low:.{places}f} to {high:.{places}f})" if shown else "")
 
 
@@ -158,12 +154,7 @@ UNITS: dict[str, Unit] = {
 }
 
 # Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is dimensionless
-DISPLAY_UNITS: dict[str, tuple[str, float]] = {
-    "Pa": ("kPa", 1e-3),
-    "1/Pa": ("1/kPa", 1e3),
-    "kg": ("g", 1e3),
-    "1": ("", 1.0),
-}
+DISPLAY_UNITS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "kg": ("g", 1e3), "1": ("", 1.0)}
 
 SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}  # Display units of sliders
 
@@ -171,16 +162,15 @@ PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}  # Display units of predi
 
 
 def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNITS) -> tuple[str, float]:
-    """Return the display unit of an SI unit, and the factor from SI. Returns name, factor (the unit itself and 1.0 if
-    it has no other display unit), >>> display_unit("Pa"), display_unit("m"), (('kPa', 0.001), ('m', 1.0)).
-    """
+    """Return the display unit of an SI unit and the factor from SI: itself and 1.0 if it has no other."""
     return table.get(unit, (unit, 1.0))
 
 
 def split_unit(name: str) -> tuple[str, str]:
     """Split a name into its quantity and the key of its unit, which is blank if the name does not end in a unit.
-    Returns quantity, unit, >>> split_unit("yield_pressure_kPa"), split_unit("film_density_kg_m3"), split_unit("bends"),
-    (('yield_pressure', 'kPa'), ('film_density', 'kg_m3'), ('bends', '')).
+
+    >>> split_unit("film_density_kg_m3"), split_unit("bends")
+    (('film_density', 'kg_m3'), ('bends', ''))
     """
     parts = name.split("_")
     for start in range(1, len(parts)):

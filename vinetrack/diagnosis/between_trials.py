@@ -338,7 +338,6 @@ def _effect_of(difference: Difference) -> Effect:
         parameters=drift or parameters,
         functions={},
         needs=(),
-        easily_taken_for=(),
         worked=(),
         path=Path(difference.name),
     )

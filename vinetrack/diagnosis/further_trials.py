@@ -51,7 +51,7 @@ from vinetrack.planning.discriminating_design import (
     worth,
 )
 from vinetrack.planning.predictive_inputs import prior_ratio
-from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES, DesignProblem, simulated_rises
+from vinetrack.planning.simulated_campaigns import DesignProblem, simulated_rises
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
@@ -383,7 +383,8 @@ class DesignInformation:
         moving = [trial_data.time_s.size - trial_data.n_rest for trial_data in tests.fit.predictor.data]
         blocks = _products_by_trial(tests, list(indices.values()))
         before = {trial.name for trial in design.trials}
-        filmed = {name: k for k, name in enumerate(names) if name not in before and moving[k] >= FEWEST_GROWTH_FRAMES}
+        # 12: frames of growth below which a trial is not worth filming (chosen)
+        filmed = {name: k for k, name in enumerate(names) if name not in before and moving[k] >= 12}
         self.conditions = tuple(condition for condition in every if condition.trial.name in filmed)
         self.each = REPLICATES * blocks[[filmed[condition.trial.name] for condition in self.conditions]]
         done = [k for k, name in enumerate(names) if name in before]

@@ -494,7 +494,6 @@ TAIL_SLACK = Effect(
     parameters=(),
     functions=MappingProxyType({}),
     needs=(),
-    easily_taken_for=(),
     worked=(),
     path=Path(__file__).resolve(),
 )

@@ -30,16 +30,15 @@ from vinetrack.effects import HOOKS, Effect, EffectError, State, TrialInputs, ca
 
 @dataclass(frozen=True)
 class Terms:
-    """Everything that the model computes along a motion; arrays of the motion's shape, SI. `tip_N` and `tail_N` are the
-    forces by effect: those at the tip act on the tail by 1/r, those on the tail in full.
+    """Everything that the model computes along a motion; arrays of the motion's shape, SI. `tip_N` are the forces at
+    the tip by effect, `tension_N` what they do to the tail, by 1/r, `total_N` that and the forces on the tail.
     """
 
     pressure_Pa: Floats
     area_m2: Floats
-    mass_kg: Floats
     tip_N: Mapping[str, Floats]
-    tail_N: Mapping[str, Floats]
     tension_N: Floats
+    total_N: Floats
     acceleration_m_s2: Floats
     inertia_kg: Floats
     state: State
@@ -69,8 +68,9 @@ def evaluate(
     moving_mass = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
     state = state._replace(moving_mass=moving_mass, linear_density=rig.linear_density * film)
     state = hooks.changed("damping_gain", _with_pressure(hooks, state, measured_Pa))
-    tip, tail = hooks.each("tip_force", state), hooks.each("tail_force", state)
+    tip = hooks.each("tip_force", state)
     tension = sum(tip.values(), nothing) / rig.travel_ratio
+    tail = sum(hooks.each("tail_force", state).values(), nothing)
     # Everything that moves with the tail. The floor of the film's mass is that of fold and gas: mass that effects add
     # counts towards it. Mass that they remove is the payload's, not that of film, which goes to zero during growth;
     # fold and gas remain.
@@ -80,11 +80,10 @@ def evaluate(
     return Terms(
         pressure_Pa=np.asarray(state.pressure),
         area_m2=np.asarray(state.area),
-        mass_kg=np.asarray(state.moving_mass),
         tip_N=tip,
-        tail_N=tail,
         tension_N=tension,
-        acceleration_m_s2=(tension + sum(tail.values(), nothing)) / inertia,
+        total_N=tension + tail,
+        acceleration_m_s2=(tension + tail) / inertia,
         inertia_kg=inertia,
         state=state,
     )
@@ -191,13 +190,6 @@ def _chamber_pressure(hooks: _Hooks, state: State) -> Any:
     return pressure
 
 
-def pressure_along(
-    model: Model, trial: Trial, time_s: Floats, lead_position_m: Floats, lead_velocity_m_s: Floats
-) -> Floats:
-    """Gauge pressure that drove a measured motion according to a model. Shape (n,)."""
-    return evaluate(model, trial, time_s, lead_position_m, lead_velocity_m_s).pressure_Pa
-
-
 COLUMNS = (
     "trial", "condition", "term", "size", "force_N", "share_of_drive", "shift_m", "time_s", "lead_position_m",
     "y_over_L", "slack_from_s", "note",
@@ -287,25 +279,20 @@ def measured_motion(
 
 def audit(model: Model, motions: Sequence[AuditedMotion]) -> Audit:
     """Compute what `model` neglects along each motion."""
-    physical = [effect for effect in catalogue().values() if effect.kind != "measurement"]
+    replaced = {name for effect in model for name in (effect.name, *effect.replaces)}
+    left = [e for e in catalogue().values() if e.kind != "measurement" and e.name not in replaced]
     rows: list[dict[str, Any]] = []
     violations: list[RuleViolation] = []
     for motion in (motion.thinned() for motion in motions):
         terms = motion.terms(model)
-        neglected = [effect for effect in physical if not _in_model(effect, model, motion)]
+        # A pressure measured during growth includes what happens in the chamber.
+        neglected = [effect for effect in left if not (effect.in_trace and motion.pressure_Pa is not None)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
         tension = _tension_row(motion, terms)
         rows += [*left_out, tension]
         violated = _violated_rules(model, motion, {row["term"]: row for row in left_out}, tension)
         violations += [RuleViolation(motion.trial.name, rule, words) for rule, words in violated]
     return Audit(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(violations))
-
-
-def _in_model(effect: Effect, model: Model, motion: AuditedMotion) -> bool:
-    """Whether the model, or a pressure measured during growth, includes an effect."""
-    if effect.name in model or (effect.in_trace and motion.pressure_Pa is not None):
-        return True
-    return any(effect.name in other.replaces for other in model)
 
 
 def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without: Terms) -> dict[str, Any]:
@@ -325,16 +312,11 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
         return motion.row(effect.name, i, size=size, shift_m=float(shift[i]))
     if set(effect.functions) == {"rest_force"}:
         return motion.row(effect.name, size=size, note="acts on a vine at rest only")
-    force = _total_N(terms) - _total_N(without) - (terms.inertia_kg - without.inertia_kg) * without.acceleration_m_s2
+    force = terms.total_N - without.total_N - (terms.inertia_kg - without.inertia_kg) * without.acceleration_m_s2
     drive = motion.drive_N()
     share = np.divide(force, drive, out=np.zeros_like(force), where=drive > 0)
     i = int(np.argmax(np.abs(share if np.any(drive > 0) else force)))
     return motion.row(effect.name, i, size=size, force_N=float(force[i]), share_of_drive=float(share[i]))
-
-
-def _total_N(terms: Terms) -> Floats:
-    """Total force on the tail, N."""
-    return terms.tension_N + sum(terms.tail_N.values(), np.zeros_like(terms.tension_N))
 
 
 def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:

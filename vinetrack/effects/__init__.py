@@ -16,11 +16,11 @@ from vinetrack.effects._catalogue import (
     find_effect,
     listing,
     load_effect,
+    own_effects,
     remedy,
     remember,
     told_apart,
 )
-from vinetrack.effects._own import own_effects
 
 __all__ = [
     "BASE_EFFECTS",

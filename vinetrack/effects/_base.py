@@ -178,7 +178,6 @@ class Effect:
     parameters: tuple[Parameter, ...]
     functions: Mapping[str, Callable[..., Any]]
     needs: tuple[str, ...]
-    easily_taken_for: tuple[str, ...]
     worked: tuple[Worked, ...]
     path: Path
     in_trace: bool = False  #: a pressure measured during growth already includes it

@@ -20,7 +20,6 @@ speed and no pulley.
 from vinetrack.core.units import AIR_DENSITY_KG_M3
 from vinetrack.effects import Parameter, Worked
 
-EASILY_TAKEN_FOR = ("inlet_loss", "fold_inertia")
 PARAMETERS = (Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0), meaning="drag coefficient"),)
 
 

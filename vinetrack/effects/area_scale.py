@@ -20,7 +20,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 2
-EASILY_TAKEN_FOR = ("pressure_gain", "wall_stretch")
 PARAMETERS = (
     Parameter(
         "eps",

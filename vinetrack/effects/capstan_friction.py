@@ -24,7 +24,6 @@ import numpy as np
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("length_mm",)
-EASILY_TAKEN_FOR = ("tail_friction",)
 PARAMETERS = (
     Parameter("C", "C", "N", 0.05, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="tension before the bend"),
     Parameter("mu_c", "μ_c", "1", 0.5, bounds=(0.0, 5.0), zero=0.5, plausible=(0.0, 2.0), meaning="friction in bends"),

@@ -19,7 +19,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-EASILY_TAKEN_FOR = ("tail_friction",)
 PARAMETERS = (
     Parameter("k", "k", "N/m", 20.0, bounds=(0.0, 1e6), plausible=(0.0, 1e4), meaning="stiffness at the tail"),
     Parameter(

@@ -17,7 +17,6 @@ Source: Alvarez et al. (2025), third term of Eq. (1) (printed there as Bxⁿ; it
 from vinetrack.effects import Parameter, Worked
 
 KIND = "base"
-EASILY_TAKEN_FOR = ("linear_damping", "pressure_damping")
 PARAMETERS = (
     Parameter(
         "B",

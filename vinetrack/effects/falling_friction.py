@@ -25,7 +25,6 @@ from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("length_mm",)
 FINITE = True
-EASILY_TAKEN_FOR = ("static_yield", "eversion_damping")
 PARAMETERS = (
     Parameter(
         "F_s", "F_s", "N", 0.2, bounds=(0.0, 1e3), plausible=(0.0, 5.0), meaning="friction at rest beyond sliding"

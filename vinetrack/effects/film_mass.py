@@ -20,7 +20,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 NEEDS = ("thickness_um",)
-EASILY_TAKEN_FOR = ("time_base", "area_scale", "pressure_gain", "fold_inertia", "reel_inertia")
 PARAMETERS = (
     Parameter(
         "eps",

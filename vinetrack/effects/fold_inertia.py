@@ -21,7 +21,6 @@ of Physics 74, 490–496.
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("thickness_um",)
-EASILY_TAKEN_FOR = ("air_drag", "eversion_damping")
 PARAMETERS = (
     Parameter("eta", "η", "1", 0.5, bounds=(0.0, 1.0), plausible=(0.0, 1.0), meaning="fraction of the energy returned"),
 )

@@ -22,7 +22,6 @@ from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("length_mm",)
-EASILY_TAKEN_FOR = ("air_drag", "inlet_loss")
 PARAMETERS = (
     Parameter(
         "factor",

@@ -24,7 +24,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 NEEDS = ("length_mm",)
-EASILY_TAKEN_FOR = ("payload_friction", "pressure_gauge")
 PARAMETERS = (
     Parameter(
         "f",

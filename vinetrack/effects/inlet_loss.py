@@ -20,7 +20,6 @@ from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("inlet_mm",)
-EASILY_TAKEN_FOR = ("air_drag", "gas_inertia")
 PARAMETERS = (Parameter("K", "K", "1", 1.5, bounds=(0.0, 50.0), plausible=(0.0, 3.0), meaning="loss coefficient"),)
 
 

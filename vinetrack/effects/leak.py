@@ -21,7 +21,6 @@ from vinetrack.effects import Parameter, Worked
 
 IN_TRACE = True
 ORDER = 2
-EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (
     Parameter(
         "rate", "1/τ", "1/s", 0.5, bounds=(0.0, 50.0), plausible=(0.0, 5.0), meaning="fraction of P lost per second"

@@ -17,7 +17,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 5
-EASILY_TAKEN_FOR = ("eversion_damping", "air_drag", "time_base")
 PARAMETERS = (
     Parameter(
         "eps",

@@ -20,7 +20,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 4
-EASILY_TAKEN_FOR = ("latch_release", "perspective")
 PARAMETERS = (
     Parameter("k3", "k₃", "1/m²", 0.3, bounds=(-50.0, 50.0), plausible=(-1.0, 1.0), meaning="radial distortion"),
     Parameter(

@@ -15,7 +15,6 @@ depends on speed in one power law.
 
 from vinetrack.effects import Parameter, Worked
 
-EASILY_TAKEN_FOR = ("eversion_damping",)
 PARAMETERS = (
     Parameter("b", "b", "N·s/m", 0.05, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="linear damping coefficient"),
 )

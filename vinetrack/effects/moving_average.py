@@ -21,7 +21,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 5
-EASILY_TAKEN_FOR = ("supply_rise", "latch_release")
 PARAMETERS = (
     Parameter(
         "T2", "T²", "s²", 1e-5, bounds=(0.0, 1e-2), plausible=(0.0, 2.5e-3), meaning="square of the time averaged over"

@@ -20,7 +20,6 @@ from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("payload_g", "length_mm")
-EASILY_TAKEN_FOR = ("air_drag",)
 PARAMETERS = (
     Parameter(
         "drag_area",

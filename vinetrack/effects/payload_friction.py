@@ -20,7 +20,6 @@ from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("payload_g",)
-EASILY_TAKEN_FOR = ("growth_angle",)
 PARAMETERS = (
     Parameter(
         "mu_p", "μ_p", "1", 0.3, bounds=(0.0, 10.0), plausible=(0.0, 1.5), meaning="friction of payload on the wall"

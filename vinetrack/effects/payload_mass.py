@@ -20,7 +20,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 NEEDS = ("payload_g",)
-EASILY_TAKEN_FOR = ("payload_friction", "growth_angle", "area_scale", "reel_inertia", "film_mass")
 PARAMETERS = (
     Parameter(
         "delta",

@@ -19,7 +19,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 4
-EASILY_TAKEN_FOR = ("tail_friction", "reservoir_depletion")
 PARAMETERS = (
     Parameter("k", "k", "1/m", 0.05, bounds=(-3.0, 3.0), plausible=(-0.3, 0.3), meaning="change of scale along y"),
 )

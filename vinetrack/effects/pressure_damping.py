@@ -18,7 +18,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-EASILY_TAKEN_FOR = ("wall_stretch",)
 PARAMETERS = (
     Parameter(
         "beta",

@@ -16,7 +16,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 4
-EASILY_TAKEN_FOR = ("area_scale", "eversion_damping", "time_base", "length_scale")
 PARAMETERS = (
     Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="relative error of P"),
 )

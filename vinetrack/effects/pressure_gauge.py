@@ -18,7 +18,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 5
-EASILY_TAKEN_FOR = ("yield_pressure",)
 PARAMETERS = (
     Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3), meaning="true minus read pressure"),
 )

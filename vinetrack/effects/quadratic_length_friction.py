@@ -17,7 +17,6 @@ Source: the capstan equation to second order for a path of even curvature, besid
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("length_mm",)
-EASILY_TAKEN_FOR = ("capstan_friction", "tail_friction")
 PARAMETERS = (
     Parameter(
         "q", "q", "N/m²", 1.0, bounds=(0.0, 1e4), plausible=(0.0, 50.0), meaning="friction per square of the growth"

@@ -20,7 +20,6 @@ the tail on a reel in the base.
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("length_mm",)
-EASILY_TAKEN_FOR = ("gas_inertia", "latch_release")
 PARAMETERS = (
     Parameter(
         "M", "M", "kg", 0.01, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="J/r² of the reel that the tail turns"

@@ -27,7 +27,6 @@ from vinetrack.effects import Parameter, Worked
 NEEDS = ("chamber_l",)
 IN_TRACE = True
 ORDER = 1
-EASILY_TAKEN_FOR = ("tail_friction", "leak")
 PARAMETERS = (
     Parameter(
         "gamma",

@@ -21,7 +21,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 4
-EASILY_TAKEN_FOR = ("time_base", "length_scale")
 PARAMETERS = (
     Parameter("delay", "s", "s/m", 2e-3, bounds=(-0.1, 0.1), plausible=(-0.01, 0.01), meaning="delay along the growth"),
 )

@@ -19,7 +19,6 @@ import numpy as np
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("yield_pressure_kPa",)
-EASILY_TAKEN_FOR = ("yield_pressure",)
 PARAMETERS = (
     Parameter(
         "P_s", "P_s", "Pa", 6e3, bounds=(0.0, 1e6), plausible=(1e3, 30e3), meaning="gauge pressure that starts growth"

@@ -22,7 +22,6 @@ from vinetrack.effects import Parameter, Worked
 
 IN_TRACE = True
 ORDER = 2
-EASILY_TAKEN_FOR = ("leak", "reservoir_depletion")
 PARAMETERS = (
     Parameter("a", "a", "1", 0.05, bounds=(0.0, 0.9), plausible=(0.0, 0.2), meaning="relative amplitude"),
     Parameter(

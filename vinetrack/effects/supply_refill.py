@@ -26,7 +26,6 @@ NEEDS = ("chamber_l",)
 IN_TRACE = True
 ORDER = 1
 REPLACES = ("reservoir_depletion",)
-EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (
     Parameter(
         "tau", "τ_s", "s", 0.1, bounds=(0.0, 1e4), plausible=(0.01, 10.0), meaning="time in which the supply refills"

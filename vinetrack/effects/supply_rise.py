@@ -25,7 +25,6 @@ from vinetrack.effects import Parameter, Worked
 IN_TRACE = True
 ORDER = 2
 FINITE = True
-EASILY_TAKEN_FOR = ("latch_release",)
 PARAMETERS = (
     Parameter("tau", "τ_v", "s", 5e-3, bounds=(0.0, 2.0), plausible=(0.0, 0.05), meaning="time in which a valve opens"),
     Parameter(

@@ -23,7 +23,6 @@ import numpy as np
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("length_mm",)
-EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (
     Parameter(
         "mu_w",

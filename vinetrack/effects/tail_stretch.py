@@ -24,7 +24,6 @@ import math
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("thickness_um", "length_mm")
-EASILY_TAKEN_FOR = ("length_scale",)
 PARAMETERS = (
     Parameter(
         "compliance",

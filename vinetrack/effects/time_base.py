@@ -16,7 +16,6 @@ Source: dimensional analysis of Eq. (2) of Alvarez et al. (2025).
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-EASILY_TAKEN_FOR = ("length_scale", "pressure_gain")
 PARAMETERS = (
     Parameter(
         "eps",

@@ -18,7 +18,6 @@ Source: thin-walled pressure vessels, Timoshenko & Goodier (1970), Theory of Ela
 from vinetrack.effects import Parameter, Worked
 
 NEEDS = ("thickness_um",)
-EASILY_TAKEN_FOR = ("pressure_gain", "area_scale", "pressure_damping")
 PARAMETERS = (
     Parameter(
         "kappa",

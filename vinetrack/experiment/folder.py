@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.core.records import CORRECTION_ACTIONS, IMAGES, Correction, Floats, Trial
+from vinetrack.core.records import IMAGES, Correction, Floats, Trial
 from vinetrack.core.tables import (
     Table,
     TableError,
@@ -30,6 +30,7 @@ from vinetrack.core.tables import (
     read_table,
     read_text,
     safe_join,
+    with_value,
     write_bytes,
 )
 from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, with_names
@@ -48,10 +49,6 @@ from vinetrack.experiment.sheet import (
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
 
 SETTINGS = "experiment.yaml"
-EXPECTED_FOLDER = (
-    f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
-    "creates both from a folder of recordings"
-)
 
 
 @dataclass(frozen=True)
@@ -181,12 +178,15 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
 
 def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
     """Read the sheet as a table and check its columns; None if it cannot be read."""
+    remedy = (
+        f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
+        "creates both from a folder of recordings"
+    )
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
-        problems.append(Problem("no_folder", message, file=str(folder), remedy=EXPECTED_FOLDER))
+        problems.append(Problem("no_folder", message, file=str(folder), remedy=remedy))
         return None
     if not os.path.lexists(folder / SHEET):
-        remedy = EXPECTED_FOLDER
         if close := closest_entry(folder / SHEET):
             remedy = f"rename {close} to {SHEET}" if close.endswith(".csv") else f"save {close} as {SHEET}"
         problems.append(Problem("missing", "is missing", file=SHEET, remedy=remedy))
@@ -279,9 +279,8 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
         by_frame = by_trial.setdefault(row["trial"], {})
         column = "action"
         try:
-            if row["action"] not in CORRECTION_ACTIONS:
-                remedy = f"write {', '.join(CORRECTION_ACTIONS[:-1])} or {CORRECTION_ACTIONS[-1]}"
-                raise TableError("is not an action", remedy, code="not_a_choice")
+            if row["action"] not in ("move", "drop", "confirm"):
+                raise TableError("is not an action", "write move, drop or confirm", code="not_a_choice")
             column = "frame"
             frame = parse_number(row["frame"], table.decimal)
             column = "edge_px"
@@ -329,12 +328,10 @@ def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
 
 CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
 
-FEWEST_TRIALS = 8  # Fewest trials for which the correlation is computed (derived)
-
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
-    """Return the rank of every trial in the order in which they were run, and whether the sheet states that order.
-    Returns ranks, stated: Ranks from 0, shape (n_trials,).
+    """Return the rank of every trial, from 0, in the order in which they were run, shape (n_trials,), and whether the
+    sheet states that order.
     """
     order = np.array([trial.order for trial in trials], dtype=float)
     stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
@@ -343,8 +340,8 @@ def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
 
 
 def order_pressure_correlation(trials: Sequence[Trial]) -> float:
-    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines. Returns −1 to
-    1; NaN if there are fewer than `FEWEST_TRIALS` trials, or each vine has only one pressure.
+    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines; NaN if there
+    are fewer than eight trials (derived), or each vine has only one pressure.
     """
     from scipy.stats import rankdata
 
@@ -356,7 +353,7 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
         if len(members) > 1 and np.ptp(pressures) > 0:
             both = np.array([rankdata(ranks[members]), rankdata(pressures)])
             pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
-    if sum(pair.shape[1] for pair in pairs) < FEWEST_TRIALS:
+    if sum(pair.shape[1] for pair in pairs) < 8:
         return math.nan
     order, pressure = np.hstack(pairs)
     return float(order @ pressure / math.sqrt(float(order @ order) * float(pressure @ pressure)))
@@ -390,10 +387,10 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
 # ------------------------------------------------------------------------------
 # The check of an experiment before any work: tracks are read, recordings handed on to who can open them.
 
-OpenRecordings = Callable[[Experiment, list[Trial]], Iterable[Problem]]
 
-
-def check_experiment(folder: Path | str, open_videos: OpenRecordings | None = None) -> list[Problem]:
+def check_experiment(
+    folder: Path | str, open_videos: Callable[[Experiment, list[Trial]], Iterable[Problem]] | None = None
+) -> list[Problem]:
     """Find all problems of sheet, settings and tracks, and missing videos; this takes seconds."""
     try:
         experiment = read_experiment(folder, strict=False)
@@ -498,16 +495,12 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
 # ------------------------------------------------------------------------------
 # Saving a model to the settings.
 
-BOM = b"\xef\xbb\xbf"
-
 
 def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
     """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
     ends of the file are kept; other encodings are converted to UTF-8.
     """
-    from vinetrack.core.tables import with_value
-
-    path = folder / SETTINGS
+    path, mark = folder / SETTINGS, b"\xef\xbb\xbf"
     before = path.read_bytes() if path.exists() else b""
     text = read_text(path) if before else ""
     listed = list(read_experiment_settings(path).effects) if before and files else []
@@ -517,5 +510,5 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     text = with_value(text, "model", names, path.name)
     if b"\r\n" in before:
         text = text.replace("\n", "\r\n")
-    write_bytes(path, (BOM if before.startswith(BOM) else b"") + text.encode("utf-8"))
+    write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
     return path

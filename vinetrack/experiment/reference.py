@@ -18,9 +18,6 @@ from vinetrack.core.units import UNITS, split_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 from vinetrack.experiment.settings import CALIBRATIONS, AxisSettings, ExperimentSettings, Limits, RunSettings
 
-_BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
-
-# Introduction of the page
 _PAGE_HEAD = """# Every column and key
 
 Generated from the declarations that validate them: `vinetrack settings` prints the same, `vinetrack settings --json -`
@@ -152,5 +149,6 @@ def _allowed(field: FieldInfo) -> str:
     for part in parts:  # constraints of the annotated parts of a union
         for rule in getattr(part, "__metadata__", ()):
             rules += rule.metadata if isinstance(rule, FieldInfo) else [rule]
-    bounds = [(name, getattr(rule, name)) for rule in rules for name in _BOUNDS if hasattr(rule, name)]
-    return ", ".join(dict.fromkeys(f"{_BOUNDS[name]} {value:g}" for name, value in bounds))
+    words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+    bounds = [f"{words[name]} {getattr(rule, name):g}" for rule in rules for name in words if hasattr(rule, name)]
+    return ", ".join(dict.fromkeys(bounds))

@@ -126,10 +126,9 @@ def option(column: str) -> str:
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 
+
 SHORTEST_AXIS_PX = 10  # Chosen: the direction of a shorter axis is too uncertain
 SMALLEST_POINT_SPACING_PX = 2  # Smallest distance between neighbouring points of a curved path (chosen)
-
-TRUTH_WORDS = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
 
 
 class CellError(InputError, ValueError):
@@ -143,9 +142,9 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
             case "text" | "path":
                 return text
             case "yes_no":
-                if text.lower() not in TRUTH_WORDS:
+                if text.lower() not in ("yes", "y", "true", "1", "no", "n", "false", "0"):
                     raise CellError("is neither yes nor no", code="not_yes_or_no")
-                return TRUTH_WORDS[text.lower()]
+                return text.lower() in ("yes", "y", "true", "1")
             case "window":
                 return _read_window(text, decimal)
             case "bends":
@@ -244,10 +243,11 @@ def _read_axis(text: str) -> PictureAxis:
     if len(written) < 2 or any(point.count(",") != 1 for point in written):
         raise CellError("is not an axis", code="not_an_axis")
     points = [(parse_number(x), parse_number(y)) for x, y in (point.split(",") for point in written)]
-    if sum(math.dist(*pair) for pair in pairwise(points)) < SHORTEST_AXIS_PX:
+    spacings = [math.dist(*pair) for pair in pairwise(points)]
+    if sum(spacings) < SHORTEST_AXIS_PX:
         message = f"is shorter than {SHORTEST_AXIS_PX} pixels"
         raise CellError(message, "give two points far apart", code="too_short")
-    if len(points) > 2 and min(math.dist(*pair) for pair in pairwise(points)) < SMALLEST_POINT_SPACING_PX:
+    if len(points) > 2 and min(spacings) < SMALLEST_POINT_SPACING_PX:
         message = f"has neighbouring points less than {SMALLEST_POINT_SPACING_PX} pixels apart"
         raise CellError(message, "leave out the second of the two", code="too_close")
     if len(parts) > len(written):
@@ -283,7 +283,9 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     payload, and other physical settings only if they differ within the experiment (the yield pressure only if it
     differs within one vine). Returns the trials, in the same order.
     """
-    shown = [column for column in _OPTIONAL_PARTS if len({_part(column, trial) for trial in trials}) > 1]
+    # Columns that a condition's name shows only if they differ within the experiment; bends, the longest part, last
+    optional = sorted((c for c in COLUMNS.values() if c.condition_part), key=lambda column: column.kind == "bends")
+    shown = [column for column in optional if len({_part(column, trial) for trial in trials}) > 1]
     yields: dict[str, set[str]] = {}
     for trial in trials:
         yields.setdefault(_vine(trial), set()).add(_yield_pressure(trial))
@@ -326,9 +328,3 @@ def _part(column: Column, trial: Trial) -> str:
         number = column.of_trial(trial)
         value = _digits(number) if math.isfinite(number) else ""
     return column.condition_part.format(value) if value else ""
-
-
-# Columns that a condition's name shows only if they differ within the experiment; bends, the longest part, last
-_OPTIONAL_PARTS = sorted(
-    (column for column in COLUMNS.values() if column.condition_part), key=lambda column: column.kind == "bends"
-)

@@ -30,9 +30,7 @@ SHEET = "trials.csv"
 # Columns that a trial of an everting vine requires; a body that moves as a whole requires the diameter only
 REQUIRED_COLUMNS = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
 
-PRESSURE_REL_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2  # Default standard errors (chosen)
-
-SUFFIXES_WITH_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})  # Suffixes of files that may carry the capture rate
+YIELD_SIGMA_KPA = 0.2  # Default standard error of a yield pressure (chosen)
 
 
 @dataclass
@@ -153,8 +151,19 @@ def _check_name(row: Row) -> None:
 
 
 def check_row(row: Row, folder: Path) -> None:
-    """Check a row as a whole: its paths, and values that contradict each other."""
-    _check_paths(row, folder)
+    """Check a row as a whole: one recording or track, paths inside the folder, values that agree with each other."""
+    for name in ("video", "track", "pressure_trace"):
+        if name in row.values:
+            try:
+                safe_join(folder, row.values[name])
+            except TableError as error:
+                row.add_error(error, name)
+    if "video" in row.values and "track" in row.values:
+        message, remedy = "has both a video and a track", "keep one of the two"
+        row.add("two_recordings", message, "track", value=row.values["track"], remedy=remedy)
+    if "video" not in row.values and "track" not in row.values:
+        remedy = "name a recording under video, or a file of positions under track"
+        row.add("no_recording", "has neither a video nor a track", remedy=remedy)
     check_wall(row)
     fps, exposure = row.number("capture_fps"), row.number("exposure_us")
     # An exposure cannot exceed the frame interval. 2 % allows for rounding of both numbers; above 1.5 intervals
@@ -184,28 +193,12 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
     return set(required) - set(columns) - set(row.values) - faulty
 
 
-def _check_paths(row: Row, folder: Path) -> None:
-    """Check that the row names exactly one recording or track, and that no path leaves the folder."""
-    for name in ("video", "track", "pressure_trace"):
-        if name in row.values:
-            try:
-                safe_join(folder, row.values[name])
-            except TableError as error:
-                row.add_error(error, name)
-    if "video" in row.values and "track" in row.values:
-        message, remedy = "has both a video and a track", "keep one of the two"
-        row.add("two_recordings", message, "track", value=row.values["track"], remedy=remedy)
-    if "video" not in row.values and "track" not in row.values:
-        remedy = "name a recording under video, or a file of positions under track"
-        row.add("no_recording", "has neither a video nor a track", remedy=remedy)
-
-
 def _may_state_rate(folder: Path, video: str) -> bool:
     """Whether a recording is of a kind that can carry its capture rate; whether it does, only opening it shows."""
     try:
         path = safe_join(folder, video)
         files = path.iterdir() if path.is_dir() else [path, path.with_suffix(".cih"), path.with_suffix(".cihx")]
-        return any(file.suffix.lower() in SUFFIXES_WITH_RATE and file.exists() for file in files)
+        return any(file.suffix.lower() in (".dng", ".cine", ".cih", ".cihx") and file.exists() for file in files)
     except (TableError, OSError, ValueError):
         return False
 
@@ -239,7 +232,7 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
     """Make the trial of a row without errors, in SI units, with the documented defaults."""
     defaults = {
         "pressure_kPa": 0.0,
-        "pressure_sigma_kPa": PRESSURE_REL_SIGMA * row.values.get("pressure_kPa", 0.0),
+        "pressure_sigma_kPa": 0.01 * row.values.get("pressure_kPa", 0.0),  # 1 %: default standard error (chosen)
         "yield_pressure_kPa": 0.0,
         "yield_pressure_sigma_kPa": YIELD_SIGMA_KPA if row.travel_ratio == 2 else 0.0,
     }

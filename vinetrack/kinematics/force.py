@@ -18,7 +18,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window, join_flags
 from vinetrack.core.units import GRAVITY_M_S2
-from vinetrack.dynamics.audit import pressure_along
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.tracks.position_noise import rest_points
 
@@ -210,7 +210,7 @@ def _modelled_pressure(motion: TrialMotion, model: Model) -> Floats:
     start_s = release.time_s if math.isfinite(release.time_s) else kinematics.time_s[0]
     travel_m = np.maximum(kinematics.lead_position_m - release.lead_position_m, 0.0)
     since_s = np.maximum(kinematics.time_s - start_s, 0.0)
-    return pressure_along(model, motion.trial, since_s, travel_m, np.maximum(kinematics.lead_velocity_m_s, 0.0))
+    return evaluate(model, motion.trial, since_s, travel_m, np.maximum(kinematics.lead_velocity_m_s, 0.0)).pressure_Pa
 
 
 def _mean_error(measured_Pa: Floats) -> float:

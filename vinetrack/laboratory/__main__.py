@@ -57,10 +57,8 @@ def main(arguments: list[str] | None = None) -> None:
             write_tracks([trial], trial.stated.track.parent)
     if filmed:
         n_frames = sum(trial.track.time_s.size for trial in filmed)
-        print(
-            f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest.",
-            flush=True,
-        )
+        where = f"{len(filmed)} trials in the virtual laboratory, {n_frames} frames"
+        print(f"Filming {where}. The first takes longest.", flush=True)
         _film(experiment, filmed, filming, truth.seed, given.processes)
     n_frames = sum(trial.track.time_s.size for trial in grown)
     print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
@@ -78,10 +76,8 @@ def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, s
 
 
 def _film_one(trial: VirtualTrial, number: int, filming: Filming, seed: int) -> str:
-    path = trial.stated.video
-    assert path is not None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    truth = film(trial, filming, path, seed + number)
+    assert trial.stated.video is not None
+    truth = film(trial, filming, trial.stated.video, seed + number)
     return f"{trial.stated.name}, {truth.time_s.size} frames"
 
 

@@ -30,25 +30,14 @@ from vinetrack.laboratory.tracks import VirtualTrial
 
 Frame = NDArray[np.uint8 | np.uint16]
 
-GREY_FORMATS = {8: "gray", 12: "gray12le", 16: "gray16le"}
-
 
 def render_recording(
-    scene: Scene,
-    motion: Motion,
-    *,
-    n_frames: int,
-    capture_fps: float,
-    out_path: Path,
-    exposure_s: float | None = None,
-    seed: int = 0,
+    scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, out_path: Path, seed: int = 0
 ) -> Truth:
     """Film `motion` in `scene` and write the recording to `out_path`, completely or not at all: with an ending a film
     with the scene's codec, without one a folder of numbered PNG pictures.
     """
-    renderer = FrameRenderer(
-        scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=exposure_s, seed=seed
-    )
+    renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
     out_path.parent.mkdir(parents=True, exist_ok=True)
     draft = out_path.with_name("part-" + out_path.name)
     (_write_video if out_path.suffix else _write_pictures)(renderer, draft)
@@ -75,7 +64,8 @@ def _write_video(renderer: FrameRenderer, path: Path) -> None:
     scene = renderer.scene
     encoding, depth = scene.encoding, scene.sensor.bit_depth
     is_h264 = encoding.codec == "h264"
-    pixel_format = ("yuv420p" if depth == 8 else None) if is_h264 else GREY_FORMATS.get(depth)
+    of_grey = {8: "gray", 12: "gray12le", 16: "gray16le"}
+    pixel_format = ("yuv420p" if depth == 8 else None) if is_h264 else of_grey.get(depth)
     if pixel_format is None:
         raise ValueError(f"{encoding.codec} here does not hold {depth} bits.")
     levels = {"low": 16.0, "span": 219.0} if is_h264 else {}
@@ -124,25 +114,20 @@ def _fill(plane: Any, values: Frame) -> None:
 # Pictures of a calibration target.
 
 
-def render_target(target: Target, scene: Scene, *, seed: int = 0, ramp: float = 0.25) -> Frame:
+def render_target(target: Target, scene: Scene, *, seed: int = 0) -> Frame:
     """Render one picture of a target through the camera of a scene, with its noise. The truth is `scene.camera`:
-    `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by `ramp` across
-    the picture. Shape (height, width).
+    `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by a quarter
+    across the picture. Shape (height, width).
     """
-    backdrop = replace(scene.backdrop, launcher=False, ruler=False, clutter=False)
-    empty = FrameRenderer(
-        replace(scene, backdrop=backdrop, door=None), np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3,
-        seed=seed,
-    )  # fmt: skip
+    bare = replace(scene, backdrop=replace(scene.backdrop, launcher=False, ruler=False, clutter=False), door=None)
+    empty = FrameRenderer(bare, np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3, seed=seed)
     light = lay_target(empty.still, target, plane_seen(scene.camera), scene.psf_px)
-    slope = 1 + ramp * (np.linspace(0, 1, light.shape[1], dtype=np.float32)[None, :] - 0.5)
+    slope = 1 + 0.25 * (np.linspace(0, 1, light.shape[1], dtype=np.float32)[None, :] - 0.5)
     return empty.expose(np.asarray(light * slope, dtype=np.float32), 0)
 
 
 # ------------------------------------------------------------------------------
 # Campaigns before a camera.
-
-FINE_STEPS = 8  # Samples per frame of the true motion (chosen)
 
 
 @dataclass(frozen=True)
@@ -168,12 +153,9 @@ def scene_of(stated: Trial, filming: Filming) -> Scene:
     base = preset(filming.scene)
     subject = base.subject
     if isinstance(subject, Tube):
-        subject = replace(
-            subject,
-            diameter_m=stated.diameter_m,
-            length_m=stated.length_m,
-            payload_diameter_m=0.6 * stated.diameter_m if stated.payload_kg > 0 else 0.0,
-        )
+        payload_m = 0.6 * stated.diameter_m if stated.payload_kg > 0 else 0.0
+        size = {"diameter_m": stated.diameter_m, "length_m": stated.length_m, "payload_diameter_m": payload_m}
+        subject = replace(subject, **size)
     return replace(base, subject=subject, camera=filming.camera, exposure_fraction=filming.exposure_fraction)
 
 
@@ -181,15 +163,10 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
     """Film one simulated trial; its truth is returned and not written."""
     capture_fps = trial.stated.capture_fps
     n_frames = int(trial.track.time_s.size)
-    time_s = np.linspace(0.0, n_frames / capture_fps, FINE_STEPS * n_frames + 1)
-    return render_recording(
-        scene_of(trial.stated, filming),
-        (time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m),
-        n_frames=n_frames,
-        capture_fps=capture_fps,
-        out_path=out_path,
-        seed=seed,
-    )
+    time_s = np.linspace(0.0, n_frames / capture_fps, 8 * n_frames + 1)  # 8 samples a frame (chosen)
+    motion = time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m
+    how: dict[str, Any] = {"n_frames": n_frames, "capture_fps": capture_fps, "out_path": out_path, "seed": seed}
+    return render_recording(scene_of(trial.stated, filming), motion, **how)
 
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:

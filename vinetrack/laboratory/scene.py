@@ -277,9 +277,7 @@ def _camera_like(scene: Scene) -> Scene:
 def _presets() -> dict[str, Scene]:
     """All presets by name; `clean` and `demo` come first, harder ones follow."""
     plain = Backdrop(brightness=0.1, gradient=0, texture=0, ruler=False, launcher=False, clutter=False)
-    opaque = Tube(
-        opacity=1.0, brightness=0.8, texture=0, tail_texture=0, tail_opacity=0, specular=0, tip_glow=0
-    )  # fmt: skip
+    opaque = Tube(opacity=1.0, brightness=0.8, texture=0, tail_texture=0, tail_opacity=0, specular=0, tip_glow=0)
     clean = Scene(
         subject=opaque,
         door=None,
@@ -341,11 +339,8 @@ def _presets() -> dict[str, Scene]:
     }
 
 
-PRESETS = tuple(_presets())  # Names of the presets
-
-
 def preset(name: str) -> Scene:
-    """Return a scene by name (see `PRESETS`)."""
+    """Return a scene by name, of those in `_presets`."""
     scenes = _presets()
     if name not in scenes:
         raise ValueError(f"No scene is called {name!r}; choose one of {', '.join(scenes)}.")

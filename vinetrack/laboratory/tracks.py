@@ -20,7 +20,7 @@ from vinetrack.core import published
 from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.core.tables import write_csv, write_text
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.dynamics.audit import pressure_along
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model, Value, make_model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.experiment.schema import COLUMNS
@@ -58,9 +58,7 @@ class GroundTruth:
 
 
 def read_ground_truth(path: Path) -> GroundTruth:
-    """Read a ground truth from YAML, whose keys are the fields of `GroundTruth` and `filming`, which is
-    ignored here.
-    """
+    """Read a ground truth from YAML, whose keys are the fields of `GroundTruth` and `filming`, which is ignored."""
     content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
     content.pop("filming", None)
     for key in ("effects", "release_frames", "origin_m"):
@@ -116,21 +114,11 @@ def grow(trials: Sequence[Trial], truth: GroundTruth) -> list[VirtualTrial]:
         gauge_Pa = None
         if truth.trace_sigma_kPa is not None:
             velocity_m_s = moved[i].lead_velocity_m_s[:stop]
-            gauge_Pa = pressure_along(own_model, true[i], time_s - release[i], lead_m, velocity_m_s)
+            gauge_Pa = evaluate(own_model, true[i], time_s - release[i], lead_m, velocity_m_s).pressure_Pa
             gauge_Pa = gauge_Pa + 1e3 * truth.trace_sigma_kPa * draw.standard_normal(stop)
-        grown.append(
-            VirtualTrial(
-                stated=trial,
-                true=true[i],
-                model=own_model,
-                track=plain_track(
-                    time_s, origin_m + moved[i].observed_position_m[:stop] + noise_m, pressure_Pa=gauge_Pa
-                ),
-                release_s=release[i],
-                origin_m=origin_m,
-                true_lead_position_m=lead_m,
-            )
-        )
+        seen_m = origin_m + moved[i].observed_position_m[:stop] + noise_m
+        track = plain_track(time_s, seen_m, pressure_Pa=gauge_Pa)
+        grown.append(VirtualTrial(trial, true[i], own_model, track, release[i], origin_m, lead_m))
     return grown
 
 

@@ -88,13 +88,10 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
         for effort, rig in rigs:
             if effort == least:
                 feasible += _loads(rig, k, NEW_VINE, used, limits)
+    named = [replace(condition.trial, name=f"next_{number}") for number, condition in enumerate(feasible, 1)]
     return [
-        replace(
-            condition,
-            trial=replace(condition.trial, name=f"next_{number}"),
-            changed=_changed(condition.trial, trials[condition.like]),
-        )
-        for number, condition in enumerate(feasible, 1)
+        replace(condition, trial=trial, changed=_changed(trial, trials[condition.like]))
+        for condition, trial in zip(feasible, named, strict=True)
     ]
 
 
@@ -284,9 +281,6 @@ def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Tri
 # The free parameters of the fit stay as they are. Every new vine adds its own: B of the vine nearest in size, scaled by
 # the ratio of their priors, and the yield pressure with the error to which it will be measured.
 
-# Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
-SCATTER_FACTORS = ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0))
-
 
 @dataclass(frozen=True)
 class ScatterLevel:
@@ -383,7 +377,8 @@ def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, .
     may_grow = np.array(fit.solution.estimable) & (np.array(state.spread) > LEAST_BETWEEN_TRIAL_SD)
     levels: dict[tuple[float, float], ScatterLevel] = {}
     as_fitted = 0.0
-    for factors in SCATTER_FACTORS:
+    # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
+    for factors in ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)):
         pressure, damping = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted).tolist()
         pair = (pressure, damping)
         if pair in levels:
@@ -490,20 +485,15 @@ def growth_courses(
             continue
         length_m = condition.trial.length_m
         near_m, longest_s = np.nan_to_num(END_FRACTION * length_m, nan=math.inf), cameras[i].longest_s
-        near_s = min(
-            float(np.interp(near_m, moved.lead_position_m, moved.time_s, right=longest_s)) for moved in trajectories
-        )
+        near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in trajectories)
         grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in trajectories)
         ratio = _speed_ratio(hypotheses[-1].fit, condition.trial, jobs[i], trajectories[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
         grows_enough = grown_m > 0.3 * (length_m if math.isfinite(length_m) else 0.0)
         is_compressed = condition.trial.tail_slack != "free" and ratio > largest_ratio
         ends = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
-        growth.append(
-            GrowthCourse(near_s, ends)
-            if grows_enough and not is_compressed and near_s > 8 * cameras[i].frame_s
-            else None
-        )
+        is_worth_it = grows_enough and not is_compressed and near_s > 8 * cameras[i].frame_s
+        growth.append(GrowthCourse(near_s, ends) if is_worth_it else None)
     return growth
 
 
@@ -577,9 +567,8 @@ def film_trials(
         position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
         pressure_Pa = None if items[i].trace is None else np.full(stop, chosen[i].trial.pressure_Pa)
         try:
-            tracks.append(
-                prepare_trial(chosen[i].trial, plain_track(times[i][:stop], position_m, pressure_Pa=pressure_Pa))
-            )
+            track = plain_track(times[i][:stop], position_m, pressure_Pa=pressure_Pa)
+            tracks.append(prepare_trial(chosen[i].trial, track))
         except FitError:
             tracks.append(None)
     return tracks

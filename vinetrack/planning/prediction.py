@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.optimize import brentq
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate, pressure_along
+from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.effects import EffectError, catalogue
@@ -55,32 +56,24 @@ class Runs:
     slack: Floats
 
 
-def run(
-    inputs: PredictiveInputs,
-    places_m: Floats,
-    samples: int,
-    seed: int,
-) -> Runs:
+def run(inputs: PredictiveInputs, places_m: Floats, samples: int, seed: int) -> Runs:
     """Draw predictive inputs and simulate every draw. Shapes: places_m (n_places,)."""
     trials, rows = inputs.laid_out(inputs.draw(samples, seed))
     moved, until_s = grown(inputs.model, trials, rows)
     time_s, velocity_m_s = np.full((samples, places_m.size), math.inf), np.zeros((samples, places_m.size))
     for i, trajectory in enumerate(moved):
-        reached = places_m <= trajectory.lead_position_m[-1]
-        time_s[i, reached] = np.interp(places_m[reached], trajectory.lead_position_m, trajectory.time_s)
-        velocity_m_s[i, reached] = np.interp(
-            places_m[reached], trajectory.lead_position_m, trajectory.lead_velocity_m_s
-        )
+        position_m, reached = trajectory.lead_position_m, places_m <= trajectory.lead_position_m[-1]
+        time_s[i, reached] = np.interp(places_m[reached], position_m, trajectory.time_s)
+        velocity_m_s[i, reached] = np.interp(places_m[reached], position_m, trajectory.lead_velocity_m_s)
     # 300: draws whose forces are evaluated, a third of a millisecond each (chosen)
     tension_N, pressure_Pa, least_N, slack = _forces(inputs, trials[:300], rows, moved, places_m)
+    last_m_s = np.array([trajectory.lead_velocity_m_s[-1] for trajectory in moved])
     return Runs(
         places_m=places_m,
         time_s=time_s,
         lead_velocity_m_s=velocity_m_s,
         end_s=until_s,
-        end_lead_velocity_m_s=np.where(
-            np.isfinite(until_s), [trajectory.lead_velocity_m_s[-1] for trajectory in moved], 0.0
-        ),
+        end_lead_velocity_m_s=np.where(np.isfinite(until_s), last_m_s, 0.0),
         steady_tail_m_s=_steady(inputs, trials, rows),
         tension_N=tension_N,
         least_tension_N=least_N,
@@ -167,21 +160,14 @@ def _steady(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> 
         return np.asarray((force_N / B) ** (1 / n))
 
 
-SAMPLES = 1000  # Draws of a prediction (derived)
-
-
-# y/L of the curves, dense at the start
-ALONG = np.concatenate([[0.0, 0.0005, 0.001, 0.002, 0.004, 0.007], np.linspace(0.01, 0.99, 99)])
-
 CURVE_COLUMNS = (
     "condition", "y_over_L", "lead_position_m",
     "time_s", "time_low_90_s", "time_high_90_s",
     "lead_velocity_m_s", "lead_velocity_low_90_m_s", "lead_velocity_high_90_m_s", "tail_velocity_m_s",
     "tension_N", "tension_low_90_N", "tension_high_90_N", "pressure_kPa",
 )  # fmt: skip
-TABLE_COLUMNS = ("condition", "quantity", "y_over_L", "median", "low_90", "high_90", "unit")
 
-TIME, TO_THE_END = "time to get there", "time to the end"
+TIME = "time to get there"
 EDGE, TAIL = "speed of the leading edge", "speed of the tail"
 EJECTION = "ejection speed of the payload"
 TENSION, LEAST_TENSION = "tension of the tail", "least tension of the tail"
@@ -239,10 +225,11 @@ class VinePrediction:
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row for each quantity, columns `TABLE_COLUMNS`, SI."""
+        """A row for each quantity, SI."""
         condition = self.inputs.trial.condition
         rows = [(condition, q.name, q.y_over_L, q.median, q.low, q.high, q.unit) for q in self.quantities]
-        return pd.DataFrame(rows, columns=list(TABLE_COLUMNS))
+        columns = ["condition", "quantity", "y_over_L", "median", "low_90", "high_90", "unit"]
+        return pd.DataFrame(rows, columns=columns)
 
 
 def told_by_payload(trial: Trial) -> bool:
@@ -251,7 +238,7 @@ def told_by_payload(trial: Trial) -> bool:
 
 
 def predict_vine(
-    inputs: PredictiveInputs, *, samples: int = SAMPLES, seed: int = 1, at_fraction: float = 0.95
+    inputs: PredictiveInputs, *, samples: int = 1000, seed: int = 1, at_fraction: float = 0.95
 ) -> VinePrediction:
     """Predict a trial by Monte Carlo: medians, 90 % bands, and the contribution of each uncertain input.
 
@@ -285,7 +272,8 @@ def predict_vine(
     1.0
     """
     length_m = inputs.trial.length_m
-    along = np.union1d(ALONG, [at_fraction])
+    # y/L of the curves, dense at the start
+    along = np.union1d([0.0, 0.0005, 0.001, 0.002, 0.004, 0.007, *np.linspace(0.01, 0.99, 99)], [at_fraction])
     runs = run(inputs, along * length_m, samples, seed)
     place = int(np.searchsorted(along, at_fraction))
     contributions = []
@@ -316,8 +304,6 @@ def band(values: Floats) -> Floats:
 
 
 def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int) -> Iterator[Quantity]:
-    steady = "steady tail speed, Eq. (3)"
-    hoop = "hoop stress PD/2t"
     r, at = inputs.trial.travel_ratio, float(along[place])
     speed = runs.lead_velocity_m_s[:, place]
 
@@ -328,17 +314,17 @@ def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int)
     if inputs.trial.payload_kg > 0:
         if told_by_payload(inputs.trial) or not runs.slack.any():
             yield quantity(EJECTION, 1.0, r * runs.end_lead_velocity_m_s, "m/s")
-        yield quantity(TO_THE_END, 1.0, runs.end_s, "s")
+        yield quantity("time to the end", 1.0, runs.end_s, "s")
     yield quantity(EDGE, at, speed, "m/s")
     yield quantity(TAIL, at, r * speed, "m/s")
     yield quantity(TIME, at, runs.time_s[:, place], "s")
     if not math.isnan(runs.steady_tail_m_s[0]):
-        yield quantity(steady, math.nan, runs.steady_tail_m_s, "m/s")
+        yield quantity("steady tail speed, Eq. (3)", math.nan, runs.steady_tail_m_s, "m/s")
     yield quantity(TENSION, at, runs.tension_N[:, place], "N")
     yield quantity(LEAST_TENSION, math.nan, runs.least_tension_N, "N")
     trial = inputs.trial
     stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-    yield Quantity(hoop, math.nan, stress, stress, stress, "Pa")
+    yield Quantity("hoop stress PD/2t", math.nan, stress, stress, stress, "Pa")
 
 
 def _curve(inputs: PredictiveInputs, runs: Runs, along: Floats) -> pd.DataFrame:
@@ -357,19 +343,6 @@ def _curve(inputs: PredictiveInputs, runs: Runs, along: Floats) -> pd.DataFrame:
 WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
 
 
-# Effects that every vine has to some extent; the others of the catalogue may be absent
-UNIVERSAL_EFFECTS = (
-    "air_drag",
-    "fold_inertia",
-    "gas_inertia",
-    "inlet_loss",
-    "payload_drag",
-    "reservoir_depletion",
-    "tail_friction",
-    "wall_stretch",
-)
-
-
 @dataclass(frozen=True)
 class Neglected:
     """An effect that the model leaves out, its typical size, and the median final speed, m/s, with and without it."""
@@ -386,16 +359,9 @@ class Neglected:
 
 
 def design_checks(prediction: VinePrediction) -> tuple[str, ...]:
-    """Return warnings about a planned vine in sentences, most serious first. Returns empty where there is
-    no warning.
-    """
-    return (
-        *_burst(prediction.inputs.trial),
-        *_no_growth(prediction),
-        *_slack(prediction),
-        *_rules(prediction),
-        *prediction.inputs.notes,
-    )
+    """Return warnings about a planned vine in sentences, most serious first."""
+    hazards = (*_burst(prediction.inputs.trial), *_no_growth(prediction), *_slack(prediction), *_rules(prediction))
+    return (*hazards, *prediction.inputs.notes)
 
 
 def _burst(trial: Trial) -> Iterator[str]:
@@ -463,7 +429,9 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
     kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * 25e6 * trial.thickness_m)
     without = final_m_s(inputs, inputs.model, host, at_fraction)
     neglected_effects = []
-    for name in UNIVERSAL_EFFECTS:
+    # Effects that every vine has to some extent; the others of the catalogue may be absent.
+    universal = ("air_drag", "fold_inertia", "gas_inertia", "inlet_loss", "payload_drag", "reservoir_depletion")
+    for name in (*universal, "tail_friction", "wall_stretch"):
         effect = catalogue()[name]
         is_in_model = name in inputs.model or any(name in other.replaces for other in inputs.model)
         if is_in_model or (name == "payload_drag" and trial.payload_kg == 0):
@@ -515,14 +483,8 @@ class Room:
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
         """Return the trial with a vine of this size at the highest pressure allowed."""
         pressure_Pa = min(self.pressure_Pa, self.bearable_Pa(diameter_m, thickness_m))
-        sized = replace(
-            self.rig,
-            diameter_m=diameter_m,
-            thickness_m=thickness_m,
-            length_m=length_m,
-            pressure_Pa=pressure_Pa,
-            pressure_sigma_Pa=0.01 * pressure_Pa,
-        )
+        size: dict[str, Any] = {"diameter_m": diameter_m, "thickness_m": thickness_m, "length_m": length_m}
+        sized = replace(self.rig, **size, pressure_Pa=pressure_Pa, pressure_sigma_Pa=0.01 * pressure_Pa)
         return with_names([sized])[0]
 
 
@@ -586,14 +548,13 @@ def _best(
         inputs = vine_inputs[int(i) * axes[1].size + int(j)]
         if round_number == 0:
             others = np.column_stack([axes[0], speeds.max(axis=1)])
-        spans = [_neighbours(axis, int(k), span) for axis, k, span in zip(axes, (i, j), limits, strict=True)]
+        # From the grid value below the optimum to the one above, within the limits.
+        spans = [
+            (max(low, float(axis[max(k - 1, 0)])), min(high, float(axis[min(k + 1, axis.size - 1)])))
+            for axis, k, (low, high) in zip(axes, (int(i), int(j)), limits, strict=True)
+        ]
     assert inputs is not None
     return inputs, others
-
-
-def _neighbours(axis: Floats, k: int, limits: tuple[float, float]) -> tuple[float, float]:
-    """Range from the grid value below the optimum to the one above, within the limits."""
-    return max(limits[0], float(axis[max(k - 1, 0)])), min(limits[1], float(axis[min(k + 1, axis.size - 1)]))
 
 
 def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
@@ -661,14 +622,12 @@ def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gam
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
     model = _with(inputs.model, "supply_refill", tau=tau_s, gamma=gamma)
     (moved,), _ = grown(model, [trial], host=host_for(inputs.model))
-    pressure = pressure_along(model, trial, moved.time_s, moved.lead_position_m, moved.lead_velocity_m_s)
-    return 1 - float(np.min(pressure)) / trial.pressure_Pa
+    terms = evaluate(model, trial, moved.time_s, moved.lead_position_m, moved.lead_velocity_m_s)
+    return 1 - float(np.min(terms.pressure_Pa)) / trial.pressure_Pa
 
 
 def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma: float) -> float:
-    """Return the volume of the chamber that with such a supply loses exactly this fraction; 0 where none is needed.
-    Returns m³.
-    """
+    """Return the volume, m³, of the chamber that loses just this fraction with such a supply; 0 if none is needed."""
 
     def excess_loss(log_volume: float) -> float:
         return supplied_loss(inputs, math.exp(log_volume), tau_s, gamma) - loss

@@ -20,9 +20,9 @@ from scipy.special import ndtri
 from vinetrack.core import published
 from vinetrack.core.problems import Problem
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.units import convert, number
+from vinetrack.core.units import convert, number, or_nan
 from vinetrack.dynamics.model import Model, make_model
-from vinetrack.effects import BASE_EFFECTS, Effect, EffectError
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE
@@ -37,16 +37,10 @@ if TYPE_CHECKING:
 #     B ≈ 6.44 (t/200 µm) (D/24 mm)^0.75 N·(s/m)ⁿ
 #
 # describes the four printed values and the printed linear rise with wall thickness. All four have nearly the same
-# t/D, so they do not determine the exponents of t and D separately: `SPLIT_SIGMA` allows for that. None of these
+# t/D, so they do not determine the exponents of t and D separately: their split has an error of its own. None of these
 # values is a measurement, and every output that uses them says so.
 
 SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
-
-SPLIT_SIGMA = 0.25  # Standard error of the exponent of t against that of D, at constant sum
-
-
-YIELD_PRESSURE_PA = 1000 * published.YIELD_PRESSURE_KPA
-PRINTED_YIELD_SIGMA_PA = 1000 / math.sqrt(12)  # Standard error of the printed yield pressure, Pa
 
 BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
 
@@ -106,7 +100,7 @@ def exponent_sigma() -> float:
     >>> round(exponent_sigma(), 3)
     0.012
     """
-    dof = sum(published.CONDITIONS) / len(published.CONDITIONS) - 2
+    dof = (8 + 11) / 2 - 2  # 8 to 11: the printed numbers of pressures of a scale
     variances = [published.EXPONENT**2 * (1 - R2) / R2 / dof for R2 in published.DAMPING_R2.values()]
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
@@ -174,48 +168,36 @@ class PredictiveInputs:
         return {**values, PRESSURE: self.trial.pressure_Pa, YIELD: self.trial.yield_pressure_Pa}
 
     def draw(self, count: int, seed: int, only: Iterable[str] | None = None) -> Draws:
-        """Draw every input `count` times; the same seed gives the same draws."""
+        """Draw every input `count` times within its physical bounds; the same seed gives the same draws."""
         chosen = None if only is None else set(only)
         draws = {name: np.full(count, value) for name, value in self.medians.items()}
         for uncertainty in self.uncertainties:
             if chosen is None or uncertainty.name in chosen:
                 draws = uncertainty.sample(draws, np.random.default_rng([seed, zlib.crc32(uncertainty.key.encode())]))
-        return _within_bounds(draws, self.model)
+        bounds = {f"{effect.name}.{p.name}": p.bounds for effect in self.model for p in effect.parameters}
+        bounds |= {YIELD: (0.0, math.inf), PRESSURE: (0.0, math.inf)}
+        return {name: np.clip(values, *bounds[name]) for name, values in draws.items()}
 
     def laid_out(self, draws: Draws) -> tuple[list[Trial], Floats]:
         """Return the trials and model parameters of these draws, as the simulator takes them. Returns trials (one for
         each draw, with its pressures), parameters. Shape (n, n_parameters).
         """
         rows = np.column_stack([draws[name] for name in self.model.parameter_names])
-        pressures, yields = draws[PRESSURE].tolist(), draws[YIELD].tolist()
-        return [
-            replace(self.trial, pressure_Pa=P, yield_pressure_Pa=P_y) for P, P_y in zip(pressures, yields, strict=True)
-        ], rows
+        pairs = zip(draws[PRESSURE].tolist(), draws[YIELD].tolist(), strict=True)
+        return [replace(self.trial, pressure_Pa=P, yield_pressure_Pa=P_y) for P, P_y in pairs], rows
 
-    def bands(self, seed: int = 1) -> list[Input]:
+    def bands(self) -> list[Input]:
         """Return every input with its 90 % band; fixed inputs have a band of zero width."""
-        draws = self.draw(4000, seed)
-        names = {
-            f"{effect.name}.{parameter.name}": (parameter.symbol, parameter.unit)
-            for effect in self.model
-            for parameter in effect.parameters
-        }
-        named = {**names, YIELD: ("P_y", "Pa"), PRESSURE: ("P", "Pa")}
-        order = [name for name in ("eversion_damping.B", "eversion_damping.n", YIELD, PRESSURE) if name in draws]
-        order += [name for name in draws if name not in order]
+        draws = self.draw(4000, 1)
+        named = {f"{effect.name}.{p.name}": (p.symbol, p.unit) for effect in self.model for p in effect.parameters}
+        named |= {YIELD: ("P_y", "Pa"), PRESSURE: ("P", "Pa")}
+        first = [name for name in (DAMPING, EXPONENT, YIELD, PRESSURE) if name in draws]
         bands = []
-        for name in order:
+        for name in dict.fromkeys([*first, *draws]):
             symbol, unit = named[name]
             low, median, high = (float(q) for q in np.quantile(draws[name], BAND))
             bands.append(Input(name, symbol, unit, low, median, high, self.origins.get(name, "")))
         return bands
-
-
-def _within_bounds(draws: Draws, model: Model) -> Draws:
-    """The draws, clipped to the physical bounds of each input."""
-    bounds = {f"{effect.name}.{p.name}": p.bounds for effect in model for p in effect.parameters}
-    bounds |= {YIELD: (0.0, math.inf), PRESSURE: (0.0, math.inf)}
-    return {name: np.clip(values, *bounds[name]) for name, values in draws.items()}
 
 
 @dataclass(frozen=True)
@@ -235,8 +217,6 @@ def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[
     """Parse an effect with its sizes: `NAME`, `NAME=value` or `NAME=low:high`, several parameters separated by commas.
     Returns name (of the effect), sizes (by `effect.parameter`; empty where the text gives none).
     """
-    from vinetrack.effects import find_effect
-
     name, _, sizes_text = text.partition("=")
     effect = find_effect(name.strip(), further)
     if not sizes_text.strip():
@@ -283,18 +263,12 @@ def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Sampler:
     return _varied(name, lambda values, draw: values * np.exp(log_sigma * _deviates(draw, values.size, dof)))
 
 
-def relative(name: str, sigma: float, dof: float) -> Sampler:
-    """Return a sampler that multiplies an input by one plus a normal (or t) deviate."""
-    return _varied(name, lambda values, draw: values * (1 + sigma * _deviates(draw, values.size, dof)))
-
-
 def shifted(name: str, sigma: float) -> Sampler:
     """Return a sampler that adds a normal deviate to an input."""
     return _varied(name, lambda values, draw: values + sigma * draw.standard_normal(values.size))
 
 
-def even(name: str, size: Size) -> Sampler:
-    """Return a sampler that draws an input uniformly from a range."""
+def _uniform(name: str, size: Size) -> Sampler:
     return _varied(name, lambda values, draw: draw.uniform(size.low, size.high, values.size))
 
 
@@ -302,8 +276,6 @@ def even(name: str, size: Size) -> Sampler:
 # Fitted parameters in the form from which predictions draw: means, covariance, between-trial standard deviations.
 #
 # They come from a `Fit` or from `fit.json`. B is held as its logarithm, as in the fit.
-
-_VINE = re.compile(r"([\d.]+)mm-([\d.]+)um.*")  # Diameter and thickness in the name of a vine
 
 
 @dataclass(frozen=True)
@@ -333,7 +305,8 @@ class FitNumbers:
     def sizes(self) -> dict[str, tuple[float, float]]:
         """Diameter and thickness, m, of every vine with a fitted B and a name that contains them."""
         vines = (vine for key, vine in zip(self.keys, self.vines, strict=True) if key == DAMPING)
-        return {m[0]: (float(m[1]) / 1e3, float(m[2]) / 1e6) for vine in vines if (m := _VINE.match(vine))}
+        named = (re.match(r"([\d.]+)mm-([\d.]+)um.*", vine) for vine in vines)
+        return {m[0]: (float(m[1]) / 1e3, float(m[2]) / 1e6) for m in named if m}
 
 
 def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
@@ -343,14 +316,12 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
     numbers = content["numbers"]
     if not numbers:
         raise FitError(f"{source} holds a fit without numbers: there is nothing to predict from.")
-    covariance = np.array([[_number(cell) for cell in row] for row in content["covariance"]], dtype=float)
+    covariance = np.array([[or_nan(cell) for cell in row] for row in content["covariance"]], dtype=float)
     values = np.array([number["value"] for number in numbers], dtype=float)
     log = np.array([number["parameter"] == DAMPING and number["value"] > 0 for number in numbers], dtype=bool)
     slopes = np.where(log, 1 / np.where(log, values, 1.0), 1.0)
-    widening = np.array(
-        [_widening(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)], dtype=float
-    )
-    between = np.array([[_number(cell) for cell in row] for row in content.get("between_trials") or ()], dtype=float)
+    widening = np.array([_widening(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)])
+    between = np.array([[or_nan(cell) for cell in row] for row in content.get("between_trials") or ()], dtype=float)
     is_known = np.isfinite(np.diag(covariance))
     if between.shape == covariance.shape:
         # A prediction is of one trial, whose parameters differ from the shared ones.
@@ -372,13 +343,9 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
     )
 
 
-def _number(cell: Any) -> float:
-    return math.nan if cell is None else float(cell)
-
-
 def _widening(number: Mapping[str, Any], log: bool) -> float:
     """Ratio of the fit's 95 % interval to that of a normal distribution, at least 1; 1 where a bound determines it."""
-    low, high, sigma = (_number(number[key]) for key in ("low_95", "high_95", "sigma"))
+    low, high, sigma = (or_nan(number[key]) for key in ("low_95", "high_95", "sigma"))
     if number["interval"] != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
         return 1.0
     half = (math.log(high / low) if log else high - low) / 2
@@ -581,11 +548,12 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
     )
     sources.add_uncertainty("guess of B", words, f"B scatter|{trial.vine}", scaled(DAMPING, scatter, SCATTER_DOF))
     if abs(split) > 1e-9:
+        split_sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
         words = (
-            f"B is printed for one t/D only: exponents of t and D ±{SPLIT_SIGMA:g} against each other, "
-            f"{100 * abs(split) * SPLIT_SIGMA:.0f} % at this t/D"
+            f"B is printed for one t/D only: exponents of t and D ±{split_sigma:g} against each other, "
+            f"{100 * abs(split) * split_sigma:.0f} % at this t/D"
         )
-        sources.add_uncertainty("t against D", words, "B split", scaled(DAMPING, split * SPLIT_SIGMA))
+        sources.add_uncertainty("t against D", words, "B split", scaled(DAMPING, split * split_sigma))
 
 
 def _printed_scale(trial: Trial) -> int | None:
@@ -614,6 +582,7 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
     trial, fit = sources.trial, sources.fit
     stated, sigma = trial.yield_pressure_Pa, max(np.nan_to_num(trial.yield_pressure_sigma_Pa), 0.0)
     place = yield_place(fit, vine, stated) if fit and is_same else None
+    printed_Pa = 1000 * published.YIELD_PRESSURE_KPA
     if fit is not None and place is not None and math.isfinite(stated):
         # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
         tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
@@ -625,12 +594,13 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
         if sigma > 0:
             words = f"stated to {sigma / 1e3:.2g} kPa"
             sources.add_uncertainty("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
-    elif _printed_scale(trial) == published.YIELD_PRESSURE_SCALE:
-        sources.set(YIELD, YIELD_PRESSURE_PA, f"printed, {published.SOURCE}")
-        words = f"printed to a whole number: ±{PRINTED_YIELD_SIGMA_PA / 1e3:.2g} kPa"
-        sources.add_uncertainty("printed P_y", words, "P_y printed", shifted(YIELD, PRINTED_YIELD_SIGMA_PA))
+    elif _printed_scale(trial) == 4:  # the vine whose yield pressure is printed
+        rounding_Pa = 1000 / math.sqrt(12)
+        sources.set(YIELD, printed_Pa, f"printed, {published.SOURCE}")
+        words = f"printed to a whole number: ±{rounding_Pa / 1e3:.2g} kPa"
+        sources.add_uncertainty("printed P_y", words, "P_y printed", shifted(YIELD, rounding_Pa))
     else:
-        sources.set(YIELD, YIELD_PRESSURE_PA, "guess: the one that is printed, for another vine")
+        sources.set(YIELD, printed_Pa, "guess: the one that is printed, for another vine")
         words = f"{published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine; nine of ten others within a factor 3"
         log_sigma = math.log(3.0) / float(ndtri(0.95))
         sources.add_uncertainty("guess of P_y", words, "P_y guess", scaled(YIELD, log_sigma))
@@ -655,7 +625,7 @@ def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anc
                     )
                 if size.high > size.low:
                     words = f"{parameter.symbol} of {effect.name} uniform between {size.low:g} and {size.high:g}"
-                    sources.add_uncertainty(f"{parameter.symbol} ({effect.name})", words, name, even(name, size))
+                    sources.add_uncertainty(f"{parameter.symbol} ({effect.name})", words, name, _uniform(name, size))
             elif place is not None:
                 sources.set_fitted(name, place)
             else:
@@ -706,8 +676,10 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
         pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
         origin, dof = f"estimated in {fit.source}:", fit.spread_dof
     sources.set(PRESSURE, trial.pressure_Pa, "set")
+    dof_of_pressure = dof.get("pressure", math.inf)
+    relative = _varied(PRESSURE, lambda P, draw: P * (1 + pressure * _deviates(draw, P.size, dof_of_pressure)))
     for symbol, spread, sampler in (
-        ("P", pressure, relative(PRESSURE, pressure, dof.get("pressure", math.inf))),
+        ("P", pressure, relative),
         ("B", damping, scaled(DAMPING, damping, dof.get("B", math.inf))),
     ):
         if spread > 0:

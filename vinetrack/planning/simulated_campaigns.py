@@ -23,8 +23,6 @@ from vinetrack.inference.sensitivity import Predictor, align, initial_trial_effe
 from vinetrack.planning.discriminating_design import Condition, Hypothesis, TrackSampling, film_trials
 from vinetrack.tracks.position_noise import ar1_noise
 
-FEWEST_GROWTH_FRAMES = 12  # Frames of growth below which a trial is not worth filming (chosen)
-
 
 @dataclass(frozen=True)
 class FilmingPlan:
@@ -105,11 +103,6 @@ def make(
 # the parameters, which is fast enough to compare designs. The thorough one draws the truth from its distribution given
 # the old trials and simulates every trajectory anew, as a check.
 
-MOST_ITERATIONS = 20  # Iterations of a refit, at most (chosen)
-
-# Deviations of pressure and B in standard deviations, balanced over replicates (derived)
-ALTERNATING = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-
 
 class PartlyLinear(Predictor):
     """Predictor that simulates new trials and treats the old ones as linear, with the sensitivities of their fit."""
@@ -172,14 +165,16 @@ def simulated_rises(
     the old trials stay linear, for to simulate those takes a hundred times as long. Shape (n_draws, n, n).
     """
     n = len(bench.hypotheses)
+    # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
+    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
     rises = np.full((len(draws), n, n), math.nan)
     before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in bench.hypotheses])
     for k, a in np.ndindex(len(draws), n):
         rng = np.random.default_rng([seed, int(thorough), draws[k], a])
         truth = bench.hypotheses[a]
         theta = draw_parameters(truth, rng) if thorough else truth.theta
-        alternating = ALTERNATING[(np.arange(len(design)) + draws[k]) % 4]
-        deviations = rng.standard_normal((len(design), 2)) if thorough else alternating
+        in_turn = alternating[(np.arange(len(design)) + draws[k]) % 4]
+        deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
         try:
             filmed = film_trials(truth, design, bench.conditions, bench.cameras, theta, deviations * truth.spread, rng)
         except SimulationError:
@@ -209,25 +204,22 @@ def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
 def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, thorough: bool) -> float:
     """−2 ln L of a hypothesis fitted to old and new trials; NaN where the fit fails."""
     data = [trial_data for _, trial_data in new]
+    most = 20  # Iterations of a refit, at most (chosen)
     layout, old = _extended_layout(hypothesis, [place for place, _ in new]), hypothesis.fit.solution
     quick = PartlyLinear(layout, hypothesis.fit.predictor, old, data)
     try:
         state = _extended_state(hypothesis, quick, data)
-        problem = make_problem(quick, state.trial_effects)
-        problem = replace(
-            problem,
-            release_origin_mean=np.concatenate(
-                [old.problem.release_origin_mean, problem.release_origin_mean[len(old.problem.release_origin_mean) :]]
-            ),
-        )
+        problem, before = make_problem(quick, state.trial_effects), old.problem.release_origin_mean
+        means = np.concatenate([before, problem.release_origin_mean[len(before) :]])
+        problem = replace(problem, release_origin_mean=means)
         # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
         fixed = FixedTerms(state.spread, (state.rho, state.variance))
-        solution = solve(quick, problem, state, fixed, warm=True, most_iterations=MOST_ITERATIONS)
+        solution = solve(quick, problem, state, fixed, warm=True, most_iterations=most)
         whole: Predictor = quick
         if thorough and all(trial_data.trace is None for trial_data in quick.data[: quick.n_old]):
             whole = Predictor(layout, quick.data, quick.host)
             whole.steps = quick.new.steps.copy()
-        solution = solve(whole, problem, solution.state, warm=True, most_iterations=MOST_ITERATIONS)
+        solution = solve(whole, problem, solution.state, warm=True, most_iterations=most)
     except SimulationError:
         return math.nan
     return -2 * solution.log_likelihood()
