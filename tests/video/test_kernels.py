@@ -11,9 +11,7 @@ from plain_scene import Plan, plain_scene
 
 from vinetrack.core import threads
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video.kymograph import (
-    largest_steps,
-)
+from vinetrack.video.kymograph import largest_steps
 
 
 @pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
@@ -32,7 +30,6 @@ def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(l
 
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2
-NO_SHADING = np.zeros(65)
 RIM = 40 * np.exp(-0.5 * ((np.arange(65) - 32 + 4.0) / 2.0) ** 2)
 """Shading of a tip with a bright rim 4 px behind its edge, grey levels, by distance ahead of it from −32 px on."""
 
@@ -56,32 +53,27 @@ def stepping(seed: int = 961, rim: bool = False, contrast: float = 110.0) -> tup
     return np.clip(values, 0, 255).astype(np.uint8), edge, pictures
 
 
+def fitted(strip: np.ndarray, start: np.ndarray, pictures: np.ndarray, shading: np.ndarray) -> np.ndarray:
+    fixed = (np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12)
+    return kernels.fit_edges(strip, np.ones(16), np.zeros(16), start, *fixed, shading, np.arange(16), (0, 9))
+
+
 def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     strip, edge, pictures = stepping()
     start = edge + 1.4
     start[5] = np.nan
-    fit = kernels.fit_edges(
-        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
-        NO_SHADING, np.arange(16), (0, 9),
-    )  # fmt: skip
+    fit = fitted(strip, start, pictures, 0 * RIM)
     assert np.isnan(fit[5]).all()
     sound = np.arange(16) != 5
     assert np.abs(fit[sound, 0] - edge[sound]).max() < 0.08
-    assert np.median(fit[sound, 1]) == pytest.approx(
-        0.0112, rel=0.15
-    )  # 110 grey levels, variance 10.5: (9 · 110² / 10.5 / 2√π 0.4)^−½
+    # 110 grey levels, variance 10.5: (9 · 110² / 10.5 / 2√π 0.4)^−½
+    assert np.median(fit[sound, 1]) == pytest.approx(0.0112, rel=0.15)
 
 
 @pytest.mark.parametrize("contrast", [110.0, -15.0, 0.0])
 def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_like_background(contrast: float) -> None:
     strip, edge, pictures = stepping(rim=True, contrast=contrast)
-    known, ignored = (
-        kernels.fit_edges(
-            strip, np.ones(16), np.zeros(16), edge - 1.4, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
-            shading, np.arange(16), (0, 9),
-        )[:, 0] - edge
-        for shading in (RIM, NO_SHADING)
-    )  # fmt: skip
+    known, ignored = (fitted(strip, edge - 1.4, pictures, shading)[:, 0] - edge for shading in (RIM, 0 * RIM))
     assert np.abs(known).max() < 0.15
     assert np.abs(ignored).max() > 2 * np.abs(known).max()
 
@@ -150,10 +142,7 @@ def test_a_track_is_the_same_to_the_last_digit_whatever_the_number_of_threads(mo
     found = []
     for number in (1, 3):
         monkeypatch.setattr(threads, "n_threads", lambda number=number: number)
-        found.append(tracked(luma, 0.5))
-    one, three = found
-    assert np.isfinite(one.track.edge_px).sum() > 20
-    np.testing.assert_array_equal(one.track.edge_px, three.track.edge_px)
-    np.testing.assert_array_equal(one.track.lead_position_sigma_m, three.track.lead_position_sigma_m)
-    np.testing.assert_array_equal(one.track.lead_position_systematic_m, three.track.lead_position_systematic_m)
-    assert one.track.flag.tolist() == three.track.flag.tolist()
+        found.append(tracked(luma, 0.5).track)
+    assert np.isfinite(found[0].edge_px).sum() > 20
+    for name in ("edge_px", "lead_position_sigma_m", "lead_position_systematic_m", "flag"):
+        np.testing.assert_array_equal(*(getattr(track, name) for track in found))
