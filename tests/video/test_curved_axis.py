@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bent_scene import BENDS, BentPlan, BentScene, bent_scene
-from pictures import tracked
+from pictures import in_memory, tracked
 from plain_scene import Plan, plain_scene
 
+from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import PlaneCalibration, PlaneMap
 from vinetrack.video.curved_axis import (
@@ -25,7 +26,7 @@ from vinetrack.video.curved_axis import (
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import cut_strip
-from vinetrack.video.track import Tracking
+from vinetrack.video.track import Tracking, in_metres, track_pixels
 
 RADIUS = 300.0
 SIDE = 400
@@ -106,8 +107,8 @@ def drawn(scene: BentScene, count: int = 6, off_px: float = 3.0) -> Axis:
     return axis_through(places + np.random.default_rng(scene.plan.seed).normal(0, off_px, places.shape))
 
 
-def followed(scene: BentScene, axis: Axis, **given) -> Tracking:
-    return tracked(scene.frames, scene.plan.exposure, axis, **given)
+def followed(scene: BentScene, axis: Axis) -> Tracking:
+    return tracked(scene.frames, scene.plan.exposure, axis)
 
 
 @pytest.mark.slow
@@ -131,9 +132,11 @@ def test_metres_are_lengths_along_the_curve_in_the_tilted_plane(bent: BentScene)
     covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
     plane = PlaneMap(bent.plan.width, bent.plan.height, parameters, covariance)
     calibration = PlaneCalibration("charuco", plane, 0.1, 50, 1, 0.0, (0, 0, 639, 639))
-    axis = followed(bent, drawn(bent)).axis
+    trial = Trial(name="t", exposure_s=bent.plan.exposure / 1000)
+    in_px = track_pixels(in_memory(bent.frames), trial, 1000.0, drawn(bent))
+    axis = in_px.axis
     scale = calibration.along_path(axis)
-    tracking = followed(bent, drawn(bent), position_m=scale.position_m)
+    tracking = in_metres(in_px, trial, scale.m_per_px, scale.position_m)
     used = bent.moving & tracking.track.usable
     fine = np.arange(0.0, bent.arc_px[-1], 0.5)
     steps = np.linalg.norm(np.diff(plane.plane_m(bent.places(fine)), axis=0), axis=1)

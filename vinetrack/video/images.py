@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from collections.abc import Iterator
@@ -22,10 +21,8 @@ from vinetrack.video.frames import (
     RawFrames,
     Recording,
     RecordingError,
-    Region,
-    memory_for_pictures,
+    filled,
     mosaic_brightness,
-    too_large,
     unpack_pixels,
 )
 
@@ -391,29 +388,27 @@ def inspect_images(path: Path) -> Recording:
     return Recording(path, kind, width, height, depth, count, fps, exposure, files, numbers, notes)
 
 
-def read_images(recording: Recording, region: Region) -> Frames:
-    """Read every picture, straight into one array; one that is truncated or cannot be read is partial or black, and
-    marked damaged.
-    """
+def read_images(recording: Recording) -> Frames:
+    """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged."""
     name, notes = recording.path.name, list(recording.notes)
-    dtype = np.dtype(np.uint8 if recording.bit_depth == 8 else np.uint16)
-    shape = (recording.declared_frames or 0, *region.shape)
-    if math.prod(shape) * dtype.itemsize > memory_for_pictures():
-        raise too_large(recording)
-    luma, damaged = np.zeros(shape, dtype), np.zeros(shape[0], dtype=bool)
-    if recording.kind == "stack":
-        n = 0
-        for n, page in enumerate(_stack_pages(recording), 1):
-            luma[n - 1] = page[region.slices]
-        if n < shape[0]:
-            notes.append(f"{name}: {n} pages read where the stack declares {shape[0]}: cut short")
-        luma, damaged = luma[:n], damaged[:n]
-    else:
-        for i, file in enumerate(recording.files):
+    count, dtype = recording.declared_frames or 0, np.dtype(np.uint8 if recording.bit_depth == 8 else np.uint16)
+    is_damaged: list[bool] = []
+
+    def pictures() -> Iterator[NDArray[Any]]:
+        for file in recording.files:
             picture = _read_or_none(file)
-            damaged[i] = picture is None or picture.shape != (recording.height, recording.width)
-            if picture is not None and not damaged[i]:
-                luma[i], damaged[i] = picture[region.slices], not _has_end_marker(file)
+            readable = picture is not None and picture.shape == (recording.height, recording.width)
+            is_damaged.append(not readable or not _has_end_marker(file))
+            yield picture if readable and picture is not None else np.zeros((recording.height, recording.width), dtype)
+
+    if recording.kind == "stack":
+        luma = filled(recording, _stack_pages(recording), count, dtype)
+        damaged = np.zeros(len(luma), dtype=bool)
+        if len(luma) < count:
+            notes.append(f"{name}: {len(luma)} pages read where the stack declares {count}: cut short")
+    else:
+        luma = filled(recording, pictures(), count, dtype)
+        damaged = np.array(is_damaged)
     if damaged.all():
         raise RecordingError("not one picture can be read", "the files are damaged", name)
     if damaged.any():
@@ -426,19 +421,18 @@ def read_images(recording: Recording, region: Region) -> Frames:
         slot, missing = _capture_periods(np.array(recording.numbers))
         if missing:
             notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
-    return Frames(recording, region, luma, slot, damaged, tuple(notes))
+    return Frames(recording, luma, slot, damaged, tuple(notes))
 
 
-def iterate_images(recording: Recording, region: Region) -> Iterator[NDArray[Any]]:
-    """Yield the region of each picture that can be read."""
+def iterate_images(recording: Recording) -> Iterator[NDArray[Any]]:
+    """Yield each picture that can be read."""
     if recording.kind == "stack":
-        for page in _stack_pages(recording):
-            yield page[region.slices]
+        yield from _stack_pages(recording)
         return
     for file in recording.files:
         picture = _read_or_none(file)
         if picture is not None and picture.shape == (recording.height, recording.width):
-            yield picture[region.slices]
+            yield picture
 
 
 def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tuple[str, ...]]:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.frames import (
-    DECODER_THREADS,
     Frames,
     PacketIndex,
     Recording,
@@ -310,10 +309,10 @@ def _sample_film(recording: Recording, index: PacketIndex) -> tuple[list[NDArray
     candidates = keys if keys_only else np.arange(len(index.pts))
     chosen = {int(index.pts[i]): int(i) for i in candidates[:: max(1, -(-len(candidates) // MAX_SAMPLES))]}
     pictures = {}
-    for frame in decode_packets(recording.path, set(chosen) if keys_only else None, DECODER_THREADS):
+    for frame in decode_packets(recording.path, set(chosen) if keys_only else None):
         number = None if frame.pts is None else chosen.get(frame.pts)
         if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
-            pictures[number] = _shrunk(luma_plane(frame, recording.whole), recording.bit_depth)
+            pictures[number] = _shrunk(luma_plane(frame), recording.bit_depth)
     numbers = sorted(pictures)
     return [pictures[number] for number in numbers], np.array(numbers, dtype=int)
 

@@ -227,34 +227,19 @@ class Tracking:
         return np.arange(len(self.track.time_s)) if self.strip_frames is None else self.strip_frames
 
 
-def track_recording(
-    trial: Trial,
-    axis: Axis | None = None,
-    *,
-    m_per_px: float | None = None,
-    position_m: Callable[[Floats], Floats] | None = None,
-) -> Tracking:
-    """Track the leading edge of one recording, or the body where the travel ratio is 1. Shapes: position_m (n, 2)."""
+def track_recording(trial: Trial, axis: Axis | None = None) -> Tracking:
+    """Track the leading edge of one recording, or the body where the travel ratio is 1, by the trial's own scale."""
     if trial.video is None:
         raise RecordingError("no recording is named", "fill in the column video", trial.name)
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording)
-    frames = read_event(recording, trial.frames_used)
-    return track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
+    return track_frames(read_event(recording, trial.frames_used), trial, capture_fps, axis)
 
 
-def track_frames(
-    frames: Frames,
-    trial: Trial,
-    capture_fps: float,
-    axis: Axis | None = None,
-    *,
-    m_per_px: float | None = None,
-    position_m: Callable[[Floats], Floats] | None = None,
-) -> Tracking:
+def track_frames(frames: Frames, trial: Trial, capture_fps: float, axis: Axis | None = None) -> Tracking:
     """Track frames that are already in memory; see `track_recording`."""
-    scale = trial.m_per_px if m_per_px is None else m_per_px
-    return in_metres(track_pixels(frames, trial, capture_fps, axis, trial.diameter_m / scale), trial, scale, position_m)
+    tracking = track_pixels(frames, trial, capture_fps, axis, trial.diameter_m / trial.m_per_px)
+    return in_metres(tracking, trial, trial.m_per_px)
 
 
 def track_pixels(
