@@ -365,9 +365,6 @@ def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> n
     return out
 
 
-# Formats under which FFmpeg renders any text as a picture of its letters
-TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
-
 DECODER_THREADS = 2  # Decoder threads per recording (chosen)
 
 
@@ -521,7 +518,8 @@ def _inspect_container(path: Path) -> Recording:
 
     try:
         with quiet_log() as messages, open_film(path) as container:
-            if container.format.name in TEXT_FORMATS:
+            # Formats under which FFmpeg renders any text as a picture of its letters
+            if container.format.name in {"tty", "bin", "xbin", "adf", "idf", "svg_pipe"}:
                 raise RecordingError("a text, not a recording", "name a film, or a folder of pictures", path.name)
             if not container.streams.video:
                 raise RecordingError("holds no video stream", "name a video file", path.name)
@@ -542,29 +540,23 @@ def _declared_frames(stream: Any, container: Any) -> int | None:
     """Frame count of the header; if absent, duration times playback rate."""
     if stream.frames > 0:
         return int(stream.frames)
-    seconds = None
+    seconds = math.nan if container.duration is None else container.duration / 1e6
     if stream.duration is not None and stream.time_base is not None:
         seconds = float(stream.duration * stream.time_base)
-    elif container.duration is not None:
-        seconds = container.duration / 1e6
-    if seconds is None or not stream.average_rate:
+    if math.isnan(seconds) or not stream.average_rate:
         return None
     return max(round(seconds * float(stream.average_rate)), 0) or None
 
 
 def _why_unreadable(path: Path, messages: list[str], error: str) -> tuple[str, str]:
     """What is wrong with a file that cannot be opened, and what to do."""
-    text = " ".join([*messages, error])
-    if "moov atom not found" in text and _looks_like_mp4(path):
-        return "cut short: the index that is written last is missing", "copy the file again, or repair it"
+    if "moov atom not found" in " ".join([*messages, error]):
+        with path.open("rb") as stream:
+            if stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}:
+                return "cut short: the index that is written last is missing", "copy the file again, or repair it"
     if path.suffix.lower() not in CONTAINERS:
         return "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
     return "not a video, or its beginning is damaged", "copy it from the camera again"
-
-
-def _looks_like_mp4(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
 
 
 def _assemble(recording: Recording, decoded: Decoded, index: PacketIndex | None) -> Frames:
@@ -607,10 +599,10 @@ def _assemble(recording: Recording, decoded: Decoded, index: PacketIndex | None)
 
 
 def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[NDArray[np.int_], str]:
-    """Return the capture period of every frame from its timestamp, and a note on irregularities ("" if there are none).
-    Timestamps are rounded to whole multiples of their median spacing, so that a missing frame leaves a gap. Timestamps
-    that repeat, run backwards or fit no common period are not used; frames are then numbered consecutively. Returns
-    capture periods since the first frame, shape (n_frames,), and the note. Shapes: times (n_frames,).
+    """Return the capture period of every frame since the first from its timestamp, both (n_frames,), and a note on
+    irregularities ("" if there are none). Timestamps are rounded to whole multiples of their median spacing, so that a
+    missing frame leaves a gap. Those that repeat, run backwards or fit no common period are not used; frames are then
+    numbered consecutively.
     """
     plain = np.arange(len(times))
     if len(times) < 3 or not np.all(np.isfinite(times)):
@@ -748,9 +740,7 @@ def read_raw(recording: Recording, raw: RawFrames) -> Frames:
             f"{name}: the file holds {n} frames but declares {recording.declared_frames}: cut short; "
             "copy it from the camera again"
         )
-    slot, irregular = np.arange(n), ""
-    if raw.times_s is not None:
-        slot, irregular = slots_from_times(raw.times_s[:n])
+    slot, irregular = (np.arange(n), "") if raw.times_s is None else slots_from_times(raw.times_s[:n])
     if irregular:
         notes.append(f"{name}: {irregular}")
     return Frames(recording, luma, slot, np.zeros(n, dtype=bool), tuple(notes))

@@ -324,9 +324,7 @@ def _raw_event(recording: Recording, frame_range: tuple[int, int] | None) -> Fra
     if frame_range is None or frame_range[0] >= count:
         return read_frames(recording)
     first, last = frame_range[0], min(frame_range[1], count - 1)
-    slots, irregular = np.arange(count), ""
-    if raw.times_s is not None:
-        slots, irregular = slots_from_times(raw.times_s[:count])
+    slots, irregular = (np.arange(count), "") if raw.times_s is None else slots_from_times(raw.times_s[:count])
     part = replace(raw, offsets=raw.offsets[first : last + 1], times_s=None)
     frames = read_frames(replace(recording, raw=part, declared_frames=len(part.offsets)))
     part_read = f"of {count} frames only {first} to {last}, around the motion, are read; choose others in frames_used"
