@@ -31,20 +31,8 @@ from vinetrack.kinematics.damping import (
     planes,
     slope,
 )
-from vinetrack.kinematics.summary import (
-    CONDITION_COLUMNS,
-    look_at_motions,
-    redo_damping,
-)
-from vinetrack.laboratory.tracks import (
-    BASE,
-    PAPER_B,
-    PAPER_N,
-    GroundTruth,
-    damping_values,
-    grow,
-    isometric_vine,
-)
+from vinetrack.kinematics.summary import CONDITION_COLUMNS, look_at_motions, redo_damping
+from vinetrack.laboratory.tracks import BASE, PAPER_B, PAPER_N, GroundTruth, damping_values, grow, isometric_vine
 from vinetrack.laboratory.tracks import campaign as of_vine
 
 N = 0.37
@@ -111,20 +99,6 @@ def test_exact_data_give_exact_n_and_B(method: str) -> None:
         assert (found["n_trials"], found["diameter_mm"], found["thickness_um"]) == (n_trials, 6 * scale, 50 * scale)
     assert fit["n_trials"] == 73
     assert fit["refused"] is None
-
-
-def test_log_log_is_least_squares_of_the_logarithm_of_force() -> None:
-    """The dummy-variable regression by numpy's own solver: estimates and covariance."""
-    points = scattered(1)
-    design = np.column_stack([np.log(points["x_ss_m_s"]), *((points["vine"] == vine).astype(float) for vine in B)])
-    y = np.log(points["force_N"].to_numpy())
-    solved, residuals, *_ = np.linalg.lstsq(design, y, rcond=None)
-    fit = fit_damping(points, resamples=100)["log_log"]
-    assert fit["n"] == pytest.approx(solved[0], abs=1e-9)
-    np.testing.assert_allclose([fit["vines"][vine]["B"] for vine in B], np.exp(solved[1:]), rtol=1e-9)
-    variance = residuals[0] / (160 - 5)
-    assert fit["scatter"] == pytest.approx(math.sqrt(variance), rel=1e-9)
-    np.testing.assert_allclose(fit["covariance"]["matrix"], variance * np.linalg.inv(design.T @ design), rtol=1e-6)
 
 
 NORRIS = """

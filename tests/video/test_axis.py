@@ -30,18 +30,6 @@ def test_flicker_is_taken_out_by_the_bands():
     assert np.ptp(still) < 0.05 * phase
 
 
-def test_shake_is_measured_to_a_twentieth_of_a_pixel():
-    scene = plain_scene(Plan(seed=12, shake=0.8, end_px=300, width=420, rest_frames=6, end_frames=4))
-    strip = cut_strip(scene.frames, Axis((40.0, 120.0), (400.0, 120.0)), 33)
-    assert strip.stabilised
-    n = np.arange(len(scene.frames))
-    # Shake is 0.8 sin(0.55 n + φ): its amplitude and phase by least squares leave the error of the measurement.
-    waves = np.column_stack([np.sin(0.55 * n), np.cos(0.55 * n), np.ones(len(n))])
-    fit, *_ = np.linalg.lstsq(waves, strip.shift_px[:, 0], rcond=None)
-    assert np.hypot(fit[0], fit[1]) == pytest.approx(0.8, abs=0.04)
-    assert np.std(strip.shift_px[:, 0] - waves @ fit) < 0.05
-
-
 def test_black_background_is_not_used_for_flicker() -> None:
     luma = np.zeros((12, 120, 200), np.uint16)
     luma[:, 55:65] = 180

@@ -21,12 +21,7 @@ from vinetrack.video import track
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, front_share
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.point_quality import (
-    PointQuality,
-    calibrated_sigma,
-    ending_of,
-    moving_range,
-)
+from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.track import Tracking, follow, track_recording, tube_strip
 

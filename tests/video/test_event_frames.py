@@ -11,8 +11,8 @@ from camera_files import write_cine
 from plain_scene import Plan, Scene, plain_scene, write_video
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.video import frames, small_pictures
-from vinetrack.video.frames import inspect_recording, packet_index, read_frames
+from vinetrack.video import small_pictures
+from vinetrack.video.frames import inspect_recording, read_frames
 from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.track import track_recording
 
@@ -99,22 +99,6 @@ def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scen
     made = track(film, frames_used=wanted)
     assert np.isfinite(made.edge_px).sum() > 0.9 * scene.moving.sum()
     assert not np.isfinite(made.edge_px[: wanted[0]]).any()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("bracketed")
-def test_a_frame_without_a_time_is_left_out_of_the_event(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames_of, without_time = frames._frames_of, packet_index(film).pts[BEFORE + 20]
-
-    def nameless(*arguments):
-        for frame in frames_of(*arguments):
-            frame.pts = None if frame.pts == without_time else frame.pts
-            yield frame
-
-    whole = read_event(inspect_recording(film), (BEFORE, BEFORE + 40))
-    monkeypatch.setattr(frames, "_frames_of", nameless)
-    event = read_event(inspect_recording(film), (BEFORE, BEFORE + 40))
-    assert event.slot.tolist() == np.delete(whole.slot, np.flatnonzero(whole.slot == BEFORE + 20)).tolist()
 
 
 @pytest.mark.slow

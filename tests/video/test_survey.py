@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from plain_scene import write_video
 
-from vinetrack.core.problems import format_problems
 from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.settings import run_settings
@@ -123,17 +122,6 @@ def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(
 ) -> None:
     write_clip(tmp_path / "a.mp4")
     assert check(tmp_path, "a.mp4", settings=SCALE + f"axis: {{{given}}}\n") == found
-
-
-@pytest.mark.slow
-def test_fifty_recordings_take_twenty_lines_however_many_are_bad(tmp_path: Path) -> None:
-    write_clip(tmp_path / "v0.mp4")
-    for i in range(1, 50):
-        shutil.copy(tmp_path / "v0.mp4", tmp_path / f"v{i}.mp4")
-        if i % 2:
-            (tmp_path / f"v{i}.mp4").write_text("text")
-    assert len(check(tmp_path, *(f"v{i}.mp4" for i in range(50)))) == 25
-    assert len(format_problems(check_experiment(tmp_path, Surveyor()))) == 20
 
 
 # ---- sizes in the picture against the sheet ----
