@@ -199,27 +199,6 @@ STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found
 CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
 
 
-def path_error_px(axis: Axis) -> float:
-    """Return the slow error of positions along an axis that comes from its curvature."""
-    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
-    return 0.04 * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
-
-
-def curve_note(axis: CurvedAxis) -> str:
-    """Say that the growth axis was found to be a curve."""
-    return (
-        f"the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those along a curve that"
-        " was found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
-    )
-
-
-def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
-    """Refuse a curve that leaves the picture or bends more sharply than its strip is wide."""
-    complaint = curve_problem(axis, half_px, (shape[1], shape[0]))
-    if complaint is not None:
-        raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
-
-
 def outline_stretches(axis: Axis) -> int:
     """Number of stretches in which the sides of a tube are found."""
     return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12

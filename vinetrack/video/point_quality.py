@@ -243,13 +243,6 @@ def ending_of(
     return Ending(grown_px, truncated_px, tuple(growth_end_notes(luma, quality, edge_px, name, number)), name, place)
 
 
-def body_end_note(frame: int, turns_back: bool) -> str:
-    """Say why a body is not followed to the end of the recording."""
-    if turns_back:
-        return f"the body turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
-    return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
-
-
 def growth_end_notes(
     luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_]
 ) -> list[str]:

@@ -16,11 +16,9 @@ from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import (
     CENTRED_PX,
     CurvedAxis,
-    check_curve,
-    curve_note,
+    curve_problem,
     find_growth_axis,
     outline_stretches,
-    path_error_px,
     recentred_curve,
 )
 from vinetrack.video.edge import Outline, outline, track_edge
@@ -33,7 +31,6 @@ from vinetrack.video.point_quality import (
     Ending,
     PointQuality,
     assess_points,
-    body_end_note,
     calibrated_sigma,
     ending_of,
 )
@@ -263,7 +260,8 @@ def track_pixels(
     # stabilisation and path.
     random_px = np.hypot(np.maximum(random_px, followed.bands_sigma_px), quality.departure_px)
     slow_px = np.hypot(np.broadcast_to(followed.slow_px, random_px.shape), STABILISED_PX if strip.stabilised else 0.0)
-    slow_px = np.hypot(slow_px, path_error_px(strip.axis))
+    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
+    slow_px = np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad if isinstance(strip.axis, CurvedAxis) else 0.0)
     errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
     notes, ending = _notes(frames, number, luma, trial, strip, followed, quality, axis_given)
     notes += left_out
@@ -342,13 +340,20 @@ def _notes(
     name = frames.recording.path.name
     notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
-        last_frame, turns_back = followed.end
-        notes.append(f"{name}: {body_end_note(int(number[last_frame]), turns_back)}")
+        frame, turns_back = int(number[followed.end[0]]), followed.end[1]
+        why = f"is not recognised after frame {frame}: it is gone, hidden or turned over"
+        if turns_back:
+            why = f"turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
+        notes.append(f"{name}: the body {why}")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
     if isinstance(strip.axis, CurvedAxis) and not axis_given:
-        notes.append(f"{name}: {curve_note(strip.axis)}")
+        notes.append(
+            f"{name}: the vine bends by {np.degrees(strip.axis.total_turn_rad):.0f}° in all, and positions are those "
+            "along a curve that was found: look at its overlay, and draw the curve (column `axis`) if the edge is not "
+            "on it"
+        )
     if not followed.is_edge:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -371,7 +376,9 @@ def locate_axis(luma: NDArray[Any], small: SmallPictures, axis: Axis | None, tri
     wide_px = width_px + 0.08 * axis.length_px
     if axis.bends:
         width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
-        check_curve(axis, width_px / 2 if width_known else math.nan, luma.shape[1:])
+        size_px = luma.shape[2], luma.shape[1]
+        if complaint := curve_problem(axis, width_px / 2 if width_known else math.nan, size_px):
+            raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
         wide_px = min(wide_px, 2 * axis.largest_half_px)
         return replace(axis, width_px=max(wide_px, width_px) if width_known else wide_px)
     axis = replace(axis, width_px=wide_px)
