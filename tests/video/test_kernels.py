@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pictures import tracked
@@ -69,6 +74,17 @@ def test_the_largest_step_is_where_means_differ_most():
     np.testing.assert_array_equal(when, begin)
     # Of the means of six frames on either side: 6 * 6 / 12 * 50².
     assert np.median(power) == pytest.approx(3 * 50**2, rel=0.05)
+
+
+FITS = "from test_kernels import *; s, e, p = stepping(); print(fitted(s, e + 1.4, p, RIM).tobytes().hex())"
+
+
+@pytest.mark.slow
+def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and_in_later_ones(tmp_path: Path) -> None:
+    where = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = [sys.executable, "-c", FITS]
+    first, later = (subprocess.run(run, env=os.environ | where, capture_output=True, check=True) for _ in range(2))
+    assert first.stdout == later.stdout
 
 
 # ---- threads of the tracker ----

@@ -20,6 +20,9 @@ from vinetrack.core.threads import in_parts
 # The fraction, called coverage, is tabulated at subpixel steps. Neighbouring columns lie a whole pixel apart, so that
 # a row of pixels reads every 1/TABLE_STEP_PX-th entry; the table is stored in that order, so that inner loops run
 # over neighbours in memory, without a branch.
+#
+# Functions that other compiled ones call are inlined: each caller would hold a copy of its own, with other last digits,
+# and the process that compiles them would run another one than those that load them.
 
 TABLE_STEP_PX = 0.05  # Spacing of the coverage table, px (derived)
 Z_STEP, Z_LAST = 0.02, 8.0  # Spacing and end of the table of the normal distribution (derived)
@@ -34,7 +37,7 @@ _NORMAL = np.array(
 FASTMATH = {"contract", "arcp", "nsz", "reassoc"}  # Floating-point freedom of the compiler (chosen)
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _normal(z: float) -> tuple[float, float]:
     """Interpolate Φ(z) and its integral zΦ(z) + φ(z) from the table."""
     if z <= -Z_LAST:
@@ -53,7 +56,7 @@ def _normal(z: float) -> tuple[float, float]:
     return a * low + b * low_slope + c * high - d * high_slope, a * low_sum + b * low + c * high_sum - d * high
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
     """Tabulate the coverage p and its slope dp/dx for one length of motion blur. Entry [j, k] is for x = middle − k + j
     TABLE_STEP_PX, with middle = ceil(half) + 1. p is the mean of the normal distribution function over a box of
@@ -79,13 +82,13 @@ def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
     return table
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_reach(length: float, blur: float) -> float:
     """Return the distance from an edge beyond which a pixel is fully covered or fully uncovered."""
     return 0.5 * length + 4 * blur + 0.5
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def subpixel_index(place: float) -> tuple[int, int, float, int]:
     """Split the position of an edge into indices of a coverage table. Returns whole part, px; entry j below the
     fraction; weight of entry j + 1; 1 if the position is a whole number, else 0.
@@ -194,7 +197,7 @@ def fit_edges(
 
 
 # _nrt: numba need not count references in a function that allocates nothing (measured).
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 def _normal_sums(
     picture: np.ndarray, rows: tuple[int, int], scale: np.float32, offset: np.float32, appearance: np.ndarray, y: float,
     lag: np.ndarray, half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray,
