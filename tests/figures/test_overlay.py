@@ -193,9 +193,9 @@ def tracking_points() -> Tracking:
         Plan(width=480, height=160, from_px=(20, 80), start_px=40, end_px=400, speed=14, radius=20)
     ).frames
     recording = Recording(Path("a.mp4"), "container", 480, 160, 8, len(luma))
-    frames = Frames(recording, recording.whole, luma, np.arange(len(luma)), np.zeros(len(luma), dtype=bool))
+    frames = Frames(recording, luma, np.arange(len(luma)), np.zeros(len(luma), dtype=bool))
     given = (Correction(20, "move", 150.0), Correction(22, "confirm"))
-    return track_frames(frames, Trial(name="a", capture_fps=1000.0, corrections=given), 1000.0, m_per_px=2.5e-4)
+    return track_frames(frames, Trial(name="a", capture_fps=1000.0, m_per_px=2.5e-4, corrections=given), 1000.0)
 
 
 def words(tracking_points: Tracking) -> str:

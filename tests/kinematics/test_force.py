@@ -10,7 +10,7 @@ import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack import effects
-from vinetrack.core.records import Kinematics, Track, Trial, Window
+from vinetrack.core.records import Kinematics, Track, Trial, Window, plain_track
 from vinetrack.dynamics.model import base_model
 from vinetrack.kinematics.force import (
     Release,
@@ -29,30 +29,20 @@ G = 9.81
 AREA = math.pi * 0.012**2
 FILM = 1200 * math.pi * 0.024 * 200e-6
 VINE = Trial(
-    name="v",
-    diameter_m=0.024,
-    thickness_m=200e-6,
-    length_m=0.28,
-    pressure_Pa=14e3,
-    pressure_sigma_Pa=140.0,
-    yield_pressure_Pa=3e3,
-    yield_pressure_sigma_Pa=200.0,
-)
+    name="v", diameter_m=0.024, thickness_m=200e-6, length_m=0.28, pressure_Pa=14e3, pressure_sigma_Pa=140.0,
+    yield_pressure_Pa=3e3, yield_pressure_sigma_Pa=200.0,
+)  # fmt: skip
 START_S, ORIGIN_M, SPEED = 0.05, 0.02, 1.0
 TIME = START_S + np.arange(200) / 1000
 WINDOW = Window("gated", True, "", from_s=START_S + 0.0499, to_s=START_S + 0.1501, n_points=101, x_ss_m_s=2 * SPEED)
-RELEASE = Release(
-    time_s=START_S, lead_position_m=ORIGIN_M, lead_position_sigma_m=1e-5, moving_from_start=False, reason=""
-)
+RELEASE = Release(START_S, ORIGIN_M, 1e-5, False, "")
 
 
 def moved(pressure_Pa: np.ndarray | None = None, trial: Trial = VINE) -> TrialMotion:
     """Growth at 1 m/s of the edge from 20 mm on; in WINDOW from 50 to 150 mm of growth, 100 mm in the mean."""
-    y = ORIGIN_M + SPEED * (TIME - START_S)
-    nan, ones = np.full(TIME.size, math.nan), np.ones(TIME.size)
-    track = Track(TIME, y, nan, np.full(TIME.size, "", dtype="<U8"), nan, pressure_Pa)
-    points = np.full(TIME.size, 7)
-    kinematics = Kinematics(TIME, y, SPEED * ones, 0.01 * ones, 0 * ones, points, 1e-4, 0.0, 2.0)
+    y, ones = ORIGIN_M + SPEED * (TIME - START_S), np.ones(TIME.size)
+    track = plain_track(TIME, y, pressure_Pa=pressure_Pa)
+    kinematics = Kinematics(TIME, y, SPEED * ones, 0.01 * ones, 0 * ones, np.full(TIME.size, 7), 1e-4, 0.0, 2.0)
     return TrialMotion(trial, track, kinematics, RELEASE, {})
 
 
@@ -86,17 +76,10 @@ def test_a_measured_pressure_takes_the_place_of_the_set_one() -> None:
     assert force.sigma_N == pytest.approx(0, abs=1e-9)
     assert force.pressure_source == "trace"
     assert force.paper_N == pytest.approx(11e3 * AREA)
-
-
-def test_noise_of_a_measured_pressure_becomes_the_error_of_its_mean() -> None:
-    trace = 12e3 + 100.0 * np.random.default_rng(3).standard_normal(200)
-    assert force_of(VINE, pressure_Pa=trace).sigma_N == pytest.approx(100 / math.sqrt(101) * AREA, rel=0.2)
-
-
-def test_a_trace_that_is_silent_in_the_window_leaves_the_set_pressure() -> None:
-    trace = np.full(200, 12e3)
-    trace[40:160] = math.nan
-    assert force_of(VINE, pressure_Pa=trace).pressure_source == "set"
+    noisy = trace + 100.0 * np.random.default_rng(3).standard_normal(200)
+    assert force_of(VINE, pressure_Pa=noisy).sigma_N == pytest.approx(100 / math.sqrt(101) * AREA, rel=0.2)
+    silent = np.where((np.arange(200) > 39) & (np.arange(200) < 160), math.nan, trace)
+    assert force_of(VINE, pressure_Pa=silent).pressure_source == "set"
 
 
 def test_the_model_in_use_says_what_the_pressure_was() -> None:
@@ -126,27 +109,19 @@ def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only() -> No
     np.testing.assert_allclose(found[1:], 12e3 + np.arange(1, 200))
 
 
-@pytest.mark.parametrize(
-    ("trial", "enters"),
-    [(VINE, True), (replace(VINE, payload_kg=0.0356), False), (replace(VINE, travel_ratio=1.0), False)],
-    ids=["bare", "loaded", "ball"],
-)
-def test_which_trials_can_enter_the_fit(trial: Trial, enters: bool) -> None:
-    assert (why_not_in_fit(trial) == "") is enters
-
-
-def test_which_forces_can_enter_the_fit() -> None:
-    assert why_not_force(None)
+def test_which_trials_and_forces_can_enter_the_fit() -> None:
+    assert why_not_in_fit(VINE) == ""
+    assert why_not_in_fit(replace(VINE, payload_kg=0.0356))
+    assert why_not_in_fit(replace(VINE, travel_ratio=1.0))
     assert why_not_force(force_of(VINE)) == ""
-    weak = force_of(replace(VINE, pressure_Pa=2e3))
-    assert weak.force_N < 0
-    assert why_not_force(weak)
+    assert why_not_force(None)
+    assert why_not_force(force_of(replace(VINE, pressure_Pa=2e3)))
 
 
 # ---- release time and resting position ----
 
 
-def release_of(track, travel_ratio=2.0):
+def release_of(track: Track, travel_ratio: float = 2.0) -> Release:
     return find_release(track, estimate_kinematics(track, travel_ratio=travel_ratio))
 
 
@@ -166,7 +141,10 @@ def test_onset_is_found_to_within_frames(vine, noise_m, frames):
     off = []
     for seed in range(1000, 1020):
         trial = record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=0.3, rest_frames=50)
-        off.append((release_of(trial.track).time_s - trial.release_s) * CAPTURE_FPS)
+        release = release_of(trial.track)
+        off.append((release.time_s - trial.release_s) * CAPTURE_FPS)
+        resting = trial.track.time_s < release.time_s
+        assert np.array_equal(flag_rest(trial.track, release).flag == "before_release", resting)
     assert np.sqrt(np.mean(np.square(off))) < frames
 
 
@@ -180,31 +158,15 @@ def test_origin_is_within_its_error():
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.6
 
 
-def test_rest_frames_are_flagged_and_no_others():
-    trial = record(Vine(3, 5.0), np.random.default_rng(1000), noise_m=3e-5, rest_frames=50)
-    release = release_of(trial.track)
-    flagged = flag_rest(trial.track, release)
-    resting = flagged.flag == "before_release"
-    assert resting.sum() == np.sum(trial.track.time_s < release.time_s)
-    assert abs(resting.sum() - 51) <= 1
-    assert np.all(trial.track.flag == "")
-
-
-def test_motion_from_the_first_frame_is_said_and_the_first_point_taken():
-    time_s = np.arange(200) / 1069
-    y = 0.02 + 0.5 * time_s + ar1(200, 1e-4, 0.0, np.random.default_rng(1000))
-    track = make_track(time_s, y)
-    release = release_of(track)
-    assert release.moving_from_start
-    assert release.time_s == 0.0
-    assert release.lead_position_m == pytest.approx(0.02, abs=4e-4)
-    np.testing.assert_array_equal(flag_rest(track, release).flag, track.flag)
-
-
-def test_a_start_just_missed_is_extrapolated_and_said():
+def test_motion_from_the_first_frame_is_said_and_a_start_just_missed_is_extrapolated():
     time_s = np.arange(8, 200) / 1000
-    y = 0.5 * 9.81 * time_s**2 + ar1(192, 2e-5, 0.0, np.random.default_rng(1000))
-    release = release_of(make_track(time_s, y), travel_ratio=1)
+    noise_m = ar1(192, 2e-5, 0.0, np.random.default_rng(1000))
+    even = make_track(time_s, 0.02 + 0.5 * time_s + noise_m)
+    assert release_of(even).moving_from_start
+    assert release_of(even).time_s == time_s[0]
+    assert release_of(even).lead_position_m == pytest.approx(0.024, abs=4e-4)
+    np.testing.assert_array_equal(flag_rest(even, release_of(even)).flag, even.flag)
+    release = release_of(make_track(time_s, 0.5 * 9.81 * time_s**2 + noise_m), travel_ratio=1)
     assert release.moving_from_start
     assert release.time_s == pytest.approx(0.0, abs=1e-3)
     assert abs(release.lead_position_m) < 3e-4

@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import savgol_filter
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.kinematics.velocity import correlated, estimate_kinematics, fit_all_windows
 
 SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
 TRIALS = [
-    pytest.param(vine, noise_m, rho, id=f"R{vine.scale}-{vine.tail_speed_m_s}m_s-{noise_m * 1e3}mm-{rho}")
+    (vine, noise_m, rho)
     for vine in (Vine(1, 0.2), Vine(2, 1.0), Vine(3, 5.0), Vine(4, 3.0), Vine(4, 10.0))
     for noise_m, rho in ((3e-5, 0.0), (1e-4, 0.6), (3e-4, 0.3))
 ]
@@ -49,35 +48,19 @@ def test_stated_error_holds_within_a_factor_of_two_from_four_frames_after_releas
     assert np.mean(np.abs(pull) > 3) < 0.1
 
 
-def test_exact_cubic_is_returned_exactly_and_without_division_by_its_noise():
+def test_exact_cubic_is_returned_exactly_and_points_without_position_or_with_a_flag_are_left_out():
     time_s = np.arange(100) / 1000
     cubic = np.polynomial.Polynomial([0.2, 0.4, 3.0, -11.0])
-    kinematics = estimate_kinematics(make_track(time_s, cubic(time_s)), travel_ratio=2)
-    np.testing.assert_allclose(kinematics.lead_position_m, cubic(time_s), rtol=1e-9)
-    np.testing.assert_allclose(kinematics.lead_velocity_m_s, cubic.deriv()(time_s), rtol=1e-6)
-    assert np.all(np.isfinite(kinematics.lead_velocity_sigma_m_s))
-
-
-@pytest.mark.parametrize("drop", [[], [150], [150, 151, 152, 153, 154], list(range(0, 300, 9))])
-def test_missing_frames_do_not_bias(drop):
-    time_s = np.delete(np.arange(300) / 1069, drop)
-    y = 0.5 * time_s + ar1(time_s.size, 1e-4, 0.0, np.random.default_rng(1000))
-    kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=2)
-    pull = (kinematics.lead_velocity_m_s - 0.5) / kinematics.lead_velocity_sigma_m_s
-    assert np.max(np.abs(pull)) < 5
-
-
-def test_points_without_position_or_with_a_flag_are_left_out():
-    time_s = np.arange(100) / 1069
-    y = 0.5 * time_s
-    y[50] = 7.0
-    y[[0, 40, 41, 99]] = np.nan
+    y = cubic(time_s)
+    y[50], y[[0, 40, 41, 99]] = 7.0, np.nan
     track = make_track(time_s, y)
-    flag = track.flag.copy()
-    flag[50] = "rejected"
-    kinematics = estimate_kinematics(replace(track, flag=flag), travel_ratio=2)
-    assert kinematics.time_s.size == 95
-    np.testing.assert_allclose(kinematics.lead_velocity_m_s, 0.5, rtol=1e-9)
+    flagged = replace(track, flag=np.where(np.arange(100) == 50, "rejected", track.flag))
+    kinematics = estimate_kinematics(flagged, travel_ratio=2)
+    kept_s = np.delete(time_s, [0, 40, 41, 50, 99])
+    np.testing.assert_array_equal(kinematics.time_s, kept_s)
+    np.testing.assert_allclose(kinematics.lead_position_m, cubic(kept_s), rtol=1e-9)
+    np.testing.assert_allclose(kinematics.lead_velocity_m_s, cubic.deriv()(kept_s), rtol=1e-6)
+    assert np.all(np.isfinite(kinematics.lead_velocity_sigma_m_s))
 
 
 def test_where_points_jump_about_the_velocity_is_known_as_badly_as_they_say():
@@ -102,7 +85,7 @@ UNEVEN = np.cumsum(np.random.default_rng(1000).uniform(0.5, 1.5, 60)) / 1000
 
 
 @pytest.mark.parametrize("time_s", [EVEN, GAPPED, UNEVEN], ids=["even", "gapped", "uneven"])
-@pytest.mark.parametrize("side", [-1.0, -0.5, 0.0, 0.5, 1.0])
+@pytest.mark.parametrize("side", [-1.0, 0.0, 0.5])
 def test_a_cubic_is_returned_exactly(time_s, side):
     cubic = np.polynomial.Polynomial([0.1, 0.5, -8.0, 90.0])
     fits = fit_all_windows(time_s, cubic(time_s), 9, 3, 0.0)
@@ -112,13 +95,6 @@ def test_a_cubic_is_returned_exactly(time_s, side):
     np.testing.assert_allclose(values[0], cubic(time_s), rtol=1e-9)
     np.testing.assert_allclose(values[2], cubic.deriv(2)(time_s), rtol=1e-6)
     assert np.all(fits.misfit < 1e-24)
-
-
-def test_even_spacing_is_savitzky_golay():
-    y = 0.3 * EVEN + ar1(60, 1e-4, 0.0, np.random.default_rng(1000))
-    _, velocity, _ = fit_all_windows(EVEN, y, 11, 3, 0.0).velocities(EVEN, 0.0)
-    expected = savgol_filter(y, 11, 3, deriv=1, delta=1e-3, mode="interp")
-    np.testing.assert_allclose(velocity, expected, rtol=1e-9)
 
 
 @pytest.mark.slow

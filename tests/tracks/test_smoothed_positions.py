@@ -20,15 +20,11 @@ TIME_S = np.arange(150) / 1000.0
 TRIAL = Trial(name="t", capture_fps=1000.0)
 
 
-def grown_m(time_s: np.ndarray) -> np.ndarray:
-    """From rest at 20 ms, at up to 3 m/s."""
-    since = np.clip(time_s - 0.02, 0.0, None)
-    return np.asarray(3.0 * (since - 0.01 * (1 - np.exp(-since / 0.01))))
-
-
-def tracks(seed: int, rho: float = 0.0, count: int = 8, smooth=lambda y: y) -> list[tuple[Trial, Track]]:  # type: ignore[no-untyped-def]
-    draw = np.random.default_rng(seed)
-    noisy = [grown_m(TIME_S) + ar1_noise(TIME_S.size, 1e-4, rho, draw) for _ in range(count)]
+def tracks(seed: int, rho: float = 0.0, smooth=lambda y: y) -> list[tuple[Trial, Track]]:
+    """Eight, from rest at 20 ms, at up to 3 m/s."""
+    draw, since = np.random.default_rng(seed), np.clip(TIME_S - 0.02, 0.0, None)
+    grown_m = 3.0 * (since - 0.01 * (1 - np.exp(-since / 0.01)))
+    noisy = [grown_m + ar1_noise(TIME_S.size, 1e-4, rho, draw) for _ in range(8)]
     return [(TRIAL, as_track(TIME_S, smooth(y))) for y in noisy]
 
 
@@ -41,14 +37,12 @@ def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
 @pytest.mark.parametrize("frames", [3, 5, 9])
 def test_a_moving_average_is_found_with_its_length(frames: int) -> None:
     found = detect_smoothing(tracks(352, smooth=lambda y: uniform_filter1d(y, frames)))
-    assert found is not None
     assert (found.window, found.degree, found.decimation) == (frames, 0, frames)
 
 
 @pytest.mark.parametrize("frames", [7, 11])
 def test_a_polynomial_is_distinguished_from_a_moving_average(frames: int) -> None:
     found = detect_smoothing(tracks(353, smooth=lambda y: savgol_filter(y, frames, 3)))
-    assert found is not None
     assert (found.window, found.degree) == (frames, 2)
     assert 1 < found.decimation < frames
 

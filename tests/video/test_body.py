@@ -79,25 +79,19 @@ def test_a_bounce_ends_the_track():
 
 
 def test_places_that_hop_between_bodies_are_refused():
-    number = np.arange(30.0)
-    seen = np.ones(30, dtype=bool)
-    fall = 0.3 * number**2
-    assert not hops_between_bodies(fall + np.random.default_rng(309).normal(0, 0.1, 30), seen)
-    neighbour = fall + 25
+    fall, seen = 0.3 * np.arange(30.0) ** 2, np.ones(40, dtype=bool)
+    assert not hops_between_bodies(fall + np.random.default_rng(309).normal(0, 0.1, 30), seen[:30])
     turns = np.random.default_rng(310).random(30) < 0.5
-    assert hops_between_bodies(np.where(turns, neighbour, fall), seen)
-    number, seen = np.arange(40.0), np.ones(40, dtype=bool)
-    assert not hops_between_bodies(np.minimum(9 * number, 180), seen)
-    assert not hops_between_bodies(180 - np.abs(9 * number - 180), seen)
+    assert hops_between_bodies(np.where(turns, fall + 25, fall), seen[:30])
+    for stops_or_bounces in (np.minimum(9 * np.arange(40.0), 180), 180 - np.abs(9 * np.arange(40.0) - 180)):
+        assert not hops_between_bodies(stops_or_bounces, seen)
 
 
 @pytest.mark.slow
 def test_a_body_that_disappears_is_lost():
-    """Taken away in mid-fall: nothing that remains is followed in its place."""
-    frames, _ = falling_disc(308, n=185)
+    frames, _ = falling_disc(308, n=150)
     empty = np.concatenate([frames[:60, 210:], frames[:60, 210:]], axis=1)[:, : SHAPE[0]]
-    gone = np.concatenate([frames[:150], empty, empty])
-    track = track_frames(in_memory(gone), BALL, RATE).track
+    track = track_frames(in_memory(np.concatenate([frames, empty, empty])), BALL, RATE).track
     assert track.usable[60:145].all()
     assert not track.usable[151:].any()
 

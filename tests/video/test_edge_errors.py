@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pictures
 import pytest
@@ -14,7 +16,6 @@ from vinetrack.video.edge import (
     BANDS,
     BLUR_SIGMA_PART,
     band_disagreement,
-    band_fits,
     dwell_error_px,
     leap_error_px,
     shared_disagreement,
@@ -23,14 +24,22 @@ from vinetrack.video.edge_state import EdgeState
 from vinetrack.video.strip import Strip
 from vinetrack.video.track import Tracking
 
-SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
-ROWS, COLUMNS, TUBE = 120, 460, 40
-SUB_INSTANTS = 60
+COLUMNS = 460
 
 
-def tracked(luma: np.ndarray, exposure: float, axis: Axis | None = None) -> Tracking:
-    """One tenth of a millimetre a pixel."""
-    return pictures.tracked(luma, exposure, axis, m_per_px=1e-4)
+AXIS = Axis((20.0, 59.5), (440.0, 59.5), 40.0)
+
+
+def errors(luma: np.ndarray, exposure: float, true: np.ndarray) -> tuple[np.ndarray, Tracking, np.ndarray, np.ndarray]:
+    """Tracked minus true edge, px, the tracking along AXIS, and its stated random and slow errors, px."""
+    found = pictures.tracked(luma, exposure, AXIS, m_per_px=1e-4)
+    error = found.track.edge_px + found.axis.from_px[0] - true
+    return error, found, found.track.lead_position_sigma_m * 1e4, found.track.lead_position_systematic_m * 1e4
+
+
+def instants(frames: np.ndarray, exposure: float) -> np.ndarray:
+    """Sixty moments of each exposure, in frames, shape (n_frames, 60)."""
+    return frames[:, None] + exposure * (np.arange(60) - 29.5) / 60
 
 
 def step_frames(edge_px: np.ndarray, noise: float = 2.0, seed: int = 331) -> np.ndarray:
@@ -40,9 +49,8 @@ def step_frames(edge_px: np.ndarray, noise: float = 2.0, seed: int = 331) -> np.
     """
     bands = edge_px if edge_px.ndim == 3 else edge_px[:, :, None]
     cover = ndtr(bands[..., None] - np.arange(COLUMNS)).mean(axis=1)
-    luma = np.full((len(edge_px), ROWS, COLUMNS), 60.0)
-    top = (ROWS - TUBE) // 2
-    luma[:, top : top + TUBE] += 100 * np.repeat(cover, TUBE // cover.shape[1], axis=1)
+    luma = np.full((len(edge_px), 120, COLUMNS), 60.0)
+    luma[:, 40:80] += 100 * np.repeat(cover, 40 // cover.shape[1], axis=1)
     luma += np.random.default_rng(seed).normal(0, noise, luma.shape)
     return np.rint(np.clip(luma, 0, 255)).astype(np.uint8)
 
@@ -65,15 +73,14 @@ def grown_px(frames: np.ndarray, start_px: float = 60.0, rest: int = 12, speed: 
 )
 def test_stated_errors_match_the_true_errors(changes: dict[str, float]) -> None:
     """Random errors show in second differences of the errors: Σ(1, −2, 1)² = 6."""
+    short = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
     pulls = []
     for seed in (331, 332):
-        plan = Plan(**{**SHORT, **changes, "seed": seed})
-        scene = plain_scene(plan)
-        tracking = tracked(scene.frames, plan.exposure)
-        error = tracking.track.edge_px + tracking.axis.from_px[0] - plan.from_px[0] - scene.edge_px
-        sigma = tracking.track.lead_position_sigma_m * 1e4
+        scene = plain_scene(Plan(**{**short, **changes, "seed": seed}))
+        tracking = pictures.tracked(scene.frames, scene.plan.exposure)
         use = scene.moving & tracking.track.usable
-        error, sigma = error[use], sigma[use]
+        error = (tracking.track.edge_px + tracking.axis.from_px[0] - scene.edge_px)[use]
+        sigma = tracking.track.lead_position_sigma_m[use] * 1e3
         pulls.append(np.diff(error, 2) / np.sqrt(sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2))
     assert 0.6 < np.sqrt(np.mean(np.concatenate(pulls) ** 2)) < 1.3
 
@@ -87,53 +94,41 @@ def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods: tup
     """
     frames = np.arange(100.0)
     true, moves = grown_px(frames), (frames > 12)[:, None]
-    errors, noises, shares = [], [], []
+    found = []
     for seed in (333, 334, 335):
         phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, BANDS))
         # Two waves for every band, which its neighbours do not have: differences of the track hardly see any of them.
         waves = [0.6 * np.sin(2 * np.pi * frames[:, None] / T + p) for T, p in zip(periods, phase, strict=True)]
         luma = step_frames((true[:, None] + np.sum(waves, axis=0) * moves)[:, None, :])
-        tracking = tracked(luma, 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+        error, tracking, sigma, slow = errors(luma, 0.05, true)
         use = (frames > 25) & (frames < 95) & tracking.track.usable
         assert use.sum() > 60
-        error = (tracking.track.edge_px + tracking.axis.from_px[0] - true)[use]
-        errors.append(error.var())
-        assert tracking.track.lead_position_systematic_m is not None
-        noises.append(np.mean((tracking.track.lead_position_sigma_m[use] * 1e4) ** 2))
-        shares.append(np.mean((tracking.track.lead_position_systematic_m[use] * 1e4) ** 2))
-    assert 0.6 < np.sqrt(np.mean(errors) / (np.mean(noises) + np.mean(shares))) < 1.8
+        found.append((error[use].var(), np.mean(sigma[use] ** 2), np.mean(slow[use] ** 2)))
+    variance, noise, share = np.mean(found, axis=0)
+    assert 0.6 < np.sqrt(variance / (noise + share)) < 1.8
     if min(periods) > 40:
-        assert 0.6 < np.sqrt(np.mean(errors) / np.mean(shares)) < 1.9
+        assert 0.6 < np.sqrt(variance / share) < 1.9
 
 
 @pytest.mark.parametrize("exposure", [0.1, 0.9])
 def test_an_edge_that_speeds_up_is_placed_where_it_was_at_mid_exposure(exposure: float) -> None:
     """At 4 px a frame² its mean over 0.9 frames lies aτ²/24 = 0.135 px ahead of where it was in their middle."""
     frames = np.arange(32.0)
-    instants = frames[:, None] + exposure * (np.arange(SUB_INSTANTS) + 0.5 - SUB_INSTANTS / 2) / SUB_INSTANTS
-
-    def place(time: np.ndarray) -> np.ndarray:
-        return 60.0 + 2.0 * np.clip(time - 12.0, 0.0, 13.0) ** 2
-
-    tracking = tracked(step_frames(place(instants), noise=1.0), exposure, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+    at, true = (60.0 + 2.0 * np.clip(t - 12.0, 0.0, 13.0) ** 2 for t in (instants(frames, exposure), frames))
+    error, tracking, *_ = errors(step_frames(at, noise=1.0), exposure, true)
     use = (frames > 15) & (frames < 24) & tracking.track.usable
     assert use.sum() >= 7
-    error = (tracking.track.edge_px + tracking.axis.from_px[0] - place(frames))[use]
-    assert abs(error.mean()) < 0.05
+    assert abs(error[use].mean()) < 0.05
 
 
 def test_an_edge_that_stops_within_an_exposure_has_the_error_of_its_dwell() -> None:
     """Half of an exposure at 20 px a frame, half at rest: seen on average vτ/8 behind where it is in the middle."""
-    frames, exposure, stop = np.arange(36.0), 0.5, 380.0
-    instants = frames[:, None] + exposure * (np.arange(SUB_INSTANTS) + 0.5 - SUB_INSTANTS / 2) / SUB_INSTANTS
-
-    def place(time: np.ndarray) -> np.ndarray:
-        return np.minimum(60.0 + 20.0 * np.clip(time - 12.0, 0.0, None), stop)
-
-    tracking = tracked(step_frames(place(instants), noise=1.0), exposure, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
-    error = tracking.track.edge_px + tracking.axis.from_px[0] - place(frames)
-    sigma = tracking.track.lead_position_sigma_m * 1e4
-    last = int(np.flatnonzero(place(frames) >= stop)[0])
+    frames, exposure = np.arange(36.0), 0.5
+    at, true = (
+        np.minimum(60.0 + 20.0 * np.clip(t - 12.0, 0.0, None), 380.0) for t in (instants(frames, exposure), frames)
+    )
+    error, _, sigma, _ = errors(step_frames(at, noise=1.0), exposure, true)
+    last = int(np.argmax(true >= 380.0))
     assert 0.8 * 20.0 * exposure / 8 < sigma[last] < 3.0  # by the edge as measured, which is behind itself
     assert np.abs(error[14 : last + 1] / np.hypot(sigma, 0.1)[14 : last + 1]).max() < 4.0
     assert sigma[16 : last - 4].max() < 0.5
@@ -146,20 +141,16 @@ def test_a_noisier_picture_has_a_larger_error() -> None:
     true = grown_px(frames)
     moves = (frames > 20) & (frames < 92)
     noisy = moves & (frames % 4 == 0)
-    errors, stated, chosen = [], [], []
+    found = []
     for seed in (342, 343, 344, 345):
         luma = step_frames(true[:, None], seed=seed).astype(float)
         luma[noisy] += np.random.default_rng(seed).normal(0, 10, luma[noisy].shape)
-        tracking = tracked(
-            np.rint(np.clip(luma, 0, 255)).astype(np.uint8), 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0)
-        )
+        error, tracking, sigma, _ = errors(np.rint(np.clip(luma, 0, 255)).astype(np.uint8), 0.05, true)
         use = moves & tracking.track.usable
-        errors.append((tracking.track.edge_px + tracking.axis.from_px[0] - true)[use])
-        stated.append(tracking.track.lead_position_sigma_m[use] * 1e4)
-        chosen.append(noisy[use])
-    error, sigma, which = map(np.concatenate, (errors, stated, chosen))
-    assert 0.7 < np.sqrt(np.mean(sigma[which] ** 2) / np.mean(error[which] ** 2)) < 2.0
-    assert 0.8 < np.sqrt(np.mean(sigma[~which] ** 2) / np.mean(error[~which] ** 2)) < 1.25
+        found.append(np.array([error, sigma, noisy])[:, use])
+    error, sigma, which = np.concatenate(found, axis=1)
+    for chosen, low, high in ((which == 1, 0.7, 2.0), (which == 0, 0.8, 1.25)):
+        assert low < np.sqrt(np.mean(sigma[chosen] ** 2) / np.mean(error[chosen] ** 2)) < high
 
 
 @pytest.mark.parametrize("door_grey", [30, 60, 90])
@@ -171,16 +162,15 @@ def test_an_edge_behind_a_sliding_door_is_lost(door_grey: int) -> None:
     noise = np.random.default_rng(336).normal(0, 2, luma.shape)
     stripes = np.sin(2 * np.pi * (columns + 6 * np.minimum(frames, 40)[:, None]) / 30)
     luma[:, :, :140] = (door_grey + 40 * stripes[:, None, :] + noise)[:, :, :140]
-    tracking = tracked(np.rint(np.clip(luma, 0, 255)).astype(np.uint8), 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+    error, tracking, *_ = errors(np.rint(np.clip(luma, 0, 255)).astype(np.uint8), 0.05, true)
     usable = tracking.track.usable
     assert not usable[(frames > 12) & (true < 138)].any()
     assert usable[true > 150].all()
-    error = tracking.track.edge_px + tracking.axis.from_px[0] - true
     assert np.abs(error[usable]).max() < 0.1
 
 
-@pytest.mark.parametrize("exposure", [0.9, 0.5, 0.1])
-@pytest.mark.parametrize("stop", [-0.2, 0.0, 0.04, 0.3])
+@pytest.mark.parametrize("exposure", [0.9, 0.1])
+@pytest.mark.parametrize("stop", [-0.2, 0.0, 0.3])
 @pytest.mark.parametrize("sense", [1, -1])
 def test_the_error_of_dwell_is_the_mean_place_over_the_exposure(exposure: float, stop: float, sense: int) -> None:
     """At 20 px a frame, stopping so many frames from the middle of frame 20's exposure; or setting off then."""
@@ -194,79 +184,51 @@ def test_the_error_of_dwell_is_the_mean_place_over_the_exposure(exposure: float,
 
 # ---- the disagreement of bands against known jitter ----
 
-BAND_ROWS, BAND_COLUMNS, N, BLUR = 40, 400, 80, 1.0
 
-
-def jittered(sd_px, seed=311):
-    """A step edge blurred by BLUR whose bands of ten rows are each misplaced by `sd_px`; the state is exact."""
-    rng = np.random.default_rng(seed)
-    edge = 30.0 + 4.0 * np.arange(N)
-    own = edge[:, None] + rng.normal(0, sd_px, (N, BANDS))
-    cover = ndtr((np.repeat(own, BAND_ROWS // BANDS, axis=1)[:, :, None] - np.arange(BAND_COLUMNS)) / BLUR)
-    values = 60 + 100 * cover + rng.normal(0, 1, (N, BAND_ROWS, BAND_COLUMNS))
-    strip = Strip(
-        np.rint(values * 200).astype(np.uint16), np.full(N, 1 / 200), np.zeros(N), np.zeros((N, 2)), 1.0,
-        Axis((0.0, 0.0), (BAND_COLUMNS - 1.0, 0.0), float(BAND_ROWS)), False,
-    )  # fmt: skip
-    appearance = np.ones((4, BAND_ROWS, BAND_COLUMNS), np.float32)
+def jittered(sd_px):
+    """A step edge blurred by 1 px whose bands of ten rows are each misplaced by `sd_px`; the state is exact."""
+    rng, rows, columns = np.random.default_rng(311), 40, 400
+    edge = 30.0 + 4.0 * np.arange(80)
+    own = edge[:, None] + rng.normal(0, sd_px, (80, BANDS))
+    cover = ndtr(np.repeat(own, rows // BANDS, axis=1)[:, :, None] - np.arange(columns))
+    values = np.rint(200 * (60 + 100 * cover + rng.normal(0, 1, (80, rows, columns)))).astype(np.uint16)
+    axis = Axis((0.0, 0.0), (columns - 1.0, 0.0), float(rows))
+    strip = Strip(values, np.full(80, 1 / 200), np.zeros(80), np.zeros((80, 2)), 1.0, axis, False)
+    appearance = np.ones((4, rows, columns), np.float32)
     appearance[0], appearance[1] = 160, 60
-    return strip, EdgeState(edge, np.zeros(N), np.zeros(BAND_ROWS), BLUR, appearance, np.ones(3)), own
+    return strip, EdgeState(edge, np.zeros(80), np.zeros(rows), 1.0, appearance, np.ones(3)), own
 
 
 @pytest.mark.slow
-def test_each_band_finds_its_own_edge():
-    strip, state, own = jittered(0.4)
-    edges, _ = band_fits(strip, state, state.edge)
-    assert edges.shape == (N, BANDS)
-    assert np.abs(edges - own).max() < 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sd_px", [0.2, 0.6])
+@pytest.mark.parametrize("sd_px", [0.0, 0.2, 0.6])
 def test_disagreement_is_the_error_of_the_mean(sd_px):
+    """It is another one in every frame; a band that always lags adds none."""
     strip, state, own = jittered(sd_px)
-    found, slow_px = band_disagreement(strip, state, state.edge, np.ones(N, dtype=bool))
+    lagging = np.repeat([0.0, 0.0, 0.0 if sd_px else 1.5, 0.0], 10)
+    found, slow_px = band_disagreement(strip, replace(state, lag=lagging), state.edge, np.ones(80, dtype=bool))
     true = float(np.std(own.mean(axis=1) - state.edge))
-    assert float(np.sqrt(np.mean(found**2))) == pytest.approx(true, rel=0.35)
-    # It is another one in every frame.
-    assert slow_px < 0.35 * true
-
-
-def test_a_band_that_always_lags_adds_no_error():
-    strip, state, _ = jittered(0.0)
-    lagging = np.repeat([0.0, 0.0, 1.5, 0.0], BAND_ROWS // BANDS)
-    tilted = EdgeState(state.edge, state.lengths, lagging, BLUR, state.appearance, state.inflation)
-    error_px, slow_px = band_disagreement(strip, tilted, state.edge, np.ones(N, dtype=bool))
-    assert error_px.max() < 0.1
-    assert slow_px < 0.05
+    if sd_px:
+        assert float(np.sqrt(np.mean(found**2))) == pytest.approx(true, rel=0.35)
+        assert slow_px < 0.35 * true
+    else:
+        assert found.max() < 0.1
+        assert slow_px < 0.05
 
 
 # ---- slow errors against known ones ----
 
-FRAMES = 60
-
-
-def lasting(rng: np.random.Generator, sd_px: float, frames: int = FRAMES) -> np.ndarray:
-    """Errors of bands with a correlation time of about ten frames, shape (frames, BANDS)."""
-    smooth = gaussian_filter1d(rng.standard_normal((frames + 80, BANDS)), 8.0, axis=0)[40:-40]
-    return sd_px * smooth / np.sqrt(1 / (2 * np.sqrt(np.pi) * 8.0))
-
 
 def test_the_slow_error_of_the_mean_follows_from_the_bands() -> None:
+    """Errors of bands with a correlation time of about ten frames; noise of bands is none."""
     rng = np.random.default_rng(1811)
-    told = [shared_disagreement(lasting(rng, 0.2, 400) + rng.normal(0, 0.1, (400, BANDS))) for _ in range(200)]
+    told, of_noise = [], []
+    for _ in range(200):
+        smooth = gaussian_filter1d(rng.standard_normal((480, BANDS)), 8.0, axis=0)[40:-40]
+        lasting = 0.2 * smooth * np.sqrt(2 * np.sqrt(np.pi) * 8.0)
+        told.append(shared_disagreement(lasting + rng.normal(0, 0.1, (400, BANDS))))
+        of_noise.append(shared_disagreement(rng.normal(0, 0.2, (60, BANDS))))
     assert np.sqrt(np.mean(np.square(told))) == pytest.approx(0.2 / np.sqrt(BANDS), rel=0.2)
-
-
-def test_noise_of_bands_is_not_a_slow_error() -> None:
-    rng = np.random.default_rng(1812)
-    told = [shared_disagreement(rng.normal(0, 0.2, (FRAMES, BANDS))) for _ in range(200)]
-    assert np.median(told) < 0.2 * 0.2 / np.sqrt(BANDS)
-
-
-def test_a_tilting_tip_leaves_the_mean_unchanged() -> None:
-    tilt = np.outer(lasting(np.random.default_rng(1813), 1.0)[:, 0], np.linspace(-1, 1, BANDS))
-    assert shared_disagreement(tilt) < 1e-12
+    assert np.median(of_noise) < 0.2 * 0.2 / np.sqrt(BANDS)
 
 
 # ---- hidden frames that do not lead up to the motion after them ----
@@ -279,23 +241,17 @@ def released(frame: float, acceleration: float = 3.0) -> np.ndarray:
     return 100.0 + 0.5 * acceleration * np.clip(LEAP_FRAMES - frame, 0.0, None) ** 2
 
 
-@pytest.mark.parametrize("frame", [8.0, 8.3, 8.7, 8.99])
-@pytest.mark.parametrize("seed", [351, 352])
-def test_a_tip_followed_from_rest_has_no_leap(frame: float, seed: int) -> None:
-    edge = released(frame) + np.random.default_rng(seed).normal(0, 0.1, LEAP_FRAMES.size)
-    assert leap_error_px(edge, LEAP_FRAMES < 14).max() == 0.0
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_vine_whose_speed_settles_within_a_frame_has_no_leap(share: float) -> None:
-    edge = 100.0 + 20.0 * np.clip(LEAP_FRAMES - 8.0 - share, 0.0, None)
-    assert leap_error_px(edge, LEAP_FRAMES < 14).max() == 0.0
+@pytest.mark.parametrize("frame", [8.0, 8.3, 8.99])
+def test_a_tip_followed_from_rest_has_no_leap(frame: float) -> None:
+    noise = np.random.default_rng(351).normal(0, 0.1, LEAP_FRAMES.size)
+    at_once = 100.0 + 20.0 * np.clip(LEAP_FRAMES - frame, 0.0, None)
+    for edge in (released(frame) + noise, at_once):
+        assert leap_error_px(edge, LEAP_FRAMES < 14).max() == 0.0
 
 
 def test_a_followed_door_is_off_by_its_distance_from_the_extrapolated_motion() -> None:
     true = released(8.3)
-    edge = true.copy()
-    edge[:14] = 130.0 + 0.8 * LEAP_FRAMES[:14]  # the tip comes out at frame 14, at 149 px
+    edge = np.where(LEAP_FRAMES < 14, 130.0 + 0.8 * LEAP_FRAMES, true)  # the tip comes out at frame 14, at 149 px
     error = leap_error_px(edge, LEAP_FRAMES < 16)
     assert error[14:].max() == 0.0
     assert error[:14] == pytest.approx(np.abs(edge - true)[:14], abs=6.0)

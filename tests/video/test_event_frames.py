@@ -11,8 +11,8 @@ from camera_files import write_cine
 from plain_scene import Plan, Scene, plain_scene, write_video
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.video import frames, small_pictures
-from vinetrack.video.frames import inspect_recording, packet_index, read_frames
+from vinetrack.video import small_pictures
+from vinetrack.video.frames import inspect_recording, read_frames
 from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.track import track_recording
 
@@ -31,19 +31,20 @@ def scene() -> Scene:
 def long_frames(scene: Scene) -> np.ndarray:
     """The scene with rest before and after it, each frame of rest with grain of its own."""
     rng = np.random.default_rng(20943)
+    frames = np.concatenate(
+        [np.repeat(scene.frames[:1], BEFORE, 0), scene.frames, np.repeat(scene.frames[-1:], AFTER, 0)]
+    )
+    for rest in (slice(None, BEFORE), slice(-AFTER, None)):
+        grain = np.rint(rng.normal(0, 2.0, frames[rest].shape))
+        frames[rest] = np.clip(frames[rest] + grain, 0, 255).astype(np.uint8)
+    return frames
 
-    def rest(frame: np.ndarray, count: int) -> np.ndarray:
-        grain = np.rint(rng.normal(0, 2.0, (count, *frame.shape)))
-        return np.clip(frame + grain, 0, 255).astype(np.uint8)
 
-    return np.concatenate([rest(scene.frames[0], BEFORE), scene.frames, rest(scene.frames[-1], AFTER)])
-
-
-@pytest.fixture(scope="module", params=["key frame every 30", "one key frame", "key frames alone"])
+@pytest.fixture(scope="module", params=["30", "5000", "1"])
 def film(request: pytest.FixtureRequest, long_frames: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = {"key frame every 30": "30", "one key frame": "5000", "key frames alone": "1"}
+    """With a key frame every 30, with one, and with key frames alone."""
     path = tmp_path_factory.mktemp("film") / "long.mp4"
-    return write_video(path, long_frames, options={"crf": "14", "g": options[request.param]})
+    return write_video(path, long_frames, options={"crf": "14", "g": request.param})
 
 
 @pytest.fixture
@@ -98,22 +99,6 @@ def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scen
     made = track(film, frames_used=wanted)
     assert np.isfinite(made.edge_px).sum() > 0.9 * scene.moving.sum()
     assert not np.isfinite(made.edge_px[: wanted[0]]).any()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("bracketed")
-def test_a_frame_without_a_time_is_left_out_of_the_event(film: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames_of, without_time = frames._frames_of, packet_index(film).pts[BEFORE + 20]
-
-    def nameless(*arguments):
-        for frame in frames_of(*arguments):
-            frame.pts = None if frame.pts == without_time else frame.pts
-            yield frame
-
-    whole = read_event(inspect_recording(film), (BEFORE, BEFORE + 40))
-    monkeypatch.setattr(frames, "_frames_of", nameless)
-    event = read_event(inspect_recording(film), (BEFORE, BEFORE + 40))
-    assert event.slot.tolist() == np.delete(whole.slot, np.flatnonzero(whole.slot == BEFORE + 20)).tolist()
 
 
 @pytest.mark.slow

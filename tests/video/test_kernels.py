@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,28 +14,9 @@ from plain_scene import Plan, plain_scene
 
 from vinetrack.core import threads
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video.kymograph import (
-    largest_steps,
-)
-
-
-@pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
-def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(length: float, blur: float) -> None:
-    half = 6.0 + 0.5 * length + 4 * blur
-    table = kernels.coverage_table(length, blur, half)
-    middle = math.ceil(half) + 1
-    x = middle - np.arange(table.shape[2]) + kernels.TABLE_STEP_PX * np.arange(kernels.SUBPIXEL_STEPS + 1)[:, None]
-    # A box of many Gaussian steps, summed one by one.
-    places = np.linspace(-0.5, 0.5, 401) * max(length, 0.02)
-    expected = np.zeros_like(x)
-    for place in places[1:-1:2]:
-        expected += np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2)))((x - place) / blur) / 200
-    assert np.abs(table[0] - expected).max() < 2e-5
-    assert np.abs(table[1, :, 1:-1] - np.gradient(expected, kernels.TABLE_STEP_PX, axis=0)[:, 1:-1]).max() < 0.01 / blur
-
+from vinetrack.video.kymograph import largest_steps
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2
-NO_SHADING = np.zeros(65)
 RIM = 40 * np.exp(-0.5 * ((np.arange(65) - 32 + 4.0) / 2.0) ** 2)
 """Shading of a tip with a bright rim 4 px behind its edge, grey levels, by distance ahead of it from −32 px on."""
 
@@ -56,72 +40,29 @@ def stepping(seed: int = 961, rim: bool = False, contrast: float = 110.0) -> tup
     return np.clip(values, 0, 255).astype(np.uint8), edge, pictures
 
 
+def fitted(strip: np.ndarray, start: np.ndarray, pictures: np.ndarray, shading: np.ndarray) -> np.ndarray:
+    fixed = (np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12)
+    return kernels.fit_edges(strip, np.ones(16), np.zeros(16), start, *fixed, shading, np.arange(16), (0, 9))
+
+
 def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     strip, edge, pictures = stepping()
     start = edge + 1.4
     start[5] = np.nan
-    fit = kernels.fit_edges(
-        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
-        NO_SHADING, np.arange(16), (0, 9),
-    )  # fmt: skip
+    fit = fitted(strip, start, pictures, 0 * RIM)
     assert np.isnan(fit[5]).all()
     sound = np.arange(16) != 5
     assert np.abs(fit[sound, 0] - edge[sound]).max() < 0.08
-    assert np.median(fit[sound, 1]) == pytest.approx(
-        0.0112, rel=0.15
-    )  # 110 grey levels, variance 10.5: (9 · 110² / 10.5 / 2√π 0.4)^−½
+    # 110 grey levels, variance 10.5: (9 · 110² / 10.5 / 2√π 0.4)^−½
+    assert np.median(fit[sound, 1]) == pytest.approx(0.0112, rel=0.15)
 
 
 @pytest.mark.parametrize("contrast", [110.0, -15.0, 0.0])
 def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_like_background(contrast: float) -> None:
     strip, edge, pictures = stepping(rim=True, contrast=contrast)
-    known, ignored = (
-        kernels.fit_edges(
-            strip, np.ones(16), np.zeros(16), edge - 1.4, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
-            shading, np.arange(16), (0, 9),
-        )[:, 0] - edge
-        for shading in (RIM, NO_SHADING)
-    )  # fmt: skip
+    known, ignored = (fitted(strip, edge - 1.4, pictures, shading)[:, 0] - edge for shading in (RIM, 0 * RIM))
     assert np.abs(known).max() < 0.15
     assert np.abs(ignored).max() > 2 * np.abs(known).max()
-
-
-def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
-    strip, edge, pictures = stepping(rim=True)
-    blur, margin = 0.8, 6.0
-    fit = np.column_stack([edge, np.zeros((16, 2)), np.full(16, 0.03), np.full(16, -0.02), np.zeros(16)])
-    use = np.arange(16) % 3 != 0
-    steady, frames = (strip, np.ones(16), np.zeros(16)), np.flatnonzero(use)
-    arguments = (*steady, fit, np.zeros(16), LAG, blur, pictures, margin, frames, 0.5 * RIM)
-    rows, places, distances, misfit = (sums.sum(axis=0) for sums in kernels.residual_sums(*arguments))
-    half = kernels.coverage_reach(0.0, blur) + margin
-    by_distance, by_row, by_place, logs = np.zeros_like(distances), np.zeros((9, 2)), np.zeros((65, 2)), []
-    for t in np.flatnonzero(use):
-        columns: dict[int, np.ndarray] = {}
-        for u in range(9):
-            for s in range(120):
-                x = edge[t] - LAG[u] - s
-                if abs(x) > half or s > edge[t] + half:
-                    continue
-                p = 0.5 * math.erfc(-x / blur / math.sqrt(2))
-                slope = math.exp(-0.5 * (x / blur) ** 2) / blur / math.sqrt(2 * math.pi)
-                after, before, va, vb = pictures[:, u, s].astype(float)
-                r = strip[t, u, s] - before - (after - before) * (1.03 * p - 0.02) - 0.5 * float(shaded(np.array(-x)))
-                v = p**2 * va + (1 - p) ** 2 * vb
-                w, g = 1 / (v + r * r / 9), -(after - before) * slope
-                ahead, part = divmod(-x, 1.0)
-                by_place[int(ahead) + 32] += (1 - part) * w * np.array([r, 1.0])
-                by_place[int(ahead) + 33] += part * w * np.array([r, 1.0])
-                i = int(len(by_distance) // 2 - x)
-                columns[i] = columns.get(i, np.zeros(2)) + w * (after - before) * np.array([r, after - before])
-                by_row[u] += w * g * np.array([r, g])
-                logs.append(math.log(1 + r * r / (4.5 * (va + vb))))
-        for i, (top, square) in columns.items():
-            by_distance[i] += top**2 / square, 1
-    assert np.allclose(distances, by_distance, rtol=0.01, atol=0.02)
-    assert np.allclose(rows, by_row, rtol=0.01, atol=0.02 * np.abs(by_row).max())
-    assert misfit == pytest.approx([np.sum(logs), len(logs)], rel=1e-3)
-    assert np.allclose(places.T, by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
 
 
 def test_the_largest_step_is_where_means_differ_most():
@@ -133,6 +74,17 @@ def test_the_largest_step_is_where_means_differ_most():
     np.testing.assert_array_equal(when, begin)
     # Of the means of six frames on either side: 6 * 6 / 12 * 50².
     assert np.median(power) == pytest.approx(3 * 50**2, rel=0.05)
+
+
+FITS = "from test_kernels import *; s, e, p = stepping(); print(fitted(s, e + 1.4, p, RIM).tobytes().hex())"
+
+
+@pytest.mark.slow
+def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and_in_later_ones(tmp_path: Path) -> None:
+    where = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = [sys.executable, "-c", FITS]
+    first, later = (subprocess.run(run, env=os.environ | where, capture_output=True, check=True) for _ in range(2))
+    assert first.stdout == later.stdout
 
 
 # ---- threads of the tracker ----
@@ -150,10 +102,7 @@ def test_a_track_is_the_same_to_the_last_digit_whatever_the_number_of_threads(mo
     found = []
     for number in (1, 3):
         monkeypatch.setattr(threads, "n_threads", lambda number=number: number)
-        found.append(tracked(luma, 0.5))
-    one, three = found
-    assert np.isfinite(one.track.edge_px).sum() > 20
-    np.testing.assert_array_equal(one.track.edge_px, three.track.edge_px)
-    np.testing.assert_array_equal(one.track.lead_position_sigma_m, three.track.lead_position_sigma_m)
-    np.testing.assert_array_equal(one.track.lead_position_systematic_m, three.track.lead_position_systematic_m)
-    assert one.track.flag.tolist() == three.track.flag.tolist()
+        found.append(tracked(luma, 0.5).track)
+    assert np.isfinite(found[0].edge_px).sum() > 20
+    for name in ("edge_px", "lead_position_sigma_m", "lead_position_systematic_m", "flag"):
+        np.testing.assert_array_equal(*(getattr(track, name) for track in found))

@@ -103,51 +103,40 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
     `n_trials`, `interval` (its method), `left_out`, and `refused`: None, or why there is no fit.
     """
     kept, left_out = _admit(points)
+    methods = {"log_log": False, "both_axes": True}
     if kept.empty:
-        reason = (
-            "; ".join(f"{vine}: {why}" for vine, why in left_out.items()) or "there is no trial with a steady window"
-        )
+        reasons = "; ".join(f"{vine}: {why}" for vine, why in left_out.items())
+        reason = reasons or "there is no trial with a steady window"
         refused = f"no vine has enough steady trials for a slope ({reason})"
-        return {method: _refusal(refused, left_out) for method in ("log_log", "both_axes")}
-    data = _logarithms(kept)
-    vines = kept.groupby("vine", sort=False).first()
+        return {method: _refusal(refused, left_out) for method in methods}
+    data, vines = _logarithms(kept), kept.groupby("vine", sort=False).first()
     return {
-        "log_log": _fit(data, vines, left_out, resamples, seed, both_axes=False),
-        "both_axes": _fit(data, vines, left_out, resamples, seed, both_axes=True),
+        method: _fit(data, vines, left_out, resamples, seed, both_axes=both_axes)
+        for method, both_axes in methods.items()
     }
 
 
 def _admit(points: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
     """Points of vines that determine a slope, and the reasons why others do not."""
-    fewest_per_vine = 3  # Fewest points of a vine in the fit of a shared exponent (derived)
-    least_force_ratio = 1.2  # Least ratio of largest to smallest force of a vine (derived)
     usable = points[(points["x_ss_m_s"] > 0) & (points["force_N"] > 0)]
     left_out = {}
+    # 3, 1.2: fewest points of a vine, and least ratio of its largest to its smallest force (derived)
     for vine in dict.fromkeys(points["vine"]):
         force = usable.loc[usable["vine"] == vine, "force_N"]
-        if len(force) < fewest_per_vine:
-            left_out[str(vine)] = f"{len(force)} steady trials, at least {fewest_per_vine} are needed"
-        elif force.max() < least_force_ratio * force.min():
-            ratio = force.max() / force.min()
-            left_out[str(vine)] = (
-                f"forces span a factor {ratio:.3g}, at least {least_force_ratio:g} is needed: vary the pressure"
-            )
+        if len(force) < 3:
+            left_out[str(vine)] = f"{len(force)} steady trials, at least 3 are needed"
+        elif force.max() < 1.2 * force.min():
+            span = f"{force.max() / force.min():.3g}"
+            left_out[str(vine)] = f"forces span a factor {span}, at least 1.2 is needed: vary the pressure"
     return usable[~usable["vine"].isin(list(left_out))].sort_values("vine", kind="stable"), left_out
 
 
 def _refusal(reason: str, left_out: dict[str, str]) -> dict[str, Any]:
     return {
-        "n": None,
-        "n_95": [None, None],
-        "n_95_total": [None, None],
-        "vines": {},
-        "covariance": {"parameters": [], "matrix": []},
-        "scatter": None,
-        "n_trials": 0,
-        "interval": None,
-        "left_out": left_out,
-        "refused": reason,
-    }
+        "n": None, "n_95": [None, None], "n_95_total": [None, None], "vines": {},
+        "covariance": {"parameters": [], "matrix": []}, "scatter": None, "n_trials": 0, "interval": None,
+        "left_out": left_out, "refused": reason,
+    }  # fmt: skip
 
 
 def _logarithms(points: pd.DataFrame) -> Points:
@@ -158,25 +147,18 @@ def _logarithms(points: pd.DataFrame) -> Points:
     speed, force, speed_sigma, force_sigma, yield_sigma, scale_sigma = np.nan_to_num(numbers)
     measured = points.reindex(columns=["pressure_source"])["pressure_source"].eq("trace").to_numpy()
     vine, names = pd.factorize(points["vine"].astype(str))
+    force_error = force_sigma / force
     return Points(
-        log_speed=np.log(speed),
-        log_force=np.log(force),
-        speed_error=speed_sigma / speed,
-        force_error=np.where(measured, force_sigma / force, 0.0),
-        set_error=np.where(measured, 0.0, force_sigma / force),
-        yield_error=yield_sigma,
-        scale_error=scale_sigma,
-        force=force,
-        vine=vine,
-        names=tuple(names),
-    )
+        np.log(speed), np.log(force), speed_sigma / speed, np.where(measured, force_error, 0.0),
+        np.where(measured, 0.0, force_error), yield_sigma, scale_sigma, force, vine, tuple(names),
+    )  # fmt: skip
 
 
 def slope(
     log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats
 ) -> tuple[Floats, Floats]:
-    """York's slope with one intercept for each vine, for many resamples at once. Returns n, log_B. Shapes: log_force,
-    counts (n_resamples, n_points); speed_variance, force_variance (n_points,) → (n_resamples,).
+    """York's slope n, (n_resamples,), with one intercept ln B for each vine, for many resamples at once. Shapes:
+    log_force, counts (n_resamples, n_points); speed_variance, force_variance (n_points,).
     """
     member = data.member
     n = np.full(counts.shape[0], 0.4)
@@ -216,18 +198,22 @@ def _fit(
     covariance = _covariance(data, n, speed_variance, force_variance, scatter, both_axes)
     draws = _resample(data, speed_variance, force_variance, resamples, seed, with_shared=False)
     total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
-    # 10: fewest points for bootstrap intervals (chosen)
-    by_resampling = n_points >= 10 and dof > 0
     estimate = np.concatenate([[n], log_B])
     widening = _widening(data, dof)
-    if by_resampling:
+    # 10: fewest points for bootstrap intervals (chosen)
+    if n_points >= 10 and dof > 0:
+        interval = "resampling whole trials"
         low, high = _percentiles(estimate, draws, widening)
     else:
+        interval = "least squares and Student's t: too few trials to resample"
         half_width = _student(dof) * np.sqrt(np.diag(covariance))
         low, high = estimate - half_width, estimate + half_width
     low_total, high_total = _percentiles(estimate, total, widening)
     if not both_axes:
-        shift = _flattening(data, estimate)
+        # N and ln B of a fit with all scatter in the speed, minus the estimate by least squares in ln F
+        ones = np.ones_like(data.log_force)
+        steep, steep_B = slope(data.log_force[None], ones[None], data, ones, 1e-14 * ones)
+        shift = np.concatenate([steep, steep_B[0]]) - estimate
         low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
         low_total, high_total = low_total + shift, high_total + shift
     low_total, high_total = np.minimum(low, low_total), np.maximum(high, high_total)
@@ -250,19 +236,10 @@ def _fit(
         "covariance": {"parameters": ["n", *(f"ln B {name}" for name in data.names)], "matrix": covariance.tolist()},
         "scatter": scatter,
         "n_trials": n_points,
-        "interval": "resampling whole trials"
-        if by_resampling
-        else "least squares and Student's t: too few trials to resample",
+        "interval": interval,
         "left_out": left_out,
         "refused": None,
     }
-
-
-def _flattening(data: Points, estimate: Floats) -> Floats:
-    """N and ln B of a fit with all scatter in the speed, minus the estimate by least squares in ln F."""
-    ones = np.ones_like(data.log_force)
-    n, log_B = slope(data.log_force[None], ones[None], data, ones, 1e-14 * ones)
-    return np.concatenate([n, log_B[0]]) - estimate
 
 
 def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]:
@@ -369,20 +346,18 @@ def _r_squared(log_force: Floats, residual: Floats) -> float:
 # large if there is none.
 
 ISOMETRIC_WITHIN = 0.05  # Vines whose t/D agree within this fraction count as scaled copies of each other (chosen)
-
 SAME_WITHIN = 0.02  # Vines whose diameters agree within this fraction count as equal in diameter (chosen)
+SAME_SETTING_WITHIN = 0.01  # Pressures and payloads that agree within this fraction count as equal (chosen)
 
-FEWEST_VINES = 3  # Fewest vines of a regression with an error (derived)
 
-
-def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_axes") -> dict[str, Any]:
+def fit_scaling(damping: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Regress B on diameter for isometric vines, and on thickness for vines of one diameter. Returns `isometric` and
     `thickness`, each a list of families: `along` (`diameter_mm` or `thickness_um`), `vines`, `sizes`, `B`, `power` and
     `line` (see `regress`), and `refused` (None, or why there is no regression).
     """
     import pandas as pd
 
-    vines = damping[method]["vines"]
+    vines = damping["both_axes"]["vines"]
     table = pd.DataFrame(
         [{"vine": name, **law} for name, law in vines.items()],
         columns=["vine", "diameter_mm", "thickness_um", "B", "B_95"],
@@ -395,7 +370,7 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_ax
         few = ("no vine has a damping coefficient", "only one vine has a damping coefficient; it takes two")
         none_alike = f"of {len(vines)} vines no two are scaled copies of each other or of equal diameter"
         reason = [*few, none_alike][min(len(vines), 2)]
-    return {"method": method, "isometric": isometric, "thickness": thickness, "reason": reason}
+    return {"method": "both_axes", "isometric": isometric, "thickness": thickness, "reason": reason}
 
 
 def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> list[dict[str, Any]]:
@@ -419,8 +394,8 @@ def _families(table: pd.DataFrame, along: str, within: Mapping[str, float]) -> l
 
 def _lines(sizes: Floats, values: Floats, count: int) -> dict[str, Any]:
     """A power law and a straight line, or why neither; `count` is the number of sizes, or of vines."""
-    if count < FEWEST_VINES:
-        return {"power": None, "line": None, "refused": f"{count} sizes; an error takes {FEWEST_VINES}"}
+    if count < 3:
+        return {"power": None, "line": None, "refused": f"{count} sizes; an error takes 3"}
     return {"power": regress(np.log(sizes), np.log(values)), "line": regress(sizes, values), "refused": None}
 
 
@@ -430,24 +405,17 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
     """
     from scipy.stats import linregress
 
-    line, quantile = linregress(x, y), _student(x.size - 2)
+    line = linregress(x, y)
+    half, half_intercept = _student(x.size - 2) * np.array([line.stderr, line.intercept_stderr])
     return {
         "slope": float(line.slope),
-        "slope_95": [float(line.slope - quantile * line.stderr), float(line.slope + quantile * line.stderr)],
+        "slope_95": [float(line.slope - half), float(line.slope + half)],
         "intercept": float(line.intercept),
-        "intercept_95": [
-            float(line.intercept - quantile * line.intercept_stderr),
-            float(line.intercept + quantile * line.intercept_stderr),
-        ],
+        "intercept_95": [float(line.intercept - half_intercept), float(line.intercept + half_intercept)],
         "R2": float(line.rvalue**2),
         "p": float(line.pvalue) if math.isfinite(line.pvalue) else math.nan,
         "n": int(x.size),
     }
-
-
-SAME_SETTING_WITHIN = 0.01  # Pressures and payloads that agree within this fraction count as equal (chosen)
-
-SIZES = {"thickness_um": "wall", "diameter_mm": "diameter"}
 
 
 def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
@@ -456,7 +424,8 @@ def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
     `x_ss_over_diameter_1_s`, their errors, `power` and `line` of both (see `scaling.regress`; those of the second in
     `over_diameter`), `monotonic`, and `refused`.
     """
-    return {"steady_speed": _speed_families(conditions), "efficiency": _efficiency_families(conditions)}
+    speeds, efficiencies = _speed_families(conditions), _efficiency_families(conditions)
+    return {"steady_speed": speeds, "efficiency": efficiencies}
 
 
 def alike(table: pd.DataFrame, within: Mapping[str, float]) -> list[pd.DataFrame]:
@@ -549,6 +518,7 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
 
     known = np.isfinite(values) & (values > 0)
     varying = {name: np.log(size[known]) for name, size in sizes.items() if np.unique(size[known]).size > 1}
+    words = " and ".join({"thickness_um": "wall", "diameter_mm": "diameter"}[name] for name in varying)
     n, dof = int(known.sum()), int(known.sum()) - len(varying) - 1
     matrix = np.column_stack([np.ones(n), *varying.values()])
     refused = None
@@ -557,10 +527,9 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     elif not varying:
         refused = "all vines are of one size"
     elif dof < 1:
-        powers = " and ".join(SIZES[name] for name in varying)
-        refused = f"{n} conditions are too few for powers of {powers} with errors: it takes {len(varying) + 2}"
+        refused = f"{n} conditions are too few for powers of {words} with errors: it takes {len(varying) + 2}"
     elif np.linalg.matrix_rank(matrix) < matrix.shape[1]:
-        refused = f"{' and '.join(SIZES[name] for name in varying)} vary together: neither power is identifiable"
+        refused = f"{words} vary together: neither power is identifiable"
     if refused:
         return {"refused": refused, "n": n, "R2": None}
     y = np.log(values[known])

@@ -56,7 +56,9 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
     n_rest = rest_points(position_m)
-    if n_rest == position_m.size or not _ever_moves(kinematics):
+    span_m = float(np.ptp(kinematics.lead_position_m))
+    # 5.0: standard deviations of a position by which the track must leave its start to count as moving
+    if n_rest == position_m.size or not (span_m > 5.0 * kinematics.noise_m and span_m > 0):
         origin_m, sigma_m = _resting_level(position_m, kinematics)
         return Release(math.nan, origin_m, sigma_m, False, "the leading edge never moves forward beyond its noise")
     # 3: fewest points at rest that define a resting position (chosen)
@@ -73,21 +75,9 @@ def flag_rest(track: Track, release: Release) -> Track:
     if not math.isfinite(release.time_s) or release.moving_from_start:
         return track
     resting = track.time_s < release.time_s
-    flag = np.array(
-        [
-            join_flags(old, "before_release") if at_rest else old
-            for old, at_rest in zip(track.flag, resting, strict=True)
-        ],
-        dtype=track.flag.dtype if track.flag.dtype.itemsize >= 320 else "<U80",
-    )
+    flag = track.flag.astype(track.flag.dtype if track.flag.dtype.itemsize >= 320 else "<U80")
+    flag[resting] = [join_flags(str(old), "before_release") for old in flag[resting]]
     return replace(track, flag=flag)
-
-
-def _ever_moves(kinematics: Kinematics) -> bool:
-    """Whether positions span more than noise can explain."""
-    span_m = float(np.ptp(kinematics.lead_position_m))
-    # 5.0: standard deviations of a position by which the track must leave its start to count as moving
-    return span_m > 5.0 * kinematics.noise_m and span_m > 0
 
 
 def _resting_level(position_m: Floats, kinematics: Kinematics) -> tuple[float, float]:
@@ -105,19 +95,14 @@ def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:
     first_m = float(kinematics.lead_position_m[0])
     back_s = velocity / acceleration if acceleration > 0 else math.inf
     # 20: frames by which an extrapolated release may precede the first frame (chosen)
+    moving = f"moving at the first point ({velocity:.3g} m/s)"
     if -step_s / 2 <= back_s <= 20 * step_s:
         back_s = max(back_s, 0.0)
         origin_m = float(first_m - 0.5 * velocity * back_s)
         sigma_m = math.hypot(kinematics.noise_m, 0.5 * velocity * back_s)
-        reason = (
-            f"moving at the first point ({velocity:.3g} m/s); release extrapolated {back_s * 1e3:.3g} ms back"
-            f" at {acceleration:.3g} m/s²"
-        )
+        reason = f"{moving}; release extrapolated {back_s * 1e3:.3g} ms back at {acceleration:.3g} m/s²"
         return Release(float(time_s[0]) - back_s, origin_m, sigma_m, True, reason)
-    reason = (
-        f"moving at the first point ({velocity:.3g} m/s), and the start cannot be extrapolated: zeros set to the first"
-        " point"
-    )
+    reason = f"{moving}, and the start cannot be extrapolated: zeros set to the first point"
     return Release(float(time_s[0]), first_m, kinematics.noise_m, True, reason)
 
 

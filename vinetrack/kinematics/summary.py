@@ -48,33 +48,11 @@ if TYPE_CHECKING:
 # conditions together.
 
 CONDITION_COLUMNS = (
-    "condition",
-    "vine",
-    "diameter_mm",
-    "thickness_um",
-    "length_mm",
-    "pressure_kPa",
-    "payload_g",
-    "growth_angle_deg",
-    "n_trials",
-    "n_steady",
-    "x_ss_m_s",
-    "x_ss_sigma_m_s",
-    "x_ss_over_diameter_1_s",
-    "x_ss_over_diameter_sigma_1_s",
-    "n_final",
-    "final_at_mm",
-    "final_lead_velocity_m_s",
-    "final_lead_velocity_sigma_m_s",
-    "n_efficiency",
-    "efficiency_at_mm",
-    "efficiency",
-    "efficiency_sigma",
-    "efficiency_payload",
-    "efficiency_payload_sigma",
-    "efficiency_with_weight",
-    "efficiency_with_weight_sigma",
-    "weight_share",
+    *("condition", "vine", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g", "growth_angle_deg"),
+    *("n_trials", "n_steady", "x_ss_m_s", "x_ss_sigma_m_s", "x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s"),
+    *("n_final", "final_at_mm", "final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s", "n_efficiency"),
+    *("efficiency_at_mm", "efficiency", "efficiency_sigma", "efficiency_payload", "efficiency_payload_sigma"),
+    *("efficiency_with_weight", "efficiency_with_weight_sigma", "weight_share"),
 )
 
 
@@ -98,9 +76,10 @@ def condition_table(
 
 
 def _row(trial: Trial, group: pd.DataFrame, final_at_fraction: float, efficiency_at_mm: float) -> dict[str, object]:
-    steady = _steady(group)
+    speed, speed_sigma, n_steady = mean_with_error(*(group[f"x_ss_{of}m_s"].to_numpy(float) for of in ("", "sigma_")))
+    if n_steady < LEAST_STEADY_SHARE * len(group):
+        speed = speed_sigma = math.nan
     final, final_sigma, n_final = mean_with_error(group["final_lead_velocity_m_s"].to_numpy(float))
-    diameter_m = trial.diameter_m
     return {
         "condition": trial.condition,
         "vine": trial.vine,
@@ -111,23 +90,17 @@ def _row(trial: Trial, group: pd.DataFrame, final_at_fraction: float, efficiency
         "payload_g": 1e3 * trial.payload_kg,
         "growth_angle_deg": math.degrees(trial.growth_angle_rad),
         "n_trials": len(group),
-        **steady,
-        "x_ss_over_diameter_1_s": steady["x_ss_m_s"] / diameter_m,
-        "x_ss_over_diameter_sigma_1_s": steady["x_ss_sigma_m_s"] / diameter_m,
+        "n_steady": n_steady,
+        "x_ss_m_s": speed,
+        "x_ss_sigma_m_s": speed_sigma,
+        "x_ss_over_diameter_1_s": speed / trial.diameter_m,
+        "x_ss_over_diameter_sigma_1_s": speed_sigma / trial.diameter_m,
         "n_final": n_final,
         "final_at_mm": 1e3 * final_at_fraction * trial.length_m,
         "final_lead_velocity_m_s": final,
         "final_lead_velocity_sigma_m_s": final_sigma,
         **_efficiencies(trial, group["efficiency"].to_numpy(float), efficiency_at_mm),
     }
-
-
-def _steady(group: pd.DataFrame) -> Mapping[str, float]:
-    speeds, sigmas = (group[name].to_numpy(float) for name in ("x_ss_m_s", "x_ss_sigma_m_s"))
-    mean, sigma, count = mean_with_error(speeds, sigmas)
-    if count < LEAST_STEADY_SHARE * len(group):
-        mean = sigma = math.nan
-    return {"n_steady": count, "x_ss_m_s": mean, "x_ss_sigma_m_s": sigma}
 
 
 def _efficiencies(trial: Trial, values: Floats, at_mm: float) -> dict[str, object]:
@@ -141,8 +114,8 @@ def _efficiencies(trial: Trial, values: Floats, at_mm: float) -> dict[str, objec
 
 
 def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float, float, int]:
-    """Return the mean of the known values, its standard error, and their number. Returns mean, standard error, number;
-    NaN, NaN, 0 without known values, and an error of NaN for a single value without one. Shapes: values, sigmas (n,).
+    """Return the mean of the known values, its standard error, and their number: NaN, NaN, 0 without known values, and
+    an error of NaN for a single value without one. Shapes: values, sigmas (n,).
     """
     known = np.isfinite(values)
     count = int(known.sum())
@@ -369,9 +342,9 @@ def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
 LAW_COLUMNS = ("model", "method", "vine", "n", "n_low_95", "n_high_95", "B", "B_low_95", "B_high_95", "n_trials")
 
 
-def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings | None = None) -> list[TrialMotion]:
+def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings) -> list[TrialMotion]:
     """Find velocity, release and windows of every track; trials with too few points are skipped."""
-    settings, motions = settings or RunSettings(), []
+    motions = []
     for trial, track in pairs:
         try:
             motions.append(look_at_motion(trial, track, settings))
@@ -380,15 +353,12 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings 
     return motions
 
 
-def redo_damping(
-    model: Model, motions: Sequence[TrialMotion], settings: RunSettings | None = None
-) -> Mapping[str, Any]:
+def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSettings) -> Mapping[str, Any]:
     """Find steady windows and the damping law with the pressure of a model; laws as in `damping.json`. Trials that
     cannot be analysed under the model are left out.
     """
     import pandas as pd
 
-    settings = settings or RunSettings()
     rows, reasons = [], []
     for motion in motions:
         try:

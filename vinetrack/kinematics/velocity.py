@@ -57,8 +57,7 @@ class WindowFits:
 
     def velocities(self, time_s: Floats, side: float) -> tuple[Indices, Floats, Floats]:
         """Evaluate the velocity at every point, from the window in which the point has a given position. Returns number
-        of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,). Shapes: time_s
-        (n,).
+        of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,).
         """
         offset = round((1 + side) / 2 * (self.width - 1))
         window = np.clip(np.arange(time_s.size) - offset, 0, self.coefficients.shape[1] - 1)
@@ -146,13 +145,6 @@ def correlated(weights: Floats, rho: float) -> Floats:
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)
 
-SIDES = (0.0, -0.5, 0.5, -1.0, 1.0)  # Positions of the point in its window (chosen)
-
-# Largest misfit of a window that fits its points, by number of terms (derived)
-MISFIT_LIMITS = {0: np.inf, 1: 12.0, 2: 15.3, 3: 18.0, 4: 20.5}
-
-KINK_GAIN = 2.5  # Factor on the misfit, taken as noise, for the error of the velocity where no window fits (derived)
-
 
 # Window, velocity and error for unit noise at every point, of centred windows of one width
 Centred = tuple[Indices, Floats, Floats]
@@ -188,23 +180,25 @@ def smooth(
     """Estimate position, velocity and acceleration at every point for known noise. A window is used only if the next
     wider one at the same position agrees too: the widest that agrees is about to disagree, and its bias may be several
     times its error. Each step in width changes their ratio by 1.45^5.5 = 8. Returns position, velocity and
-    acceleration, shape (3, n), SI; standard error of the velocity, shape (n,), m/s; points in: the window used, shape
-    (n,). Shapes: time_s, position_m (n,).
+    acceleration, (3, n), SI; standard error of the velocity, m/s, and points in the window used, (n,) each.
     """
     n = time_s.size
     least = min(n, max(WINDOWS[0], order + 2))
     widths = [least, *(width for width in WINDOWS if least < width <= n)]
     fits = [fit_all_windows(time_s, position_m, width, min(order, width - 1), rho) for width in widths]
-    fits_points = [fit.misfit <= noise_m**2 * MISFIT_LIMITS[fit.misfit_terms] for fit in fits]
+    # Largest misfit of a window that fits its points, by number of terms (derived)
+    limits = (np.inf, 12.0, 15.3, 18.0, 20.5)
+    fits_points = [fit.misfit <= noise_m**2 * limits[fit.misfit_terms] for fit in fits]
     centred = [fit.velocities(time_s, 0.0) for fit in fits]
     low, high, centred_error = _agreement(centred, fits_points, noise_m, kappa)
     # The narrowest window is used where no wider one is; its error is that of the noise, or of its misfit if larger.
     window_used, _, gain = centred[0]
     window_used, good = window_used.copy(), fits_points[0][window_used]
-    sigma = np.where(good, noise_m, np.maximum(noise_m, KINK_GAIN * np.sqrt(fits[0].misfit[window_used]))) * gain
+    # 2.5: factor on the misfit, taken as noise, for the error of the velocity where no window fits (derived)
+    sigma = np.where(good, noise_m, np.maximum(noise_m, 2.5 * np.sqrt(fits[0].misfit[window_used]))) * gain
     best = np.where(good, sigma, np.inf)
     fit_used = np.zeros(n, dtype=int)
-    for side in SIDES:
+    for side in (0.0, -0.5, 0.5, -1.0, 1.0):  # positions of the point in its window (chosen)
         wider_agrees = np.full(n, len(fits) == 1)
         for k in reversed(range(len(fits))):
             window, velocity, gain = centred[k] if side == 0 else fits[k].velocities(time_s, side)

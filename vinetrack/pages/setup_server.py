@@ -159,7 +159,7 @@ def warm_up() -> None:
     for i, frame in enumerate(luma):
         frame[24:40, : 20 + max(0, i - 6) * 7] = 180
     recording = Recording(Path("warm-up"), "container", 240, 64, 8, len(luma))
-    frames = Frames(recording, recording.whole, luma, np.arange(len(luma)), np.zeros(len(luma), dtype=bool))
+    frames = Frames(recording, luma, np.arange(len(luma)), np.zeros(len(luma), dtype=bool))
     try:
         track_frames(frames, Trial(name="warm-up", capture_fps=1000.0), 1000.0)
     except RecordingError:

@@ -34,9 +34,6 @@ SIDE_POINTS = (8, 5, 3)  # Points used on either side, fewer where release or th
 # Points on either side that must show at least this part of the jump too, where they are conclusive (chosen)
 WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
 
-# Factor on JUMP_SIGMAS for a jump that points farther away cannot confirm, as near release (measured)
-SURE_FACTOR = 2.0
-
 _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]  # Frame numbers and positions before and after
 
 
@@ -95,7 +92,8 @@ def frames_surely_missing(track: Track) -> bool:
         jump = _jump(*near, slice(0, i + 1), slice(i + 1, None), noise_m[rows[i]], rho) if i >= 0 else None
         if jump is None or math.isfinite(_wide_jump(*near, i, noise_m[rows[i]])):
             return True
-        if jump.size > SURE_FACTOR * JUMP_SIGMAS * jump.sigma:
+        # 2.0: factor for a jump that points farther away cannot confirm, as near release (measured)
+        if jump.size > 2.0 * JUMP_SIGMAS * jump.sigma:
             return True
     return False
 
@@ -319,12 +317,10 @@ def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> _Jump | No
 
 def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:
     """The track with one fault flagged and reported, and its times corrected."""
-    at_s = float(track.time_s[fault.row])
+    at_s, time_s = float(track.time_s[fault.row]), track.time_s.copy()
     if fault.kind == "stale":
-        return _mark(
-            track, fault.row, "duplicate", f"the frame at {at_s:.5g} s repeats the one before it and is left out"
-        )
-    time_s = track.time_s.copy()
+        note = f"the frame at {at_s:.5g} s repeats the one before it and is left out"
+        return _mark(track, fault.row, "duplicate", note)
     if fault.kind == "inserted":
         time_s[fault.row] -= step_s / 2
         time_s[fault.row + 1 :] -= step_s
@@ -347,9 +343,6 @@ def _mark(track: Track, row: int, flags: str, note: str) -> Track:
 #
 # The threshold is that of `frame_timing`, which examines tracks of any source and what remains undecided here.
 
-# Range of the four steps around a long one, as a part of their median, below which the motion is steady (chosen)
-EVEN_STEP_RANGE = 0.35
-
 
 @dataclass(frozen=True)
 class MissingFrames:
@@ -368,8 +361,7 @@ def count_missing(
     edge_px: Floats, sigma_px: Floats, slot: Indices, number: Indices, repeated: Bools, moving: tuple[int, int]
 ) -> MissingFrames:
     """Count in the frames that steps of the motion show to be missing. A step is compared with two on each side, which
-    must agree (EVEN_STEP_RANGE) and be clear of the stated errors. Shapes: edge_px, sigma_px, slot, number, repeated
-    (n_frames,).
+    must agree and be clear of the stated errors. Arrays have shape (n_frames,).
     """
     n = len(edge_px)
     gap, retimed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -386,7 +378,8 @@ def count_missing(
         median_step = float(np.median(around))
         # Steps below 2 px cannot show a missing frame.
         least_step = max(2.0, CLEAR_STEP_SIGMAS * float(np.max(sigma_px[i - 1 : i + 1])))
-        if median_step < least_step or np.ptp(around) > EVEN_STEP_RANGE * median_step:
+        # 0.35: range of the four steps, as a part of their median, above which the motion is not steady (chosen)
+        if median_step < least_step or np.ptp(around) > 0.35 * median_step:
             continue
         ratio = step[i] / float(near.mean())
         if ratio <= DROP_RATIO:

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 # Checks that every imported track must pass, and how a track is assembled.
 
 FEWEST_POINTS = 5  # Fewest points of a track (derived)
-
-
 LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
 
 
@@ -52,16 +50,16 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
     """Refuse pressures outside what the sheet allows; NaN passes. Shapes: pressure_kPa (n,)."""
-    largest_pressure_kpa = 1000.0  # Largest gauge pressure in kPa that is accepted (chosen)
-    # -101.4: least gauge pressure that is accepted; sensors do read a little below zero (derived)
-    wrong = np.flatnonzero((pressure_kPa > largest_pressure_kpa) | (pressure_kPa < -101.4))
+    # 1000, -101.4: largest gauge pressure that is accepted (chosen), and least; sensors do read a little below zero
+    # (derived)
+    wrong = np.flatnonzero((pressure_kPa > 1000.0) | (pressure_kPa < -101.4))
     if len(wrong):
         value = float(pressure_kPa[wrong[0]])
         where = f"line {lines[wrong[0]]}, column pressure_kPa: {value:g}"
         if value < 0:
             raise TrackError(f"{where} is below vacuum", "gauge pressure in kPa is wanted")
-        hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1000 * largest_pressure_kpa else ""
-        raise TrackError(f"{where} is above {largest_pressure_kpa:g} kPa{hint}")
+        hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1e6 else ""
+        raise TrackError(f"{where} is above 1000 kPa{hint}")
 
 
 def new_track(
@@ -77,8 +75,7 @@ def new_track(
     sigma_m, edge_px, pressure_Pa (n,).
     """
     known = np.isfinite(lead_position_m)
-    if np.sum(known) < FEWEST_POINTS:
-        count = int(np.sum(known))
+    if (count := int(np.sum(known))) < FEWEST_POINTS:
         raise TrackError(f"has {count} point{'s' * (count != 1)}", f"at least {FEWEST_POINTS} are needed")
     if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
         raise TrackError("holds a time or position too large to be one", "correct it")
@@ -206,8 +203,6 @@ def _require_whole(data: bytes) -> None:
 # is that of Tracker's source, `org.opensourcephysics.media.core.ImageCoordSystem`. Where origin, angle or scale
 # change, a project holds them for key frames; each is valid until the next.
 
-_HEADER_CELL = re.compile(r"#?\s*(t|time|x|y)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE)
-
 
 def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
     """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
@@ -321,13 +316,10 @@ def _clock(panel: Element) -> tuple[float, float, int]:
     frame_ms = next((spacing for spacing in spacings if math.isfinite(spacing) and spacing > 0), math.nan)
     if math.isnan(frame_ms):
         raise TrackError("does not say how long a frame lasts", "set the frame rate in Tracker's clip settings")
-    start_ms = 0.0 if clip is None else _number(clip, "starttime")
-    start_frame = 0.0 if clip is None else _number(clip, "startframe")
-    return (
-        frame_ms / 1000,
-        start_ms / 1000 if math.isfinite(start_ms) else 0.0,
-        int(start_frame) if math.isfinite(start_frame) else 0,
+    start_ms, start_frame = (
+        0.0 if clip is None else float(np.nan_to_num(_number(clip, name))) for name in ("starttime", "startframe")
     )
+    return frame_ms / 1000, start_ms / 1000, int(start_frame)
 
 
 def _object(node: Element, name: str) -> Element | None:
@@ -361,7 +353,8 @@ def _physics_tracker_column(cell: str) -> tuple[str, str]:
     >>> _physics_tracker_column("x (cm)"), _physics_tracker_column("#t")
     (('x', 'cm'), ('t', ''))
     """
-    match = _HEADER_CELL.fullmatch(cell.strip().strip('"').strip())
+    pattern = r"#?\s*(t|time|x|y)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?"
+    match = re.fullmatch(pattern, cell.strip().strip('"').strip(), re.IGNORECASE)
     if match is None:
         return "", ""
     return {"time": "t"}.get(match[1].lower(), match[1].lower()), (match[2] or "")
@@ -377,17 +370,14 @@ def read_export(table: Table) -> Track:
         raise TrackError("has no columns t and x or y", "export them from Tracker with one separator throughout")
     time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"][1] or "s", "s"))
     check_times(time_s, table.lines)
-    axes = [
-        table.numbers(columns[name][0], blank_is_nan=True) * _factor(columns[name][1] or "m", "m")
-        for name in ("x", "y")
-        if name in columns
-    ]
+    places = [columns[name] for name in ("x", "y") if name in columns]
+    axes = [table.numbers(column, blank_is_nan=True) * _factor(unit or "m", "m") for column, unit in places]
     position_m, note = _project_on_axis(np.column_stack(axes))
     missing = int(np.sum(~np.isfinite(position_m)))
     notes = [rounded] if rounded else []
     if missing:
         notes.append(f"{missing} rows have no position.")
-    if not columns["t"][1] and not any(columns[name][1] for name in ("x", "y") if name in columns):
+    if not columns["t"][1] and not any(unit for _, unit in places):
         notes.append("The export names no units; seconds and metres are assumed.")
     return new_track(time_s, position_m, notes=[*notes, note] if note else notes)
 
@@ -402,9 +392,8 @@ def _factor(unit: str, si: str) -> float:
 
 
 def _project_on_axis(points: Floats) -> tuple[Floats, str]:
-    """Positions along the principal axis of the motion, and a sentence saying so; NaN rows stay NaN. Returns position,
-    note: Shape (n,), with a net displacement that is not negative; the note is blank where nothing was done. Shapes:
-    points (n, 1).
+    """Positions, (n,), along the principal axis of the motion, with a net displacement that is not negative, and a
+    sentence saying so, blank where nothing was done; NaN rows stay NaN. Shapes: points (n, 1 or 2).
     """
     known = np.all(np.isfinite(points), axis=1)
     if not known.any():
@@ -449,8 +438,7 @@ def flag_end_of_motion(trial: Trial, track: Track) -> Track:
     if end is None or end + 1 < FEWEST_POINTS:
         return track
     flag = track.flag.astype("<U80")
-    for row in rows[end + 1 :]:
-        flag[row] = join_flags(str(flag[row]), "after_end")
+    flag[rows[end + 1 :]] = [join_flags(str(old), "after_end") for old in flag[rows[end + 1 :]]]
     who, end_s = "vine" if is_vine else "body", track.time_s[rows[end]]
     note = f"the {who} {what} after {end_s:.5g} s: the end of its motion; later points are not used"
     return replace(track, flag=flag, notes=(*track.notes, note))
@@ -501,8 +489,6 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
     `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and Tracker's text export
     (columns t, x, y or t and one coordinate, with or without a title above).
     """
-    # Lines within which the header of a text export is looked for, below its title and remarks (chosen)
-    header_within_lines = 20
     if path.suffix.lower() == ".trz":
         raise TrackError("is a packed Tracker project", "unpack it and name the .trk inside")
     try:
@@ -511,7 +497,7 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
             return read_project(text, point_mass, frames_used)
         if point_mass:
             raise TrackError("has no point masses to choose from", "leave point_mass blank, or name a .trk file")
-        lines = text.split("\n")[:header_within_lines]
+        lines = text.split("\n")[:20]  # title and remarks stand above the header of a text export (chosen)
         skip = next((i for i, line in enumerate(lines) if is_export_header(line)), None)
         table = parse_table(text, skip or 0)
         if skip is not None and "position_m" not in table.columns:

@@ -33,14 +33,6 @@ LOWEST_FREQUENCY = 0.06  # Lowest frequency, in cycles a frame, at which the spe
 
 FEWEST_FRAMES = 40  # Fewest frames of a stretch without gaps (chosen)
 
-# Median deviation of the spacings, as a part of their median, above which a track is not used (chosen)
-UNEVEN_PART = 0.02
-
-CORRELATIONS = tuple(np.linspace(0.0, 0.9, 10))  # Lag-one correlations of noise that was not smoothed (chosen)
-
-# Gain of ln L over noise without holes, and over every other filter, above which positions count as smoothed (chosen)
-SURE_GAIN = 30.0
-
 
 @dataclass(frozen=True)
 class Smoothing:
@@ -87,8 +79,11 @@ def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0
         return None
     # The twelve longest stretches are compared.
     spectra = sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:12]
-    unsmoothed = max(_whittle(spectra, [_ar1_spectrum(f, rho) for f, _ in spectra]) for rho in CORRELATIONS)
-    ranked: list[tuple[float, Smoothing | None]] = [(unsmoothed, None)]
+    ranked: list[tuple[float, Smoothing | None]] = []
+    for rho in np.linspace(0.0, 0.9, 10):  # noise that was not smoothed: first-order autoregressive
+        shapes = [(1 - rho**2) / (1 - 2 * rho * np.cos(2 * math.pi * f) + rho**2) for f, _ in spectra]
+        ranked.append((_whittle(spectra, shapes), None))
+    ranked = [max(ranked, key=lambda pair: pair[0])]
     # Filters are compared by their windows, in frames.
     for window in (3, 5, 7, 9, 11, 13, 15, 17, 19, 21):
         # Degrees of the polynomials; 0 is the moving average.
@@ -98,11 +93,13 @@ def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0
             weights = _filter_weights(window, degree)
             # Noise averaged over N frames keeps 1/N of its variance.
             smoothing = Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
-            # Part of its power that smoothed noise keeps in a hole.
-            shapes = [np.maximum(_power_response(f, weights), 1e-5) for f, _ in spectra]
+            # The squared response of the filter; 1e-5: part of its power that smoothed noise keeps in a hole.
+            phases = [2 * math.pi * np.outer(f, np.arange(window) - window // 2) for f, _ in spectra]
+            shapes = [np.maximum((np.cos(phase) @ weights) ** 2, 1e-5) for phase in phases]
             ranked.append((_whittle(spectra, shapes), smoothing))
     ranked.sort(key=lambda pair: -pair[0])
-    return ranked[0][1] if ranked[0][0] > ranked[1][0] + SURE_GAIN else None
+    # 30.0: gain of ln L over noise without holes, and over every other filter, that is sure (chosen)
+    return ranked[0][1] if ranked[0][0] > ranked[1][0] + 30.0 else None
 
 
 def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
@@ -111,8 +108,8 @@ def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
     if time_s.size < FEWEST_FRAMES:
         return
     steps = np.diff(time_s)
-    uneven = np.median(np.abs(steps - np.median(steps))) > UNEVEN_PART * np.median(steps)
-    if uneven:
+    # 0.02: median deviation of the spacings, as a part of their median, above which a track is not used (chosen)
+    if np.median(np.abs(steps - np.median(steps))) > 0.02 * np.median(steps):
         return
     for part in np.split(np.arange(time_s.size), np.flatnonzero(steps > 1.5 * np.median(steps)) + 1):
         if part.size < FEWEST_FRAMES:
@@ -143,17 +140,6 @@ def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats])
         spectrum = amplitudes @ bases
         total -= float(np.sum(np.log(spectrum) + power / spectrum))
     return total
-
-
-def _ar1_spectrum(frequency: Floats, rho: float) -> Floats:
-    """Spectrum of first-order autoregressive noise."""
-    return np.asarray((1 - rho**2) / (1 - 2 * rho * np.cos(2 * math.pi * frequency) + rho**2))
-
-
-def _power_response(frequency: Floats, weights: Floats) -> Floats:
-    """Squared frequency response of a filter with these weights."""
-    places = np.arange(weights.size) - weights.size // 2
-    return np.asarray((np.cos(2 * math.pi * np.outer(frequency, places)) @ weights) ** 2)
 
 
 MOVING_STRETCH, MOVING_ORDER = 12, 3  # Points of a stretch in motion, and degree of its polynomial (chosen)
@@ -221,7 +207,6 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     """Return the `rounding_noise` of most of a campaign's tracks where it dominates their noise; it then holds for all.
     Returns 0 where most are not rounded, or to different steps, or are noisier than that. Shapes: tracks (n_points,).
     """
-    same_step_tolerance = 0.01  # Relative difference within which two rounding steps are the same (chosen)
     # Below √2 errors of rounding, most of the noise is rounding.
     limit = math.sqrt(2) / math.sqrt(12)
     noises = sorted(
@@ -229,9 +214,8 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
         for position_m in tracks
     )
     typical = noises[len(noises) // 2] if noises else 0.0
-    n_same = sum(
-        typical * (1 - same_step_tolerance) <= noise <= typical * (1 + same_step_tolerance) for noise in noises
-    )
+    # 0.01: relative difference within which two rounding steps are the same (chosen)
+    n_same = sum(typical * (1 - 0.01) <= noise <= typical * (1 + 0.01) for noise in noises)
     return typical if 2 * n_same > len(noises) else 0.0
 
 
@@ -349,7 +333,10 @@ def _restricted_likelihood(groups: list[tuple[Floats, Floats]]) -> tuple[float, 
         # ρ has a normal prior about 0 with a standard deviation of 0.5.
         score = -0.5 * (n * np.log(pooled) + log_det[:, used].sum(axis=1)) - 0.5 * (RHO_GRID / 0.5) ** 2
         best = int(np.argmax(score))
-    rho = _parabola_vertex(RHO_GRID, score, best)
+    rho = float(RHO_GRID[best])
+    if 0 < best < RHO_GRID.size - 1:  # the vertex of the parabola through it and its neighbours
+        left, middle, right = score[best - 1 : best + 2]
+        rho = float(rho + 0.5 * (RHO_GRID[1] - RHO_GRID[0]) * (left - right) / (left - 2 * middle + right))
     innovation = math.exp(np.interp(rho, RHO_GRID, np.log(pooled / n)))
     return math.sqrt(innovation / (1 - rho**2)), rho
 
@@ -365,14 +352,6 @@ def _whitened_residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
     residual = white_y - (q @ inside)[..., 0]
     diagonal = np.abs(np.diagonal(r, axis1=2, axis2=3))
     return np.sum(residual**2, axis=2), 2 * np.log(diagonal).sum(axis=2) - np.log(1 - RHO_GRID**2)[:, None]
-
-
-def _parabola_vertex(x: Floats, score: Floats, best: int) -> float:
-    """Abscissa of the vertex of the parabola through the best grid point and its neighbours."""
-    if best == 0 or best == x.size - 1:
-        return float(x[best])
-    left, middle, right = score[best - 1 : best + 2]
-    return float(x[best] + 0.5 * (x[1] - x[0]) * (left - right) / (left - 2 * middle + right))
 
 
 def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
@@ -400,10 +379,7 @@ HALF_WIDTH = 6  # Neighbours on either side (chosen)
 
 LEAST_SHARE = 0.75  # Least share of the neighbours that must lie on the cubic (chosen)
 
-
 FEWEST_POINTS = 2 * HALF_WIDTH + 1  # Fewest points of a window: the point and its neighbours (derived)
-
-MOST_REJECTED = 0.1  # Largest share of points that may be rejected (chosen)
 
 
 @dataclass(frozen=True)
@@ -493,7 +469,8 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
         if not outlying_kept.any():
             break
         is_outlier[candidates[outlying_kept]] = True
-    return is_outlier if np.mean(is_outlier) <= MOST_REJECTED else np.zeros(n, dtype=bool)
+    # 0.1: largest share of points that may be rejected (chosen)
+    return is_outlier if np.mean(is_outlier) <= 0.1 else np.zeros(n, dtype=bool)
 
 
 def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
@@ -506,8 +483,7 @@ def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
     if not outlying.size:
         return track
     flag = track.flag.astype("<U80")
-    for row in outlying:
-        flag[row] = join_flags(str(flag[row]), "rejected")
+    flag[outlying] = [join_flags(str(old), "rejected") for old in flag[outlying]]
     rejected = replace(track, flag=flag)
     note = f"far off the motion around, so left out: {', '.join(_places(rejected, outlying))}"
     return replace(rejected, notes=(*track.notes, note))
@@ -592,13 +568,6 @@ def _normal_solution(powers: Floats, weight: Floats, right: Floats) -> Floats:
 
 FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # Weights of a fourth difference
 
-# Grid points of τ, by factors of 1.19 from a thirtieth to thirty times what makes both parts equal at the higher
-# speeds, and of s, by factors of 1.12; the best τ is then refined by a parabola (derived)
-BLUR_GRID_SIZE, SCALE_GRID_SIZE = 41, 61
-
-
-_SCALE_GRID = np.geomspace(1 / 30, 2.0, SCALE_GRID_SIZE)
-
 
 @dataclass(frozen=True)
 class NoiseShape:
@@ -638,10 +607,10 @@ def noise_shape(
     if not shapes:
         return None
     deviance, shape = min(shapes, key=lambda result: result[0])
-    # Noise that varies is used if it is far more likely and its standard deviations differ by a quarter.
-    if equal_noise - deviance < 28.0 or _sd_ratio(shape) < 1.25:
-        return None
-    return shape
+    # Noise that varies is used if it is far more likely and, in the trial where they differ most, the standard
+    # deviations of the noisiest and the quietest points differ by a quarter.
+    ratio = max(float(np.quantile(sd, 0.95) / np.quantile(sd, 0.05)) for sd in shape.sd_m)
+    return None if equal_noise - deviance < 28.0 or ratio < 1.25 else shape
 
 
 def ar1_difference_gain(rho: float) -> float:
@@ -668,13 +637,9 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
     use = even & (fit.share >= LEAST_SHARE) & (around_m > 0)
     # They are winsorised to 4 standard deviations of their surroundings.
     winsorised_m = np.minimum(distance_m, 4.0 * around_m)
-    return _Differences(winsorised_m, use, _running_median(np.abs(fit.speed_m_s)))
-
-
-def _running_median(values: Floats) -> Floats:
-    """Running median of five: the slope in one window is unreliable at a corner."""
-    view = np.lib.stride_tricks.sliding_window_view(np.pad(values, 2, mode="edge"), 5)
-    return np.median(view, axis=1)
+    # The slope in one window is unreliable at a corner: the median of five is taken.
+    speeds = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(fit.speed_m_s), 2, mode="edge"), 5)
+    return _Differences(winsorised_m, use, np.median(speeds, axis=1))
 
 
 def _best_scale(differences: _Differences, extra_m: Floats) -> tuple[float, float]:
@@ -684,14 +649,14 @@ def _best_scale(differences: _Differences, extra_m: Floats) -> tuple[float, floa
     coarse_step = 5  # Every fifth value of s is tried before those between (chosen)
     square, extra_square = differences.distance_m[differences.use] ** 2, extra_m[differences.use] ** 2
     typical = math.sqrt(float(np.mean(square))) + 1e-300
-    s = typical * _SCALE_GRID
-    indices = np.arange(0, SCALE_GRID_SIZE, coarse_step)
+    s = typical * np.geomspace(1 / 30, 2.0, 61)  # by factors of 1.12 (derived)
+    indices = np.arange(0, s.size, coarse_step)
     for _ in range(2):
         variance = s[indices, None] ** 2 + extra_square
         deviances = np.sum(np.log(variance) + square / variance, axis=1)
         best = int(np.argmin(deviances))
         deviance, k = float(deviances[best]), int(indices[best])
-        indices = np.arange(max(k - coarse_step + 1, 0), min(k + coarse_step, SCALE_GRID_SIZE))
+        indices = np.arange(max(k - coarse_step + 1, 0), min(k + coarse_step, s.size))
     return deviance, float(s[k])
 
 
@@ -701,11 +666,12 @@ def _by_speed(differences: Sequence[_Differences]) -> tuple[float, NoiseShape] |
     noise = float(np.median([np.median(part.distance_m[part.use]) for part in differences])) / 0.6745
     if not (speed > 0 and noise > 0):
         return None
-    grid = noise / speed * np.geomspace(1 / 30, 30.0, BLUR_GRID_SIZE)
+    # By factors of 1.19 about what makes both parts equal at the higher speeds; then refined by a parabola (derived)
+    grid = noise / speed * np.geomspace(1 / 30, 30.0, 41)
     deviances = np.array([sum(_best_scale(part, blur * part.speed_m_s)[0] for part in differences) for blur in grid])
     k = int(np.argmin(deviances))
     blur = float(grid[k])
-    if 0 < k < BLUR_GRID_SIZE - 1:
+    if 0 < k < grid.size - 1:
         low, mid, high = deviances[k - 1 : k + 2]
         blur *= float((grid[1] / grid[0]) ** (0.5 * (low - high) / (low - 2 * mid + high)))
     fits = [_best_scale(part, blur * part.speed_m_s) for part in differences]
@@ -736,8 +702,3 @@ def _as_stated(
         deviance += float(np.sum(2 * np.log(scale * expected_m) + 1))
         sd_m.append(scale * sigma)
     return deviance, NoiseShape(tuple(sd_m), 0.0)
-
-
-def _sd_ratio(shape: NoiseShape) -> float:
-    """Ratio of the standard deviations of the noisiest and the quietest points, in the trial where it is largest."""
-    return max(float(np.quantile(sd, 0.95) / np.quantile(sd, 0.05)) for sd in shape.sd_m)

@@ -24,8 +24,6 @@ from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures
 # Least share of all change that one front explains where nothing else of weight moves (chosen)
 LEAST_FRONT_SHARE = 0.45
 MOST_TURN_DEG = 8.0  # Largest angle by which a given axis is turned onto the motion (chosen)
-# Fractions of a recording, from its start, that may be orderly where the whole is not (chosen)
-BEGINNINGS = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 
 @dataclass(frozen=True)
@@ -85,11 +83,6 @@ class Axis:
         start = np.asarray(self.from_px, dtype=float)
         return start + along[..., None] * self.direction + across[..., None] * self.normal
 
-    def moved(self, dx_px: float, dy_px: float) -> Axis:
-        """Shift the axis into a picture whose origin is elsewhere."""
-        a, b = self.from_px, self.to_px
-        return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
-
 
 def find_axis(small: SmallPictures, grows: bool = True) -> Axis:
     """Find the growth axis from the motion."""
@@ -110,9 +103,14 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
     """The line of the beginning of a recording that collects most change in order; else that of the whole."""
     best = whole
     use_lasting = grows and small.grown is not small.changed
-    for fraction in BEGINNINGS:
+    # Fractions of a recording, from its start, that may be orderly where the whole is not (chosen)
+    for fraction in (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):
         count = max(3, int(fraction * len(small.frames)))
-        pixels = _pixels_until(fraction, small.grown) if use_lasting else changed_pixels(small.frames, count)
+        pixels = small.grown if use_lasting else changed_pixels(small.frames, count)
+        if use_lasting:  # those that change within this fraction
+            x, y, time, weight, n_times = pixels
+            early = time < fraction * n_times
+            pixels = x[early], y[early], time[early], weight[early], n_times
         line = _line_through(small, pixels, early_first=True)
         in_order = line.front_share * line.collected
         if line.front_share >= LEAST_FRONT_SHARE and (
@@ -152,7 +150,9 @@ def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
     keep their places along the axis: only the position across is corrected, by up to half of `given.width_px` and
     MOST_TURN_DEG. Of several bodies within the width, the one that collects more change and lies nearer is taken.
     """
-    scaled, factor = _in_small_pictures(given, small.factor), small.factor
+    factor = small.factor
+    start, stop = (((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5) for x, y in (given.from_px, given.to_px))
+    scaled = Axis(start, stop, given.width_px / factor)
     x, y, time, weight, n_times = small.changed
     reach = max(0.5 * scaled.width_px, 3.0)
     from_start = np.column_stack([x, y]) - scaled.from_px
@@ -169,10 +169,9 @@ def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
     slope = float(turned @ scaled.normal) / max(float(turned @ scaled.direction), 0.5)
     middle = line.middle - scaled.from_px
     shift = float(middle @ scaled.normal - slope * (middle @ scaled.direction)) * factor
-    start = given.points(np.array(0.0), shift)
-    stop = given.points(np.array(given.length_px), shift + slope * given.length_px)
-    ends = (float(start[0]), float(start[1])), (float(stop[0]), float(stop[1]))
-    return Axis(*ends, 2 * line.half * factor)
+    along = np.array([0.0, given.length_px])
+    start, stop = ((float(x), float(y)) for x, y in given.points(along, shift + slope * along))
+    return Axis(start, stop, 2 * line.half * factor)
 
 
 @dataclass(frozen=True)
@@ -188,20 +187,6 @@ class _Line:
 
 
 _NO_LINE = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
-
-
-def _in_small_pictures(axis: Axis, factor: float) -> Axis:
-    """The axis in pictures that are smaller by a factor."""
-    (a, b), (c, d) = axis.from_px, axis.to_px
-    ends = [((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5) for x, y in ((a, b), (c, d))]
-    return Axis(ends[0], ends[1], axis.width_px / factor)
-
-
-def _pixels_until(fraction: float, pixels: Pixels) -> Pixels:
-    """Those pixels that change within a fraction of the recording, from its start."""
-    x, y, time, weight, n_times = pixels
-    early = time < fraction * n_times
-    return x[early], y[early], time[early], weight[early], n_times
 
 
 def _line_through(small: SmallPictures, changed: Pixels, early_first: bool = False, insist: bool = False) -> _Line:
@@ -327,13 +312,8 @@ def _refine_once(
     half = float(np.quantile(np.abs(lateral - shift), 0.95)) + 0.5
     along = (points - centre) @ principal
     ends = float(np.quantile(along, 0.002)), float(np.quantile(along, 0.998))
-    return (
-        float(np.arctan2(principal[1], principal[0])),
-        centre + shift * side,
-        half,
-        ends,
-        float(on_front_weight.sum()),
-    )
+    direction = float(np.arctan2(principal[1], principal[0]))
+    return direction, centre + shift * side, half, ends, float(on_front_weight.sum())
 
 
 def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
@@ -355,8 +335,6 @@ def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
 # ------------------------------------------------------------------------------
 # Whether the growth axes of recordings agree: vines filmed by one camera grow along one line of its picture.
 
-FEWEST_ALIKE = 3  # Fewest recordings whose axes agree from which the others are judged (chosen)
-
 
 def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) -> float:
     """Direction of an axis in the picture, degrees from +x towards +y; NaN for a curve, which agrees with no line."""
@@ -365,7 +343,7 @@ def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) 
 
 def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
     """Recordings whose axis differs from that of most others, where most agree. Returns their names, and how many
-    recordings agree; no names where fewer than FEWEST_ALIKE agree, or not most.
+    recordings agree; no names where fewer than three agree, or not most.
     """
     # Angle between a recording's axis and that of most others above which the recording is named (chosen)
     askew_deg = 10.0
@@ -374,7 +352,8 @@ def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
     common = straight[int(np.argmax(agreeing))] if straight else 0.0
     names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, common) < askew_deg]
     agreed = len(slopes_deg) - len(names)
-    return (names, agreed) if FEWEST_ALIKE <= agreed > len(names) else ([], agreed)
+    # 3: fewest recordings whose axes agree from which the others are judged (chosen)
+    return (names, agreed) if 3 <= agreed > len(names) else ([], agreed)
 
 
 def askew_trials(slopes_deg: Mapping[str, float], trials: Iterable[Trial]) -> list[tuple[list[str], int]]:

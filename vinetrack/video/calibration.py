@@ -8,9 +8,10 @@ is one number for a whole recording, common to all its points, and kept apart fr
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,6 @@ Grey = NDArray[np.uint8]
 FEWEST_CORNERS = 8  # Fewest corners of a calibration (chosen)
 # Distance, in squares, from where the board has it beyond which a marker belongs to another board (chosen)
 MARKER_OUTLIER = 0.3
-# Relative difference from `marker_mm` above which markers were printed at another size (chosen)
-MARKER_TOLERANCE = 0.10
 DICTIONARY_SIZES = (50, 100, 250, 1000)  # Words in OpenCV's dictionaries of each marker size (defined)
 OTHER_DICTIONARIES = (*(f"DICT_{n}X{n}" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
 
@@ -44,18 +43,15 @@ class CornersError(ValueError):
 
 
 def eight_bits(picture: NDArray[Any]) -> Grey:
-    """Stretch grey levels, shape (height, width), so that 0.5 % of the pixels are black and 0.5 % white. Shapes:
-    picture (height, width) → (height, width).
-    """
+    """Stretch grey levels, shape (height, width), so that 0.5 % of the pixels are black and 0.5 % white."""
     low, high = np.percentile(picture, [0.5, 99.5])
     stretched = (picture.astype(np.float32) - low) * (255 / max(float(high - low), 1.0))
     return stretched.clip(0, 255).astype(np.uint8)
 
 
 def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floats]:
-    """Find the corners of a ChArUco board in the picture (px) and on the board (m). Boards printed by OpenCV before 4.6
-    (markers in the other squares where the rows are even) are recognised too. Returns corners in the picture (px) and
-    on the board (m), both of shape (n, 2). Shapes: picture (height, width).
+    """Find the corners of a ChArUco board in the picture (px) and on the board (m), both of shape (n, 2). Boards
+    printed by OpenCV before 4.6 (markers in the other squares where the rows are even) are recognised too.
     """
     import cv2
 
@@ -72,7 +68,8 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
             f"the markers do not lie as on a board of {board.squares[0]} × {board.squares[1]} squares "
             f"({len(ids)} markers, {share:.0%} in place); count the squares across and down and correct `squares`"
         )
-    if abs(marker_mm / board.marker_mm - 1) > MARKER_TOLERANCE:
+    # 0.10: relative difference above which markers were printed at another size (chosen)
+    if abs(marker_mm / board.marker_mm - 1) > 0.10:
         raise CornersError(
             f"the markers measure {marker_mm:.3g} mm beside squares of {board.square_mm:g} mm, not "
             f"{board.marker_mm:g}; measure both on the print and correct `square_mm` or `marker_mm`"
@@ -87,8 +84,8 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
 
 
 def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Floats, Floats]:
-    """Find the inner corners of a checkerboard, all of which must be in the picture (px), and on the board (m). Returns
-    corners in the picture (px) and on the board (m), both of shape (n, 2). Shapes: picture (height, width).
+    """Find the inner corners of a checkerboard in the picture (px), all of which must be there, and on the board (m),
+    both of shape (n, 2).
     """
     grey = eight_bits(picture)
     across, down = board.squares
@@ -103,8 +100,8 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
-    """Count the squares across and down of the checkerboard in a picture, as far as visible; None where there is none.
-    Returns across, down; or None. Shapes: grey (height, width).
+    """Count the squares across and down of the checkerboard in a picture, as far as visible; None where there is
+    none.
     """
     import cv2
 
@@ -267,7 +264,6 @@ class BoardSeen:
     squares: tuple[int, int]
     dictionary: str = ""
     marker_share: float = float("nan")
-    n_markers: int = 0
 
 
 def find_board(picture: NDArray[Any]) -> BoardSeen | None:
@@ -276,36 +272,29 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     seen = [(*_detect_markers(grey, _dictionary(_largest(family))), family) for family in OTHER_DICTIONARIES]
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
     # 6: fewest markers that distinguish a board from chance (chosen)
-    if len(ids) >= 6:
-        board = _charuco(corners, ids, family)
-        if board is not None:
-            return board
+    board = _charuco(corners, ids, family) if len(ids) >= 6 else None
+    if board is not None:
+        return board
     squares = checkerboard_squares(grey)
     return None if squares is None else BoardSeen("checkerboard", squares)
 
 
 def _charuco(corners: Any, ids: NDArray[np.int32], family: str) -> BoardSeen | None:
     """The layout on which most markers lie in place; None where no layout has enough of them."""
-    best_share, best_board = 0.0, None
-    for squares in _layouts(int(ids.max()) + 1):
+    best_share, best_board, n_markers = 0.0, None, int(ids.max()) + 1
+    # Squares across and down, at most 40, of the boards with this many markers, of which two may be hidden (chosen)
+    for across, down in itertools.product(range(2, 41), repeat=2):
+        squares = across, down
+        if not n_markers <= across * down // 2 <= n_markers + 2:
+            continue
         # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
         board = Charuco(kind="charuco", image="", squares=squares, square_mm=1.0, marker_mm=0.7, dictionary=family)
         share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
-            dictionary = _smallest(family, squares[0] * squares[1] // 2)
-            best_share, best_board = share, BoardSeen("charuco", squares, dictionary, marker, len(ids))
+            dictionary = _smallest(family, across * down // 2)
+            best_share, best_board = share, BoardSeen("charuco", squares, dictionary, marker)
     # 0.8: least share of the markers that must lie where a board has them (chosen)
     return best_board if best_share >= 0.8 else None
-
-
-def _layouts(n_markers: int) -> Iterator[tuple[int, int]]:
-    """Squares across and down of the boards with this many markers, or a few more."""
-    most_squares = 40  # Most squares along a side (chosen)
-    for across in range(2, most_squares + 1):
-        for down in range(2, most_squares + 1):
-            # 2: markers at the end of a board that may be hidden (chosen)
-            if n_markers <= across * down // 2 <= n_markers + 2:
-                yield across, down
 
 
 def _largest(family: str) -> str:
@@ -332,9 +321,8 @@ def _smallest(family: str, n_markers: int) -> str:
 # determine, so that a small target neither fails nor claims too much: the covariance of the fit includes the
 # remaining uncertainty.
 
-PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)  # Prior standard deviations of the two perspective terms (chosen)
-
-
+# Prior standard deviations of the two perspective terms, and of the two of a lens (chosen)
+PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)
 N_PLANE, N_LENS = 8, 2  # Parameters of a plane and of a lens (derived)
 
 
@@ -357,23 +345,9 @@ class PlaneMap:
         parameters = np.array([step_m, 0, 0, 0, step_m, 0, 0, 0, 0, 0], dtype=float)
         return cls(width_px, height_px, parameters, np.zeros((N_PLANE + N_LENS, N_PLANE + N_LENS)))
 
-    @property
-    def distortion(self) -> tuple[float, float]:
-        """κ₁ and κ₂: relative outward shifts at the picture's corners, times the second and fourth power of q."""
-        return float(self.parameters[8]), float(self.parameters[9])
-
     def plane_m(self, picture_px: Floats) -> Floats:
         """Map points of the picture to the plane. Shapes: picture_px (..., 2) → (..., 2)."""
         return self._plane_m(self.parameters, np.asarray(picture_px, dtype=float))
-
-    def length_m(self, from_px: Floats | Sequence[float], to_px: Floats | Sequence[float]) -> float:
-        """Return the distance in the plane between two points of the picture."""
-        ends = self.plane_m(np.array([from_px, to_px], dtype=float))
-        return float(np.linalg.norm(ends[1] - ends[0]))
-
-    def length_rel_sigma(self, from_px: Floats | Sequence[float], to_px: Floats | Sequence[float]) -> float:
-        """Return the relative standard error of the distance in the plane between two points, from the covariance."""
-        return self.path_rel_sigma(np.array([from_px, to_px], dtype=float))
 
     def path_rel_sigma(self, places_px: Floats) -> float:
         """Return the relative standard error of the length of a path in the plane, from the covariance. Shapes:
@@ -397,22 +371,6 @@ class PlaneMap:
         return np.asarray(projected[..., :2] / projected[..., 2:])
 
 
-@dataclass(frozen=True)
-class PlaneFit:
-    """Plane maps of several views with a common lens, and the reprojection residuals. `residual_px` holds an array of
-    shape (n, 2) per view; `noise_px` is the standard deviation per coordinate.
-    """
-
-    maps: tuple[PlaneMap, ...]
-    residual_px: tuple[Floats, ...]
-    noise_px: float
-
-    @property
-    def reprojection_px(self) -> float:
-        """Root mean square reprojection error, px."""
-        return float(np.sqrt(np.mean(np.concatenate([(view**2).sum(axis=1) for view in self.residual_px]))))
-
-
 def _length(path_m: Floats) -> float:
     """Length of a path through places of the plane, shape (n, 2), m."""
     return float(sum(np.linalg.norm(step) for step in np.diff(path_m, axis=0)))
@@ -423,8 +381,10 @@ def _half_diagonal_px(width_px: int, height_px: int) -> float:
     return 0.5 * float(np.hypot(width_px, height_px))
 
 
-def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px: int) -> PlaneFit:
-    """Fit a plane to each view and a common lens. Shapes: views (n, 2)."""
+def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px: int) -> tuple[list[PlaneMap], float]:
+    """Fit a plane to each view and a common lens; also return the root mean square reprojection error, px. Shapes:
+    views (n, 2).
+    """
     from scipy.optimize import least_squares
 
     size = (width_px, height_px)
@@ -452,7 +412,7 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
         metres = np.array([reach_m] * 6 + [1.0] * 4)
         part = covariance[np.ix_(index, index)] * np.outer(metres, metres)
         maps.append(PlaneMap(width_px, height_px, values[index] * metres, part))
-    return PlaneFit(tuple(maps), tuple(view * unit_px for view in residuals), noise_px)
+    return maps, float(np.sqrt(np.mean(np.concatenate([((view * unit_px) ** 2).sum(axis=1) for view in residuals]))))
 
 
 def _half_diagonals(picture_px: Floats, size: tuple[int, int]) -> Floats:
@@ -474,11 +434,6 @@ def _undistorted(distorted: Floats, lens: Floats) -> Floats:
     )
 
 
-def _distorted(ideal: Floats, lens: Floats) -> Floats:
-    radius2 = (ideal**2).sum(axis=-1, keepdims=True)
-    return np.asarray(ideal * (1 + lens[0] * radius2 + lens[1] * radius2**2))
-
-
 def _first_homography(picture: Floats, board: Floats) -> Floats:
     """Homography from half-diagonals to the board by the direct linear transform; first eight entries, shape (8,)."""
     homogeneous = np.column_stack([picture, np.ones(len(picture))])
@@ -498,7 +453,9 @@ def _residuals(values: Floats, corners: list[Floats], boards: list[Floats]) -> l
     for k, (corner, board) in enumerate(zip(corners, boards, strict=True)):
         homography = np.append(values[k * N_PLANE : (k + 1) * N_PLANE], 1.0).reshape(3, 3)
         projected = np.column_stack([board, np.ones(len(board))]) @ np.linalg.inv(homography).T
-        residuals.append(corner - _distorted(projected[:, :2] / projected[:, 2:], lens))
+        ideal = projected[:, :2] / projected[:, 2:]
+        radius2 = (ideal**2).sum(axis=-1, keepdims=True)
+        residuals.append(corner - ideal * (1 + lens[0] * radius2 + lens[1] * radius2**2))
     return residuals
 
 
@@ -513,11 +470,6 @@ def _misfit(values: Floats, corners: list[Floats], boards: list[Floats], noise: 
 
 
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
-
-MOST_PICTURES_READ = 10  # Most pictures of a clip that are read (chosen)
-
-# First frames of a recording in which a target is looked for, while nothing hides it yet (chosen)
-SEARCHED_FRAMES = 300
 
 
 class CalibrationError(RecordingError):
@@ -562,22 +514,18 @@ class PlaneCalibration:
         """Relative standard error of `m_per_px`; NaN where unknown."""
         return self.along(*self._middle_line()).scale_rel_sigma
 
-    def plane_m(self, picture_px: Floats) -> Floats:
-        """Map points of the picture to the plane of growth. Shapes: picture_px (..., 2) → (..., 2)."""
-        return self.plane.plane_m(picture_px)
-
     def along(self, from_px: Sequence[float], to_px: Sequence[float]) -> AxisScale:
         """Return scale and position along an axis of the picture. Shape (n, 2)."""
-        start_px, end_px = np.asarray(from_px, dtype=float), np.asarray(to_px, dtype=float)
-        start_m, end_m = self.plane.plane_m(np.stack([start_px, end_px]))
+        ends_px = np.array([from_px, to_px], dtype=float)
+        start_m, end_m = self.plane.plane_m(ends_px)
         length_m = float(np.linalg.norm(end_m - start_m))
         direction = (end_m - start_m) / length_m
 
         def position_m(picture_px: Floats) -> Floats:
             return np.asarray((self.plane.plane_m(picture_px) - start_m) @ direction)
 
-        m_per_px = length_m / float(np.linalg.norm(end_px - start_px))
-        rel_sigma = math.hypot(self.plane.length_rel_sigma(start_px, end_px), self.own_rel_sigma)
+        m_per_px = length_m / float(np.linalg.norm(ends_px[1] - ends_px[0]))
+        rel_sigma = math.hypot(self.plane.path_rel_sigma(ends_px), self.own_rel_sigma)
         return AxisScale(m_per_px, rel_sigma, position_m)
 
     def along_path(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
@@ -606,12 +554,20 @@ class PlaneCalibration:
 
 def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int) -> PlaneCalibration:
     """Calibrate recordings of `width_px` × `height_px` as the experiment's settings say."""
+    whole = 0.0, 0.0, width_px - 1.0, height_px - 1.0
     if isinstance(settings, MmPerPx):
         plane = PlaneMap.from_scale(settings.mm_per_px / 1000, width_px, height_px)
         note = "the scale is the one given as mm_per_px; nothing is known of its error, nor of distortion and tilt"
-        return PlaneCalibration("mm_per_px", plane, math.nan, 0, 0, math.nan, _whole_picture(plane), (note,))
-    if isinstance(settings, TwoPoints):
-        return _from_two_points(settings, width_px, height_px)
+        return PlaneCalibration("mm_per_px", plane, math.nan, 0, 0, math.nan, whole, (note,))
+    if isinstance(settings, TwoPoints):  # each point errs by CLICK_SIGMA_PX along the line
+        distance_px = math.dist(settings.from_px, settings.to_px)
+        plane = PlaneMap.from_scale(settings.length_mm / 1000 / distance_px, width_px, height_px)
+        note = (
+            f"the scale rests on two points {distance_px:.0f} px apart, each good to {CLICK_SIGMA_PX} px, "
+            "and on nothing else"
+        )
+        rel_sigma = math.sqrt(2) * CLICK_SIGMA_PX / distance_px
+        return PlaneCalibration("two_points", plane, math.nan, 2, 1, rel_sigma, whole, (note,))
     pictures = _target_pictures(folder / settings.image, settings.image)
     sizes_seen = {(picture.shape[1], picture.shape[0]) for picture in pictures}
     if sizes_seen != {(width_px, height_px)}:
@@ -628,8 +584,6 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     target are averaged. Of a target that is moved every picture gets its own plane but all share the lens, and the
     first readable one shows the plane of growth. Shapes: pictures (height, width).
     """
-    # Root mean square distance of the corners from the model above which the board is another one (chosen)
-    largest_reprojection_px = 2.0
     views, complaints = [], []
     read = charuco_corners if isinstance(board, Charuco) else checkerboard_corners
     for picture in pictures:
@@ -648,10 +602,11 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
         notes.append(
             f"{board.image}: the target moves by {moved_px:.1f} px; its first picture is taken for the plane of growth"
         )
-    fit = fit_planes([_median_corners(views)] if stationary else views, width, height)
-    if fit.reprojection_px > largest_reprojection_px:
+    maps, reprojection_px = fit_planes([_median_corners(views)] if stationary else views, width, height)
+    # 2.0: distance of the corners from the model above which the board is another one (chosen)
+    if reprojection_px > 2.0:
         raise CalibrationError(
-            f"corners lie {fit.reprojection_px:.1f} px from where a flat board of {board.squares[0]} × "
+            f"corners lie {reprojection_px:.1f} px from where a flat board of {board.squares[0]} × "
             f"{board.squares[1]} squares has them",
             "check `squares`, and that the board is flat",
             board.image,
@@ -662,43 +617,23 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     bias_rel = 0.05 * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
     covered = (*corners_px.min(axis=0), *corners_px.max(axis=0))
     return PlaneCalibration(
-        board.kind, fit.maps[0], fit.reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
+        board.kind, maps[0], reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
     )
 
 
-def _whole_picture(plane: PlaneMap) -> tuple[float, float, float, float]:
-    return 0.0, 0.0, plane.width_px - 1.0, plane.height_px - 1.0
-
-
 def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
-    """Up to MOST_PICTURES_READ grey pictures, spread over the first SEARCHED_FRAMES frames of a recording."""
+    """Up to ten grey pictures, spread over the first 300 frames of a recording, while nothing hides the target yet."""
+    most_pictures, searched_frames = 10, 300  # chosen
     try:
         recording = inspect_recording(path)
-        declared = recording.declared_frames or SEARCHED_FRAMES
-        every = max(1, min(declared, SEARCHED_FRAMES) // MOST_PICTURES_READ)
-        pictures = []
-        for count, frame in enumerate(iterate_frames(recording)):
-            if count % every == 0:
-                pictures.append(frame)
-            if len(pictures) == MOST_PICTURES_READ or count >= SEARCHED_FRAMES:
-                break
+        every = max(1, min(recording.declared_frames or searched_frames, searched_frames) // most_pictures)
+        frames = itertools.islice(iterate_frames(recording), 0, searched_frames + 1, every)
+        pictures = list(itertools.islice(frames, most_pictures))
     except RecordingError as error:
         raise CalibrationError(error.what, error.remedy) from error
     if not pictures:
         raise CalibrationError(f"{name} holds no picture that can be read", "copy it from the camera again")
     return pictures
-
-
-def _from_two_points(settings: TwoPoints, width_px: int, height_px: int) -> PlaneCalibration:
-    """Scale from two points and the length between them; each point errs by CLICK_SIGMA_PX along the line."""
-    distance_px = math.dist(settings.from_px, settings.to_px)
-    plane = PlaneMap.from_scale(settings.length_mm / 1000 / distance_px, width_px, height_px)
-    rel_sigma = math.sqrt(2) * CLICK_SIGMA_PX / distance_px
-    note = (
-        f"the scale rests on two points {distance_px:.0f} px apart, each good to {CLICK_SIGMA_PX} px, "
-        "and on nothing else"
-    )
-    return PlaneCalibration("two_points", plane, math.nan, 2, 1, rel_sigma, _whole_picture(plane), (note,))
 
 
 def _corners_by_place(view: tuple[Floats, Floats]) -> dict[tuple[float, float], Floats]:
@@ -742,10 +677,6 @@ def _coverage_note(corners_px: Floats, width: int, height: int, name: str) -> li
 # ------------------------------------------------------------------------------
 # Apply corrections by hand to a track: points moved, dropped or confirmed, each flagged `corrected`.
 
-# Flags that no longer hold once a person has placed or confirmed a point
-SETTLED_FLAGS = frozenset({"doubtful", "lost", "rejected", "after_end"})
-PAST_TENSE = {"move": "moved", "drop": "dropped", "confirm": "confirmed"}
-
 
 def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
     """Move, drop or confirm points of a track. A moved point has the error of a click; a dropped one is `rejected`; a
@@ -756,6 +687,8 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
     edge, sigma = track.edge_px.copy(), track.lead_position_sigma_m.copy()
     slow = None if track.lead_position_systematic_m is None else track.lead_position_systematic_m.copy()
     flag = track.flag.astype("<U80")
+    settled = {"doubtful", "lost", "rejected", "after_end"}  # once a person has placed or confirmed a point
+    past_tense = {"move": "moved", "drop": "dropped", "confirm": "confirmed"}
     counts: Counter[str] = Counter()
     notes = []
     for point in corrections:
@@ -765,7 +698,7 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
         if point.action == "confirm" and not math.isfinite(edge[point.frame]):
             notes.append(f"frame {point.frame} has no edge to be confirmed; move it to where the edge is")
             continue
-        flags = [part for part in str(flag[point.frame]).split(";") if part not in SETTLED_FLAGS]
+        flags = [part for part in str(flag[point.frame]).split(";") if part not in settled]
         if point.action == "move":
             edge[point.frame], sigma[point.frame] = point.edge_px, CLICK_SIGMA_PX
             if slow is not None:
@@ -774,7 +707,7 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
             edge[point.frame] = sigma[point.frame] = math.nan
             flags.append("rejected")
         flag[point.frame] = join_flags(*flags, "corrected")
-        counts[PAST_TENSE[point.action]] += 1
+        counts[past_tense[point.action]] += 1
     if counts:
         parts = ", ".join(f"{count} {words}" for words, count in counts.items())
         notes.append(f"points corrected by hand: {parts}")

@@ -148,11 +148,6 @@ class CurvedAxis(Axis):
         unit, offset = self.direction_at(along), points - self.points(along)
         return along, unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
 
-    def moved(self, dx_px: float, dy_px: float) -> CurvedAxis:
-        """Shift the curve into a picture whose origin is elsewhere."""
-        through = [(x + dx_px, y + dy_px) for x, y in self.through_px]
-        return CurvedAxis(through[0], through[-1], self.width_px, tuple(through[1:-1]))
-
 
 def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float = float("nan")) -> Axis:
     """Lay the growth axis through points: a straight line through two, a smooth curve through more."""
@@ -204,46 +199,22 @@ STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found
 CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
 
 
-def path_error_px(axis: Axis) -> float:
-    """Return the slow error of positions along an axis that comes from its curvature."""
-    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
-    return 0.04 * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
-
-
-def curve_note(axis: CurvedAxis) -> str:
-    """Say that the growth axis was found to be a curve."""
-    return (
-        f"the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those along a curve that"
-        " was found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
-    )
-
-
-def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
-    """Refuse a curve that leaves the picture or bends more sharply than its strip is wide."""
-    complaint = curve_problem(axis, half_px, (shape[1], shape[0]))
-    if complaint is not None:
-        raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
-
-
 def outline_stretches(axis: Axis) -> int:
     """Number of stretches in which the sides of a tube are found."""
     return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
 
 
 def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
-    """Move a curve onto the middle of the tube, and measure how far that lies from it. Returns curve, with the tube's
-    width; the given one where the tube's middle makes none that a strip can be cut along., distance.
+    """Move a curve onto the middle of the tube, and measure how far that lies from it. Returns the curve, with the
+    tube's width, or the given one where the tube's middle makes none that a strip can be cut along; and the distance.
     """
     # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
     offsets = _local_lines(sides.places_px, sides.middles_px, knots)
     through = axis.points(knots, offsets)
-    separate = [
-        0,
-        *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > SMALLEST_POINT_SPACING_PX),
-    ]
+    separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
     try:
-        curve = axis_through(through[separate], 2 * sides.half_px)
+        curve = axis_through(through[np.append(True, separate)], 2 * sides.half_px)
     except RecordingError:
         return axis, 0.0
     if not isinstance(curve, CurvedAxis) or sides.half_px > curve.largest_half_px:
@@ -273,34 +244,28 @@ def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
 # that changed first to the end that changed last, is the path. The curve is used only where its front share is far
 # larger than that of the best straight line.
 
-# Ratio of the front share of a curve to that of the straight line from which the curve is used (measured)
-CURVE_GAIN = 1.35
-# A curve is also used where the straight line needs a band this many times wider and the curve explains at least
-# EQUAL_SHARE of what the line does (measured)
-BAND_RATIO, EQUAL_SHARE = 1.25, 0.98
-
 
 def find_growth_axis(small: SmallPictures) -> Axis:
     """Find the growth axis from the motion: a straight line, or a curve where that explains far more of the change."""
+    straight: Axis | RecordingError
     try:
-        straight: Axis | None = find_axis(small)
-        line_error = None
+        straight = find_axis(small)
     except RecordingError as error:
-        straight, line_error = None, error
+        straight = error
     band = _changed_band(small)
-    line_share = 0.0 if straight is None else front_share_of_picture(small, straight)
-    line_too_wide = (
-        straight is not None and band is not None and straight.width_px > BAND_RATIO * band.width * small.factor
-    )
+    line_share = front_share_of_picture(small, straight) if isinstance(straight, Axis) else 0.0
+    # 1.25, 0.98, 1.35: a curve is used where the straight line needs a band this many times wider and the curve
+    # explains at least this part of what the line does, else where it explains this many times as much (measured)
+    line_too_wide = isinstance(straight, Axis) and band and straight.width_px > 1.25 * band.width * small.factor
+    gain = 0.98 if line_too_wide else 1.35
     # No curve can explain more than all of the change: along a straight vine none is searched.
-    curve = find_curve(small, band) if line_too_wide or line_share * CURVE_GAIN < 1 else None
+    curve = find_curve(small, band) if line_too_wide or line_share * gain < 1 else None
     if curve is not None:
-        needed = max(LEAST_FRONT_SHARE, line_share * (EQUAL_SHARE if line_too_wide else CURVE_GAIN))
+        needed = max(LEAST_FRONT_SHARE, line_share * gain)
         if front_share_of_picture(small, curve) >= needed and front_share(small, curve) >= LEAST_FRONT_SHARE:
             return curve
-    if straight is None:
-        assert line_error is not None
-        raise line_error
+    if isinstance(straight, RecordingError):
+        raise straight
     return straight
 
 

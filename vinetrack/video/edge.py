@@ -53,16 +53,12 @@ from vinetrack.video.strip import SLOW_PX, Positions, Strip
 # The fit of every frame is compared with the motion; where it breaks it, the edge is searched again where the motion
 # leads. The edge is also fitted in bands of rows, each alone: their disagreement is an error that needs no model of
 # noise, since film, tail, glints and a swinging door touch one band and not another.
-
-# ------------------------------------------------------------------------------
-# Slow errors of an edge: errors that neighbouring frames share, which neither roughness nor averaging reveals.
 #
-# Where film or background differ by G grey levels from their estimated pictures, an edge of contrast C is misplaced
-# by about G/C pixels for as long as it passes that place. Wrinkles and light displace the bands of an edge
-# differently for some frames, and their mean with them. Near the start a door or a mouth may hide the tip as well,
-# and where a shaken camera was stabilised the slow part of the shake stays.
-
-GUESS_RANDOM_PART = math.sqrt(0.5)  # The same for an edge that is a guess, since a door or the mouth hides it (chosen)
+# Slow errors are those that neighbouring frames share, which neither roughness nor averaging reveals. Where film or
+# background differ by G grey levels from their estimated pictures, an edge of contrast C is misplaced by about G/C
+# pixels for as long as it passes that place. Wrinkles and light displace the bands of an edge differently for some
+# frames, and their mean with them. Near the start a door or a mouth may hide the tip as well, and where a shaken
+# camera was stabilised the slow part of the shake stays.
 
 
 def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats:
@@ -112,17 +108,17 @@ def noise_and_slow(bands_px: Floats, seen_px: Floats, apart_px: Floats) -> tuple
     between frames; slow ones are shared by neighbouring frames. Returns random and slow error, each of shape
     (n_frames,), px; their sum in quadrature is `apart_px`. Shapes: bands_px, seen_px, apart_px (n_frames,).
     """
-    start_random_part = 0.4  # Part of the error near the start that differs from frame to frame (measured)
+    # Part of the error near the start, and of an edge that is a guess, since a door or the mouth hides it, that differs
+    # from frame to frame (measured, chosen)
+    start_part, guess_part = 0.4, math.sqrt(0.5)
     near = np.sqrt(np.maximum(seen_px**2 - bands_px**2, 0.0))
     guess = np.sqrt(np.maximum(apart_px**2 - seen_px**2, 0.0))
-    noise = np.sqrt(bands_px**2 + (start_random_part * near) ** 2 + (GUESS_RANDOM_PART * guess) ** 2)
-    slow = np.hypot(math.sqrt(1 - start_random_part**2) * near, math.sqrt(1 - GUESS_RANDOM_PART**2) * guess)
+    noise = np.sqrt(bands_px**2 + (start_part * near) ** 2 + (guess_part * guess) ** 2)
+    slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
     return noise, slow
 
 
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
-# Ratio by which the misfit of a fit that agrees with its neighbours may exceed that of one that does not (chosen)
-CONSISTENT_MISFIT_RATIO = 1.4
 # Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
 LEAST_FITTED_AMPLITUDE = 0.5
 
@@ -157,12 +153,11 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
             if not math.isfinite(previous) or (inside and good_enough):
                 continue
             replacement = _best_between(strip, state, t, low, high, 1 if resting > long_rest_frames else 9)
+            is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
             if inside:
                 if replacement is not None and (faint or replacement[2] < out[t, 2]):
                     out[t] = replacement
-            elif not faint and _spans_missing_frames(edge[t] - previous, step) and _good_and_better(
-                out[t], replacement, bad_misfit
-            ):  # fmt: skip
+            elif not faint and _spans_missing_frames(edge[t] - previous, step) and is_better:
                 continue
             elif replacement is None:
                 expected = previous if math.isnan(edge[t]) else edge[t]
@@ -187,14 +182,10 @@ def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[
             continue
         reach = max(2.0, 0.3 * distance)
         replacement = _best_between(strip, state, int(t), expected - reach, expected + reach, 9)
-        if replacement is not None and replacement[2] < CONSISTENT_MISFIT_RATIO * out[t, 2]:
+        # 1.4: ratio by which the misfit of a fit that agrees with its neighbours may exceed the other (chosen)
+        if replacement is not None and replacement[2] < 1.4 * out[t, 2]:
             out[t] = replacement
     return out
-
-
-def _good_and_better(fit: Floats, other: Floats | None, bad_misfit: float) -> bool:
-    """Whether a fit is good, and better than another."""
-    return bool(fit[2] <= bad_misfit) and (other is None or bool(other[2] > fit[2]))
 
 
 def _spans_missing_frames(stride: float, step: float) -> bool:
@@ -222,19 +213,12 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
 
 BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
 
-# Deviation of a band, in median absolute deviations of the bands of its frame, at which it is clipped (chosen)
-OUTLYING_BAND = 2.0
-BAND_OFFSET_PX = 50.0  # Growth over which the lead or lag of a band is taken as its usual offset (chosen)
-
-MEDIAN_TO_MEAN = 1.27  # Ratio of mean to median of χ² with three degrees of freedom (derived)
-
 
 def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
-    """Error of the edge from the disagreement of its bands, and the part of it that neighbouring frames share. The
-    weighted mean of K independent bands has the variance Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by for
-    long in the `core` frames is the shape of the tip, not an error. Returns standard error, shape (n_frames,), px;
-    zeros where there is one band only, slow error of all frames, px; see `slow_errors.shared_disagreement`. Shapes:
-    edge, core (n_frames,).
+    """Error of the edge from the disagreement of its bands, (n_frames,), px, zeros where there is one band only; and
+    the slow part of it (`shared_disagreement`). The weighted mean of K independent bands has the variance
+    Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by for long in the `core` frames is the shape of the tip,
+    not an error.
     """
     neighbours = 2  # Frames on each side over which the median disagreement is taken (chosen)
     edges, sigmas = band_fits(strip, state, edge)
@@ -245,14 +229,16 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
     lead_px = lead_px - _band_offsets(lead_px, edge, np.flatnonzero(core))
     weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
     median_lead = np.median(lead_px, axis=1, keepdims=True)
-    limit = OUTLYING_BAND * np.median(np.abs(lead_px - median_lead), axis=1, keepdims=True) + 0.05
+    # 2.0: deviation of a band, in median absolute deviations of those of its frame, at which it is clipped (chosen)
+    limit = 2.0 * np.median(np.abs(lead_px - median_lead), axis=1, keepdims=True) + 0.05
     lead_px = median_lead + np.clip(lead_px - median_lead, -limit, limit)
     total = weight.sum(axis=1)
     mean = (weight * lead_px).sum(axis=1) / total
     variance = (weight * (lead_px - mean[:, None]) ** 2).sum(axis=1) / (lead_px.shape[1] - 1) / total
     padded = np.pad(variance, neighbours, mode="edge")
     running_median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * neighbours + 1), axis=1)
-    return np.asarray(np.sqrt(MEDIAN_TO_MEAN * running_median)), slow
+    # 1.27: ratio of mean to median of χ² with three degrees of freedom (derived)
+    return np.asarray(np.sqrt(1.27 * running_median)), slow
 
 
 # Part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
@@ -296,15 +282,15 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
 
 
 def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
-    """Median lead of each band over the core frames within BAND_OFFSET_PX, or the nearest few, (n_frames, n_bands)."""
-    # 7: fewest frames from which that offset is taken (chosen)
+    """Median lead of each band over the core frames nearby, (n_frames, n_bands)."""
+    # 7, 50.0: fewest frames from which that offset is taken, and the growth over which it is, px (chosen)
     fewest = min(7, len(core))
     # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
     places, frame_places = np.unique(np.rint(edge), return_inverse=True)
     out = np.empty((len(places), lead_px.shape[1]))
     for i, place in enumerate(places):
         distance = np.abs(edge[core] - place)
-        near = distance <= max(BAND_OFFSET_PX, float(np.partition(distance, fewest - 1)[fewest - 1]))
+        near = distance <= max(50.0, float(np.partition(distance, fewest - 1)[fewest - 1]))
         out[i] = np.median(lead_px[core[near]], axis=0)
     return out[frame_places]
 
@@ -320,43 +306,27 @@ def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floa
 # Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
 # edge is a guess (chosen)
 HIDDEN_MISFIT = 3.2
-# Misfit above which nothing of the tip is visible, whatever its contrast (chosen)
-COVERED_MISFIT = 1.12 * HIDDEN_MISFIT
 # Ratio of the misfit to the median above which a frame differs from those clear of the start (chosen)
 UNUSUAL_MISFIT_RATIO = 2.0
 # Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
-# visible, and below which part of it is hidden (chosen)
-LEAST_AMPLITUDE, REDUCED_AMPLITUDE = 0.6, 0.75
+# visible (chosen)
+LEAST_AMPLITUDE = 0.6
 # Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it
 GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
 
 # Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
-# Least ratio of the border to the largest step between neighbouring columns of film further on (measured)
-BORDER_TO_FILM = 2.0
 FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed and acceleration are estimated (chosen)
-# Ratio of a change of the step to the largest of the next four, above which the hidden frames do not belong to the
-# motion that follows (chosen)
-LEAP_RATIO = 3.0
-LEAST_LEAP_PX = ASTRAY_PX  # Smallest change of the step that is a leap (chosen)
 
 
-@dataclass(frozen=True)
-class Mouth:
-    """A launcher's mouth at the start. `before`, shape (n_frames,), marks the frames in which the edge stands at a
-    border that stays after the tip has gone.
+def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, bool]:
+    """Look for a launcher's mouth: a straight border that stays where the edge rested. Returns the frames in which the
+    edge stands there, (n_frames,), and whether the tip moved behind it.
     """
-
-    before: Bools
-    moved_behind: bool
-
-
-def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
-    """Look for a straight border that stays where the edge rested. Shapes: edge (n_frames,)."""
     fewest_rest_frames = 3  # Fewest frames of rest from which the resting place is known (chosen)
     film_range_px = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
     search_px = 3  # Distance from the resting place within which a border is looked for (chosen)
-    none = Mouth(np.zeros(len(edge), dtype=bool), False)
+    none = np.zeros(len(edge), dtype=bool), False
     first = int(np.flatnonzero(moving_frames(state.edge))[0])
     if first < fewest_rest_frames:
         return none
@@ -379,15 +349,15 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     film_step = float(np.abs(np.median(borders[:, film_columns - beside], axis=0)).max())
     contrast = np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))[later]
     straight = float(np.mean(np.sign(border) == np.sign(border_step)))
-    # 0.5: least ratio of the border to the film's contrast (measured)
-    least_step = max(BORDER_TO_FILM * film_step, 0.5 * float(np.median(contrast)))
+    # 2.0, 0.5: least ratio of the border to the largest step of film further on, and to its contrast (measured)
+    least_step = max(2.0 * film_step, 0.5 * float(np.median(contrast)))
     # 0.95: part of the rows that must show the border with the same sign (measured)
     if straight < 0.95 or abs(border_step) < least_step:
         return none
     clear_px = rest_px + 3 * state.blur + 1
     exit_frame = first + int(np.argmax(edge[first:] > clear_px))
     after_exit = edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT]
-    return Mouth(np.arange(len(edge)) < exit_frame, _moved_behind(after_exit, rest_px))
+    return np.arange(len(edge)) < exit_frame, _moved_behind(after_exit, rest_px)
 
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
@@ -422,7 +392,8 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     large, raised = misfit > HIDDEN_MISFIT, misfit > HIDDEN_MISFIT / 2
-    no_edge = (misfit > COVERED_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE)
+    # 1.12: ratio above which nothing of the tip is visible, whatever its contrast (chosen)
+    no_edge = (misfit > 1.12 * HIDDEN_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE)
     covered = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & no_edge
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
@@ -430,7 +401,8 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
         covered |= earlier & moving_frames(edge)
         added_px = np.where(earlier, np.hypot(added_px, ASTRAY_PX), added_px)
     unlike_model = large & (misfit_ratio > HIDDEN_MISFIT)
-    partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < REDUCED_AMPLITUDE)
+    # 0.75: amplitude below which part of the edge is hidden (chosen)
+    partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < 0.75)
     guessed = near & (unlike_model | partly_hidden)
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
 
@@ -484,7 +456,8 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
         later = bends[t + 1 : t + FRAMES_AFTER_EXIT]
         if len(later) < FRAMES_AFTER_EXIT - 1 or not later.sum() > speed_gain * steps[t + 1]:
             continue
-        if abs(bends[t]) <= max(LEAP_RATIO * np.abs(later).max(), LEAST_LEAP_PX):
+        # 3.0: ratio of a change of the step to the largest of the next four above which it is a leap (chosen)
+        if abs(bends[t]) <= max(3.0 * np.abs(later).max(), ASTRAY_PX):
             continue
         back = np.maximum(steps[t + 1] - max(float(later.mean()), 0.0) * np.arange(1, t + 2), 0.0)
         out[t::-1] = np.abs(edge[t::-1] - (edge[t + 1] - np.cumsum(back)))
@@ -501,9 +474,6 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
 # flown past by the end, or an object that stood in front at the start, has no vote, and the path starts up to three
 # frames late and ends up to three frames early, because several frames are averaged at either end. The path that
 # leaves the smaller residual sum is used.
-
-
-AVERAGED_FRAMES = 12  # Frames after and before the front over which film and background are averaged (derived)
 
 
 def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
@@ -545,10 +515,10 @@ def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> f
 
 
 def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:
-    """Average each pixel over the AVERAGED_FRAMES frames after (film) and before (background) the front passes it.
-    Shapes: path (n_frames,) → (2, n_across, n_columns).
+    """Average each pixel over the 12 frames (derived) after (film) and before (background) the front passes it. Shapes:
+    path (n_frames,) → (2, n_across, n_columns).
     """
-    return ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns, AVERAGED_FRAMES)
+    return ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns, 12)
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -591,18 +561,6 @@ def _run_up(path: Floats) -> Floats:
 
 
 START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
-# Added to the error near the start if a door crosses the whole strip before growth and the frames do not fit the model
-# (chosen)
-DOOR_ERROR_PX = 0.5
-# Factor on the disagreement of the bands when the fitted blur is at its upper bound (chosen)
-OUT_OF_FOCUS_FACTOR = 3.0
-# Frames in which the error of the start is at least this part of its full value count as near the start (derived)
-NEAR_START_WEIGHT = 0.1
-# Excess of the mean misfit ratio near the start at which the error of a door is added in full (chosen)
-FULL_DOOR_EXCESS = 0.7
-# Error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
-WIDTH_ERROR_PX = 1.0
-MIN_FRAME_WEIGHT = 0.05  # Weight of a frame identical to the one before it (chosen)
 
 
 def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions:
@@ -612,14 +570,16 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = initial_state(strip, path, exposure)
-    change = _frame_changes(strip)
+    # Mean absolute difference of each frame from the one before it
+    change = mean_changes(strip.values, 2) if len(strip.values) > 1 else np.ones(1)
+    change = np.concatenate([change[:1], change[: len(strip.values) - 1]])
     for iteration in range(3):
         before, path = path, _path_from_appearance(strip, state, passed, change)
         # 1.0: two paths are the same if they nowhere differ by more than this (derived)
         if iteration > 0 and np.abs(before - path).max() <= 1.0:
             break
         state = estimate_appearance(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
-    fit = _fit_frames(strip, state, informative_frames(state.edge))
+    fit = fit_edges(strip, state, informative_frames(state.edge))
     for iteration in range(3 * rounds):
         before = fit[:, 0]
         state = _update_state(strip, state, fit, exposure)
@@ -630,11 +590,11 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
         if iteration > 0:
             state = find_shading(strip, state, fit)
         steps = FIT_ROUNDS if iteration >= rounds - 1 else EARLY_FIT_ROUNDS
-        fit = repair_jumps(strip, state, _fit_frames(strip, state, informative, steps), informative)
+        fit = repair_jumps(strip, state, fit_edges(strip, state, informative, steps), informative)
         # 0.2: the iteration has converged once no edge of a moving frame changes by more than this (chosen)
         if iteration >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < 0.2:
             break
-    resting_fit = _fit_frames(strip, state, ~informative)
+    resting_fit = fit_edges(strip, state, ~informative)
     fit = repair_jumps(strip, state, np.where(informative[:, None], fit, resting_fit), np.ones(len(fit), dtype=bool))
     finished = _with_errors(strip, state, fit, exposure, passed)
     if not np.isfinite(exposure_frames):
@@ -655,11 +615,6 @@ def _unsure(fit: Floats, sigma_px: Floats, extra_px: Floats, hidden: Bools) -> B
     # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
     uncertain = (extra_px > 1.0) | (sigma_px > np.maximum(1.0, 5.0 * np.nanmedian(sigma_px)))
     return np.asarray(odd | uncertain | hidden)
-
-
-def _fit_frames(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT_ROUNDS) -> Floats:
-    """Fit the edge of the chosen frames; shape (n_frames, 6), NaN in the other frames."""
-    return fit_edges(strip, replace(state, edge=np.where(chosen, state.edge, np.nan)), rounds)
 
 
 @dataclass(frozen=True)
@@ -705,7 +660,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
     # 25.0, 0.15: contrast, in grey levels, below which the sides of a tube fade into the background (measured)
     faint = 0.15 * median_width if float(np.median(contrasts)) < 25.0 else 0.0
-    sigma = float(np.linalg.norm([width_error, WIDTH_ERROR_PX, faint]))
+    # 1.0: error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
+    sigma = float(np.linalg.norm([width_error, 1.0, faint]))
     return Outline(intercept, slope, median_width / 2 + 1.5, median_width, sigma, path, passed, place, centre)
 
 
@@ -757,21 +713,13 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
     return np.clip(path - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
 
-def _frame_changes(strip: Strip) -> Floats:
-    """Return the mean absolute difference of each frame from the one before it, shape (n_frames,)."""
-    change = np.zeros(len(strip.values))
-    change[1:] = mean_changes(strip.values, 2)
-    change[0] = change[1] if len(change) > 1 else 1.0
-    return change
-
-
 def _frame_weights(change: Floats, edge: Floats) -> NDArray[np.float32]:
-    """Weight each frame by how much it differs from the one before it, MIN_FRAME_WEIGHT to 1, shape (n_frames,). While
-    the tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
+    """Weight each frame by how much it differs from the one before it, 0.05 (chosen) to 1, shape (n_frames,). While the
+    tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
     """
     usual = float(np.median(change[moving_frames(edge)]))
     floor = float(np.quantile(change, 0.05))
-    return np.clip((change - floor) / max(usual - floor, 1e-6), MIN_FRAME_WEIGHT, 1.0).astype(np.float32)
+    return np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
 
 
 def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
@@ -804,18 +752,21 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     contrast[passed[1] :] = np.nan
     # 25.0: growth over which that error falls to 1/e (chosen)
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / 25.0)
-    near = (near_start > NEAR_START_WEIGHT) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
-    door_weight = float(np.clip((np.mean(misfit_ratio[near]) - 1) / FULL_DOOR_EXCESS, 0, 1)) if near.any() else 0.0
-    door = DOOR_ERROR_PX * disturbed_start(strip, state) * door_weight
+    near = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
+    # 0.5: error added if a door crosses the whole strip before growth, px, and in full from an excess of the mean
+    # misfit ratio near the start of 0.7 on (chosen)
+    door_weight = float(np.clip((np.mean(misfit_ratio[near]) - 1) / 0.7, 0, 1)) if near.any() else 0.0
+    door = 0.5 * disturbed_start(strip, state) * door_weight
     start_error = (START_ERROR_PX + door) * near_start
     bands, shared = band_disagreement(strip, state, edge_now, core)
     bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
-    visible_error = np.hypot(bands * (OUT_OF_FOCUS_FACTOR if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
+    # 3.0: factor on the disagreement of the bands when the fitted blur is at its upper bound (chosen)
+    visible_error = np.hypot(bands * (3.0 if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
     extra = hidden_errors(fit, misfit_ratio, edge_now, visible_error)
-    mouth = find_mouth(strip, state, edge_now)
-    extra = np.where(mouth.before, np.maximum(extra, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), extra)
+    in_mouth, moved_behind = find_mouth(strip, state, edge_now)
+    extra = np.where(in_mouth, np.maximum(extra, NO_EDGE_PX if moved_behind else GUESSED_PX), extra)
     # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
-    hidden = (door * near_start > START_ERROR_PX) | mouth.before
+    hidden = (door * near_start > START_ERROR_PX) | in_mouth
     extra = np.maximum(extra, leap_error_px(edge_now, hidden))
     bands, slow_bands = noise_and_slow(bands, visible_error, extra)
     slow = np.hypot(slow_bands, slow_error_px(edge_now, contrast, shared))

@@ -8,7 +8,6 @@ the fraction p(y − s) of the pixel at `s`; see `edge_cover`.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -21,18 +20,24 @@ from vinetrack.core.threads import in_parts
 # The fraction, called coverage, is tabulated at subpixel steps. Neighbouring columns lie a whole pixel apart, so that
 # a row of pixels reads every 1/TABLE_STEP_PX-th entry; the table is stored in that order, so that inner loops run
 # over neighbours in memory, without a branch.
+#
+# Functions that other compiled ones call are inlined: each caller would hold a copy of its own, with other last digits,
+# and the process that compiles them would run another one than those that load them.
 
 TABLE_STEP_PX = 0.05  # Spacing of the coverage table, px (derived)
 Z_STEP, Z_LAST = 0.02, 8.0  # Spacing and end of the table of the normal distribution (derived)
 MIN_MOTION_BLUR_PX = 0.02  # Shorter motion blurs are set to this length (derived)
 SUBPIXEL_STEPS = round(1 / TABLE_STEP_PX)  # Entries of the coverage table per pixel (derived)
-NO_REFCOUNT: dict[str, Any] = {"_nrt": False}  # Numba option for functions that allocate nothing (measured)
-_Z = np.arange(-Z_LAST, Z_LAST + 1.5 * Z_STEP, Z_STEP)
-_NORMAL = np.array([[0.5 * math.erfc(-z / math.sqrt(2)), math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)] for z in _Z])
+_NORMAL = np.array(
+    [
+        [0.5 * math.erfc(-z / math.sqrt(2)), math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)]
+        for z in np.arange(-Z_LAST, Z_LAST + 1.5 * Z_STEP, Z_STEP)
+    ]
+)
 FASTMATH = {"contract", "arcp", "nsz", "reassoc"}  # Floating-point freedom of the compiler (chosen)
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _normal(z: float) -> tuple[float, float]:
     """Interpolate Φ(z) and its integral zΦ(z) + φ(z) from the table."""
     if z <= -Z_LAST:
@@ -51,7 +56,7 @@ def _normal(z: float) -> tuple[float, float]:
     return a * low + b * low_slope + c * high - d * high_slope, a * low_sum + b * low + c * high_sum - d * high
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
     """Tabulate the coverage p and its slope dp/dx for one length of motion blur. Entry [j, k] is for x = middle − k + j
     TABLE_STEP_PX, with middle = ceil(half) + 1. p is the mean of the normal distribution function over a box of
@@ -77,13 +82,13 @@ def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
     return table
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_reach(length: float, blur: float) -> float:
     """Return the distance from an edge beyond which a pixel is fully covered or fully uncovered."""
     return 0.5 * length + 4 * blur + 0.5
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def subpixel_index(place: float) -> tuple[int, int, float, int]:
     """Split the position of an edge into indices of a coverage table. Returns whole part, px; entry j below the
     fraction; weight of entry j + 1; 1 if the position is a whole number, else 0.
@@ -132,22 +137,10 @@ def film_evidence(
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def fit_edges(
-    strip: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-    start: np.ndarray,
-    lengths: np.ndarray,
-    lag: np.ndarray,
-    blur: float,
-    appearance: np.ndarray,
-    inflation: np.ndarray,
-    prior_sd: float,
-    margin: float,
-    rounds: int,
-    shading: np.ndarray,
-    frames: np.ndarray,
-    rows: tuple[int, int],
-) -> np.ndarray:
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, start: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
+    blur: float, appearance: np.ndarray, inflation: np.ndarray, prior_sd: float, margin: float, rounds: int,
+    shading: np.ndarray, frames: np.ndarray, rows: tuple[int, int],
+) -> np.ndarray:  # fmt: skip
     """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6). Columns of
     the result: edge, its standard error from the Fisher information, mean squared weighted residual, amplitude − 1,
     level, number of pixels. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along); inflation
@@ -203,7 +196,8 @@ def fit_edges(
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+# _nrt: numba need not count references in a function that allocates nothing (measured).
+@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 def _normal_sums(
     picture: np.ndarray, rows: tuple[int, int], scale: np.float32, offset: np.float32, appearance: np.ndarray, y: float,
     lag: np.ndarray, half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray,
@@ -228,15 +222,9 @@ def _normal_sums(
         inflation = bin_inflation[k + on_grid : k + on_grid + m]
         values, film, background = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
         film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
-        f, fraction, first_bin = (
-            np.float32(table_fraction),
-            np.float32(row_edge - whole_px),
-            a - whole_px + (len(shading) - 1) // 2,
-        )
-        shade_before, shade_after = (
-            shading[first_bin - 1 : first_bin - 1 + m],
-            shading[first_bin : first_bin + m],
-        )
+        f, fraction = np.float32(table_fraction), np.float32(row_edge - whole_px)
+        first_bin = a - whole_px + (len(shading) - 1) // 2
+        shade_before, shade_after = shading[first_bin - 1 : first_bin - 1 + m], shading[first_bin : first_bin + m]
         for i in range(m):
             p = low[i] + f * (high[i] - low[i])
             slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
@@ -274,19 +262,9 @@ ROWS_PER_BLOCK = 8  # Rows processed together, so that their sums stay in the ca
 
 
 def gather(
-    strip: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-    edge: np.ndarray,
-    reach: np.ndarray,
-    lag: np.ndarray,
-    early: np.ndarray,
-    late: np.ndarray,
-    memory_frames: float,
-    appearance: np.ndarray,
-    clip: float,
-    shading: np.ndarray,
-) -> np.ndarray:
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, edge: np.ndarray, reach: np.ndarray, lag: np.ndarray,
+    early: np.ndarray, late: np.ndarray, memory_frames: float, appearance: np.ndarray, clip: float, shading: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Sum weight, value and its square over the frames in which a pixel is film, and in which it is background; shape
     (2, 3, n_across, n_along). It is film further than `reach` behind the edge, background as far ahead of it. The edge
     is over column s from frame `early[s]` to `late[s]`: the weight is exp(−frames / memory_frames), so that the frames
@@ -389,18 +367,9 @@ def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def residual_sums(
-    strip: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-    fit: np.ndarray,
-    lengths: np.ndarray,
-    lag: np.ndarray,
-    blur: float,
-    appearance: np.ndarray,
-    margin: float,
-    frames: np.ndarray,
-    shading: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fit: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
+    blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Sums over the pixels about the edge, with r the residual and w its weight, each frame by itself, so that frames
     may be shared among threads and no result depends on their number. Shapes: fit (n_frames, 6); frames (n_used,).
 
@@ -467,10 +436,8 @@ def residual_sums(
                     weighted_of[i] += part * weight[i] * residual[i]
                 for i in range(m):
                     weight_of[i] += part * weight[i]
-            numerators, denominators = (
-                column_sums[0, k + on_grid : k + on_grid + m],
-                column_sums[1, k + on_grid : k + on_grid + m],
-            )
+            bins_here = slice(k + on_grid, k + on_grid + m)
+            numerators, denominators = column_sums[0, bins_here], column_sums[1, bins_here]
             for i in range(m):
                 numerators[i] += weight[i] * (film[i] - background[i]) * residual[i]
             for i in range(m):

@@ -22,15 +22,11 @@ from vinetrack.video.strip import Strip
 MEMORY_FRAMES = 6.0
 # Standard deviation, grey levels, of a pixel about the mean of its neighbours, used where the pixel was never visible
 TEXTURE_SD = 12.0
-# Prior standard deviation of relative amplitude and level of the contrast in one frame (chosen)
-CONTRAST_PRIOR_SD = 0.15
 # Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
 FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
 MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
 FEWEST_FITS = 4  # Fewest fits, or frames summed over, for which another thread is used (chosen)
 SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
-# Part of the typical contrast below which film and background near the start are taken to be the same material (chosen)
-SAME_MATERIAL_CONTRAST = 0.4
 # Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
 
@@ -121,7 +117,8 @@ def _film_at_start(state: EdgeState, appearance: NDArray[np.float32]) -> NDArray
     later = (columns >= clear_of_start(state.edge)) & (columns < state.edge.max() - 5)
     if later.sum() < 10:
         return np.zeros(len(contrast), dtype=bool)
-    return near & (contrast < SAME_MATERIAL_CONTRAST * float(np.median(contrast[later])))
+    # 0.4: part of the typical contrast below which film and background are the same material (chosen)
+    return near & (contrast < 0.4 * float(np.median(contrast[later])))
 
 
 def _passage_frames(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
@@ -161,9 +158,14 @@ def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
     return good if good.sum() >= 5 else clear
 
 
-def fit_edges(strip: Strip, state: EdgeState, rounds: int = FIT_ROUNDS, rows: tuple[int, int] | None = None) -> Floats:
-    """Fit the edge of every frame by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 6)."""
-    frames = np.flatnonzero(np.isfinite(state.edge))
+def fit_edges(
+    strip: Strip, state: EdgeState, chosen: NDArray[np.bool_] | bool = True, rounds: int = FIT_ROUNDS,
+    rows: tuple[int, int] | None = None,
+) -> Floats:  # fmt: skip
+    """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 6), NaN
+    in the other frames.
+    """
+    frames = np.flatnonzero(np.isfinite(state.edge) & chosen)
     out = np.full((len(state.edge), 6), np.nan)
     out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds, rows)
     return out
@@ -176,13 +178,13 @@ def search_edges(
     """Fit the edge from each of several starts, in any frames; see `edge_kernels.fit_edges`. Shapes: frames, starts
     (n_searches,).
     """
+    contrast_prior_sd = 0.15  # Prior deviation of relative amplitude and level of the contrast in one frame (chosen)
     shading, rows = _padded_shading(state, MARGIN_PX), rows or (0, strip.values.shape[1])
 
     def fits(first: int, last: int) -> Floats:
         return kernels.fit_edges(
             strip.values, strip.scale, strip.offset, starts[first:last], state.lengths, state.lag, state.blur,
-            state.appearance, state.inflation, CONTRAST_PRIOR_SD, MARGIN_PX, rounds, shading, frames[first:last],
-            rows,
+            state.appearance, state.inflation, contrast_prior_sd, MARGIN_PX, rounds, shading, frames[first:last], rows,
         )  # fmt: skip
 
     return np.concatenate(in_parts(fits, len(frames), FEWEST_FITS))
@@ -245,15 +247,8 @@ def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
 # ------------------------------------------------------------------------------
 # Estimate the tip's shape and shading, the optical blur and the exposure from the residuals of the edge fit.
 
-BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
-NEAR_BLURS = np.array([0.7, 0.85, 1, 1.2, 1.4])  # Blurs that are tried near the last estimate, as a part of it (chosen)
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 ASSUMED_EXPOSURE = 0.25  # Exposure over frame period until it is estimated (chosen)
-# Ratio of the misfit with the stated exposure to the least of any exposure, above which the stated one is contradicted
-# (measured)
-CONTRADICTION_RATIO = 1.01
-
-
 OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel to a picture out of focus (chosen)
 
 
@@ -273,10 +268,11 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
         state = replace(state, lag=lag, edge=state.edge - lead)
     # 16: frames from which the blur is estimated (chosen)
     sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // 16)]
-    candidates = BLURS_PX if everywhere else state.blur * NEAR_BLURS
+    # Blurs that are tried: any, or near the last estimate, as a part of it (chosen)
+    candidates = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8] if everywhere else [0.7, 0.85, 1, 1.2, 1.4])
+    candidates = candidates if everywhere else state.blur * candidates
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
-
     misfits = [
         _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - coverage_reach(0.0, blur))
         for blur in candidates.tolist()
@@ -302,12 +298,9 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
 
 def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], margin_px: float) -> float:
     """Misfit of some frames after a new fit of their edges: a blur must not be judged by edges fitted with another."""
-    edge = np.full(len(state.edge), np.nan)
-    edge[frames] = state.edge[frames]
-    fit = fit_edges(strip, replace(state, edge=edge), EARLY_FIT_ROUNDS)
+    fit = fit_edges(strip, state, np.isin(np.arange(len(state.edge)), frames), EARLY_FIT_ROUNDS)
     use = np.isfinite(fit[:, 0])
-    edge[use] = fit[use, 0]
-    return misfit(strip, replace(state, edge=edge), fit, use, margin_px)
+    return misfit(strip, replace(state, edge=np.where(use, fit[:, 0], state.edge)), fit, use, margin_px)
 
 
 def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
@@ -322,15 +315,15 @@ def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
 
 def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
     """Find the exposure that the blur shows where it contradicts the stated one. Returns exposure over frame period,
-    NaN where the stated one explains the blur as well (CONTRADICTION_RATIO); and the median: speed of the frames used,
-    px a frame. Shapes: fit (n_frames, 6).
+    NaN where the stated one explains the blur as well; and the median speed of the frames used, px a frame.
     """
     speed, fast = _fast_frames(state, fit)
     # 6: fewest frames from which a blur is told from the shape of the tip (chosen)
     if fast.sum() < 6:
         return np.nan, np.nan
     misfits = _misfits_of_exposures(strip, state, fit, speed, fast, np.append(EXPOSURES, stated_frames))
-    contradicted = misfits[-1] > CONTRADICTION_RATIO * misfits.min()
+    # 1.01: ratio to the least misfit of any exposure above which the stated one is contradicted (measured)
+    contradicted = misfits[-1] > 1.01 * misfits.min()
     seen = _least_misfit(EXPOSURES, misfits[:-1]) if contradicted else np.nan
     return seen, float(np.median(speed[fast]))
 

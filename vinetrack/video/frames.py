@@ -12,7 +12,7 @@ import contextlib
 import math
 import os
 import threading
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,12 +63,7 @@ class Decoded:
 
 
 def decode_container(
-    path: Path,
-    shape: tuple[int, int],
-    picture_of: Callable[[av.VideoFrame], NDArray[Any]],
-    threads: int,
-    expected: int | None = None,
-    between_s: tuple[float, float] | None = None,
+    path: Path, shape: tuple[int, int], expected: int | None = None, between_s: tuple[float, float] | None = None
 ) -> Decoded:
     """Decode every frame; a packet that cannot be decoded costs only its own frame. Pictures are written straight into
     one array, so that they are held in memory once.
@@ -81,8 +76,7 @@ def decode_container(
         try:
             with open_film(path) as container:
                 stream = container.streams.video[0]
-                stream.thread_type = "AUTO"
-                stream.codec_context.thread_count = threads
+                stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS
                 decoded.decoder = stream.codec_context.name
                 base = float(stream.time_base) if stream.time_base else 1.0
                 if between_s is not None:
@@ -96,14 +90,18 @@ def decode_container(
                     if (frame.height, frame.width) != shape:
                         messages.append("the size of the picture changes")
                         break
-                    picture = picture_of(frame)
+                    picture = luma_plane(frame)
                     n = len(decoded.times_s)
                     if (n + 1) * picture.nbytes > available_bytes:
                         raise MemoryError
                     if buffer is None or n == len(buffer):
                         buffer = _enlarged(buffer, picture, expected, available_bytes)
                     buffer[n] = picture
-                    _record_frame(decoded, frame, base)
+                    decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base)
+                    decoded.corrupt.append(bool(frame.is_corrupt))
+                    decoded.key.append(bool(frame.key_frame))
+                    # 3: code of a B frame (defined)
+                    decoded.between.append(frame.pict_type == 3)
         except av.error.FFmpegError as error:
             messages.append(str(error.strerror or error))
     decoded.messages = list(messages)
@@ -181,12 +179,11 @@ def packet_index(path: Path) -> PacketIndex | None:
     return PacketIndex(times, np.array(key, dtype=bool)[order], base)
 
 
-def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> Iterator[av.VideoFrame]:
+def decode_packets(path: Path, chosen: Container[int] | None) -> Iterator[av.VideoFrame]:
     """Decode selected packets of a film."""
     with quiet_log() as messages, open_film(path) as container:
         stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
-        stream.codec_context.thread_count = threads
+        stream.thread_type, stream.codec_context.thread_count = "AUTO", DECODER_THREADS
         packets = container.demux(stream)
         wanted = (packet for packet in packets if chosen is None or not packet.size or packet.pts in chosen)
         yield from _frames_of(wanted, messages)
@@ -207,14 +204,6 @@ def open_film(path: Path) -> Iterator[av.container.InputContainer]:
             for stream in container.streams.video:
                 if stream.codec_context is not None:
                     stream.codec_context.flush_buffers()
-
-
-def _record_frame(decoded: Decoded, frame: av.VideoFrame, base_s: float) -> None:
-    decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base_s)
-    decoded.corrupt.append(bool(frame.is_corrupt))
-    decoded.key.append(bool(frame.key_frame))
-    # 3: code of a B frame (defined)
-    decoded.between.append(frame.pict_type == 3)
 
 
 def _frames_of(packets: Iterator[av.Packet[Any]], messages: list[str]) -> Iterator[av.VideoFrame]:
@@ -376,9 +365,6 @@ def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> n
     return out
 
 
-# Formats under which FFmpeg renders any text as a picture of its letters
-TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
-
 DECODER_THREADS = 2  # Decoder threads per recording (chosen)
 
 
@@ -389,26 +375,6 @@ class RecordingError(ValueError):
         self.message, self.remedy = message, remedy
         self.what = f"{name}: {message}" if name else message
         super().__init__(f"{self.what}; {remedy}" if remedy else self.what)
-
-
-@dataclass(frozen=True)
-class Region:
-    """Rectangle of a picture in whole pixels: columns `left` to `right`, rows `top` to `bottom`, ends excluded."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width, px."""
-        return self.bottom - self.top, self.right - self.left
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """Index of the rectangle in a picture of shape (height, width)."""
-        return slice(self.top, self.bottom), slice(self.left, self.right)
 
 
 @dataclass(frozen=True)
@@ -431,21 +397,15 @@ class Recording:
     playback_fps: float | None = None
     raw: RawFrames | None = None
 
-    @property
-    def whole(self) -> Region:
-        """The full picture."""
-        return Region(0, 0, self.width, self.height)
-
 
 @dataclass(frozen=True)
 class Frames:
-    """Decoded frames of one region. `luma` has shape (n_frames, height, width), uint8 or uint16. `slot`, shape
-    (n_frames,), is the number of capture periods since the first frame, from timestamps or from the numbers of image
-    files: 0, 1, 2 … if no frame is missing.
+    """Decoded frames. `luma` has shape (n_frames, height, width), uint8 or uint16. `slot`, shape (n_frames,), is the
+    number of capture periods since the first frame, from timestamps or from the numbers of image files: 0, 1, 2 … if no
+    frame is missing.
     """
 
     recording: Recording
-    region: Region
     luma: NDArray[Any]
     slot: NDArray[np.int_]
     damaged: NDArray[np.bool_]
@@ -489,33 +449,24 @@ def inspect_recording(path: Path | str) -> Recording:
     return _inspect_container(path)
 
 
-def read_frames(
-    path: Path | str | Recording,
-    region: Region | None = None,
-    threads: int = DECODER_THREADS,
-    part: tuple[int, int, PacketIndex] | None = None,
-) -> Frames:
-    """Decode all frames of a recording, or a `region` of them."""
+def read_frames(path: Path | str | Recording, part: tuple[int, int, PacketIndex] | None = None) -> Frames:
+    """Decode all frames of a recording, or a part of a film: from a frame to another, by its index."""
     recording = path if isinstance(path, Recording) else inspect_recording(path)
-    region = region or recording.whole
     if recording.raw is not None:
-        return read_raw(recording, recording.raw, region)
+        return read_raw(recording, recording.raw)
     if recording.kind != "container":
         from vinetrack.video.images import read_images
 
-        return read_images(recording, region)
-    shape = recording.height, recording.width
+        return read_images(recording)
     expected, between_s = recording.declared_frames, None
     if part is not None:
         first, last, index = part
         expected, between_s = last - first + 1, (float(index.times_s[first]), float(index.times_s[last]))
     try:
-        decoded = decode_container(
-            recording.path, shape, lambda frame: luma_plane(frame, region, copy=False), threads, expected, between_s
-        )
+        decoded = decode_container(recording.path, (recording.height, recording.width), expected, between_s)
     except MemoryError:
         raise too_large(recording) from None
-    return _assemble(recording, region, decoded, None if part is None else part[2])
+    return _assemble(recording, decoded, None if part is None else part[2])
 
 
 def too_large(recording: Recording) -> RecordingError:
@@ -527,42 +478,39 @@ def too_large(recording: Recording) -> RecordingError:
     )
 
 
-def iterate_frames(recording: Recording, region: Region | None = None) -> Iterator[NDArray[Any]]:
-    """Yield the region of one frame after another, as copies; stop where decoding fails."""
-    region = region or recording.whole
+def iterate_frames(recording: Recording) -> Iterator[NDArray[Any]]:
+    """Yield one frame after another, as copies; stop where decoding fails."""
     if recording.raw is not None:
-        for picture in recording.raw.pictures():
-            yield picture[region.slices]
+        yield from recording.raw.pictures()
         return
     if recording.kind != "container":
         from vinetrack.video.images import iterate_images
 
-        yield from iterate_images(recording, region)
+        yield from iterate_images(recording)
         return
     import av
 
     with open_film(recording.path) as container:
         try:
             for frame in container.decode(video=0):
-                yield luma_plane(frame, region)
+                yield luma_plane(frame)[: recording.height, : recording.width].copy()
         except av.error.FFmpegError:
             return
 
 
-def luma_plane(frame: av.VideoFrame, region: Region, copy: bool = True) -> NDArray[Any]:
-    """Return the brightness of a decoded frame."""
+def luma_plane(frame: av.VideoFrame) -> NDArray[Any]:
+    """Return the brightness of a decoded frame, in the decoder's own memory where that holds it."""
     name = frame.format.name
     depth = frame.format.components[0].bits
     if not (name.startswith(("yuv", "gray", "nv12", "nv16", "nv21", "p010")) and frame.format.is_planar) and (
         name not in {"gray", "gray10le", "gray12le", "gray14le", "gray16le"}
     ):
-        target = "gray16le" if depth > 8 else "gray"
-        return np.array(frame.to_ndarray(format=target)[region.slices])
+        return frame.to_ndarray(format="gray16le" if depth > 8 else "gray")
     plane = frame.planes[0]
     dtype = np.dtype(np.uint8) if depth <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
     rows = np.frombuffer(memoryview(plane), dtype=dtype).reshape(-1, plane.line_size // dtype.itemsize)
-    picture = rows[region.slices]
-    return np.array(picture, np.uint8 if dtype.itemsize == 1 else np.uint16) if copy else picture
+    picture = rows[: frame.height, : frame.width]
+    return picture.astype(np.uint16) if name.endswith("be") else picture
 
 
 def _inspect_container(path: Path) -> Recording:
@@ -570,7 +518,8 @@ def _inspect_container(path: Path) -> Recording:
 
     try:
         with quiet_log() as messages, open_film(path) as container:
-            if container.format.name in TEXT_FORMATS:
+            # Formats under which FFmpeg renders any text as a picture of its letters
+            if container.format.name in {"tty", "bin", "xbin", "adf", "idf", "svg_pipe"}:
                 raise RecordingError("a text, not a recording", "name a film, or a folder of pictures", path.name)
             if not container.streams.video:
                 raise RecordingError("holds no video stream", "name a video file", path.name)
@@ -591,32 +540,26 @@ def _declared_frames(stream: Any, container: Any) -> int | None:
     """Frame count of the header; if absent, duration times playback rate."""
     if stream.frames > 0:
         return int(stream.frames)
-    seconds = None
+    seconds = math.nan if container.duration is None else container.duration / 1e6
     if stream.duration is not None and stream.time_base is not None:
         seconds = float(stream.duration * stream.time_base)
-    elif container.duration is not None:
-        seconds = container.duration / 1e6
-    if seconds is None or not stream.average_rate:
+    if math.isnan(seconds) or not stream.average_rate:
         return None
     return max(round(seconds * float(stream.average_rate)), 0) or None
 
 
 def _why_unreadable(path: Path, messages: list[str], error: str) -> tuple[str, str]:
     """What is wrong with a file that cannot be opened, and what to do."""
-    text = " ".join([*messages, error])
-    if "moov atom not found" in text and _looks_like_mp4(path):
-        return "cut short: the index that is written last is missing", "copy the file again, or repair it"
+    if "moov atom not found" in " ".join([*messages, error]):
+        with path.open("rb") as stream:
+            if stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}:
+                return "cut short: the index that is written last is missing", "copy the file again, or repair it"
     if path.suffix.lower() not in CONTAINERS:
         return "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
     return "not a video, or its beginning is damaged", "copy it from the camera again"
 
 
-def _looks_like_mp4(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
-
-
-def _assemble(recording: Recording, region: Region, decoded: Decoded, index: PacketIndex | None) -> Frames:
+def _assemble(recording: Recording, decoded: Decoded, index: PacketIndex | None) -> Frames:
     n = len(decoded.times_s)
     name = recording.path.name
     if n == 0:
@@ -652,14 +595,14 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
         )
     if irregular:
         notes.append(f"{name}: {irregular}")
-    return Frames(recording, region, decoded.pictures, slot, damaged, tuple(notes), before, after)
+    return Frames(recording, decoded.pictures, slot, damaged, tuple(notes), before, after)
 
 
 def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[NDArray[np.int_], str]:
-    """Return the capture period of every frame from its timestamp, and a note on irregularities ("" if there are none).
-    Timestamps are rounded to whole multiples of their median spacing, so that a missing frame leaves a gap. Timestamps
-    that repeat, run backwards or fit no common period are not used; frames are then numbered consecutively. Returns
-    capture periods since the first frame, shape (n_frames,), and the note. Shapes: times (n_frames,).
+    """Return the capture period of every frame since the first from its timestamp, both (n_frames,), and a note on
+    irregularities ("" if there are none). Timestamps are rounded to whole multiples of their median spacing, so that a
+    missing frame leaves a gap. Those that repeat, run backwards or fit no common period are not used; frames are then
+    numbered consecutively.
     """
     plain = np.arange(len(times))
     if len(times) < 3 or not np.all(np.isfinite(times)):
@@ -774,15 +717,22 @@ def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
     return np.rint(cv2.sepFilter2D(mosaic.astype(np.float32), -1, kernel, kernel)).astype(mosaic.dtype)
 
 
-def read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
-    """Read every frame of a camera's own file, straight into one array."""
-    name, notes = recording.path.name, list(recording.notes)
-    shape = (len(raw.offsets), *region.shape)
-    if math.prod(shape) * raw.dtype.itemsize > memory_for_pictures():
+def filled(recording: Recording, pictures: Iterable[NDArray[Any]], count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Write up to `count` pictures straight into one array, unless they do not fit in memory."""
+    shape = count, recording.height, recording.width
+    if math.prod(shape) * dtype.itemsize > memory_for_pictures():
         raise too_large(recording)
-    luma, n = np.empty(shape, raw.dtype), 0
-    for n, picture in enumerate(raw.pictures(), 1):
-        luma[n - 1] = picture[region.slices]
+    luma, n = np.empty(shape, dtype), 0
+    for n, picture in enumerate(pictures, 1):
+        luma[n - 1] = picture
+    return luma[:n]
+
+
+def read_raw(recording: Recording, raw: RawFrames) -> Frames:
+    """Read every frame of a camera's own file."""
+    name, notes = recording.path.name, list(recording.notes)
+    luma = filled(recording, raw.pictures(), len(raw.offsets), raw.dtype)
+    n = len(luma)
     if n == 0:
         raise RecordingError("not one frame is in the file", "copy it from the camera again", name)
     if recording.declared_frames is not None and n < recording.declared_frames:
@@ -790,9 +740,7 @@ def read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
             f"{name}: the file holds {n} frames but declares {recording.declared_frames}: cut short; "
             "copy it from the camera again"
         )
-    slot, irregular = np.arange(n), ""
-    if raw.times_s is not None:
-        slot, irregular = slots_from_times(raw.times_s[:n])
+    slot, irregular = (np.arange(n), "") if raw.times_s is None else slots_from_times(raw.times_s[:n])
     if irregular:
         notes.append(f"{name}: {irregular}")
-    return Frames(recording, region, luma[:n], slot, np.zeros(n, dtype=bool), tuple(notes))
+    return Frames(recording, luma, slot, np.zeros(n, dtype=bool), tuple(notes))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from collections.abc import Iterator
@@ -22,10 +21,8 @@ from vinetrack.video.frames import (
     RawFrames,
     Recording,
     RecordingError,
-    Region,
-    memory_for_pictures,
+    filled,
     mosaic_brightness,
-    too_large,
     unpack_pixels,
 )
 
@@ -79,30 +76,8 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
 # They state rate and exposure of capture, which no ordinary film does. What cannot be read with certainty is refused
 # by name: compressed frames, unknown depths and versions, interleaved colours.
 
-# Offsets in the settings of a cine, bytes from their beginning
-MARK_AT, RATE_AT, SHUTTER_US_AT, COLOUR_FILTER_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 768, 772, 808, 896, 1568
-
-SETUP_BYTES = SHUTTER_NS_AT + 4  # Bytes of the settings that are read (derived)
-
-# XML path in a `.cihx` of each line of a `.cih`
-CIHX_PLACES = {
-    "Record Rate(fps)": "recordInfo/recordRate",
-    "Shutter Speed(s)": "recordInfo/shutterSpeed",
-    "Total Frame": "frameInfo/totalFrame",
-    "Image Width": "imageDataInfo/resolution/width",
-    "Image Height": "imageDataInfo/resolution/height",
-    "Color Bit": "imageDataInfo/colorInfo/bit",
-    "Color Type": "imageDataInfo/colorInfo/type",
-    "EffectiveBit Depth": "imageDataInfo/effectiveBit/depth",
-    "File Format": "imageFileInfo/fileFormat",
-}
-
+MARK_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 896, 1568  # Offsets in the settings of a cine, bytes from their beginning
 SIDE_FILES = (".cih", ".cihx")
-
-PACKED_BITS = {0: None, 256: 10, 1024: 12}  # Bits of a packed pixel by `biCompression` of a cine
-
-BAYER_CODES = frozenset({1, 2, 3, 4, 5, 6})  # Codes of colour filters of 2 by 2 pixels in a cine
-
 EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
 
 
@@ -122,7 +97,7 @@ def inspect_cine(path: Path) -> Recording:
             if min(bitmap, setup, table) < 44 or count == 0 or end > size:
                 raise RecordingError("cut short, or its header is damaged", "copy it from the camera again", name)
             stream.seek(0)
-            header = stream.read(max(end, setup + SETUP_BYTES))
+            header = stream.read(max(end, setup + SHUTTER_NS_AT + 4))
             offsets = tuple(int(at) for at in np.frombuffer(header, "<i8", count, table))
             frames = _cine_frames(path, stream, header, (version, compression, bitmap, setup), offsets, size)
         setup_bytes = header[setup:]
@@ -149,21 +124,18 @@ def _cine_frames(
     mark, length = struct.unpack_from("<2sH", header, setup + MARK_AT)
     if mark != b"ST" or length < REAL_BITS_AT + 4:
         raise RecordingError("its camera's settings are missing or of an unknown kind", "save it anew", name)
-    filters = struct.unpack_from("<I", header, setup + COLOUR_FILTER_AT)[0]
-    grey = compression == 0 or (compression == 2 and filters in {0} | BAYER_CODES)
-    if not (version == 1 and grey and packing in PACKED_BITS and bits in (8, 16)):
-        raise RecordingError(
-            (
-                f"a cine of version {version}, compression {compression}, packing {packing}, {bits} bits, colour "
-                f"filter {filters:#x} is not read"
-            ),
-            "save it as raw cine or AVI",
-            name,
+    filters = struct.unpack_from("<I", header, setup + 808)[0]  # colour filters; 1 to 6 are of 2 by 2 pixels
+    packed_bits = {0: None, 256: 10, 1024: 12}  # of a packed pixel, by `biCompression`
+    grey = compression == 0 or (compression == 2 and 0 <= filters <= 6)
+    if not (version == 1 and grey and packing in packed_bits and bits in (8, 16)):
+        kind = (
+            f"version {version}, compression {compression}, packing {packing}, {bits} bits, colour filter {filters:#x}"
         )
-    packed = PACKED_BITS[packing]
+        raise RecordingError(f"a cine of {kind} is not read", "save it as raw cine or AVI", name)
+    packed = packed_bits[packing]
     frames = RawFrames(
         path, (), width, abs(height), packed or bits, bottom_up=packed is None and height > 0,
-        linearise=packed == 10, mosaic=compression == 2 and filters in BAYER_CODES,
+        linearise=packed == 10, mosaic=compression == 2 and 1 <= filters <= 6,
     )  # fmt: skip
     if width <= 0 or height == 0 or (width * abs(height) * frames.stored_bits) % 8:
         raise RecordingError("its header is damaged", "copy it from the camera again", name)
@@ -177,15 +149,10 @@ def _cine_frames(
         size_field = stream.read(4)
         if annotation < 8 or len(size_field) < 4:
             break
-        if struct.unpack("<I", size_field)[0] != frames.frame_bytes:
-            raise RecordingError(
-                (
-                    f"a frame takes {struct.unpack('<I', size_field)[0]} bytes where {width} x {abs(height)} px of "
-                    f"{frames.stored_bits} bits take {frames.frame_bytes}"
-                ),
-                "it is not read",
-                name,
-            )
+        taken = struct.unpack("<I", size_field)[0]
+        if taken != frames.frame_bytes:
+            wanted = f"{width} x {abs(height)} px of {frames.stored_bits} bits take {frames.frame_bytes}"
+            raise RecordingError(f"a frame takes {taken} bytes where {wanted}", "it is not read", name)
         starts.append(at + annotation)
     return replace(frames, offsets=tuple(starts))
 
@@ -211,8 +178,9 @@ def _cine_clock(
     """Rate and exposure of capture: from the stamps of the frames where they exist, else as the camera was set."""
     fraction_s = 2.0**-32  # Unit of times and exposures in a cine (defined)
     notes = []
-    length, rate = struct.unpack_from("<H", setup, MARK_AT + 2)[0], float(struct.unpack_from("<I", setup, RATE_AT)[0])
-    exposure_s = struct.unpack_from("<I", setup, SHUTTER_US_AT)[0] * 1e-6
+    # 768: offset of the rate, and behind it of the exposure in µs (defined)
+    length, (rate, exposure_us) = struct.unpack_from("<H", setup, MARK_AT + 2)[0], struct.unpack_from("<II", setup, 768)
+    rate, exposure_s = float(rate), exposure_us * 1e-6
     if length >= SHUTTER_NS_AT + 4:
         exposure_s = struct.unpack_from("<I", setup, SHUTTER_NS_AT)[0] * 1e-9 or exposure_s
     # 1002, 1003: types of the tagged blocks of a cine
@@ -241,7 +209,7 @@ def _cine_clock(
 
 def inspect_mraw(path: Path) -> Recording:
     """Read the side file of a Photron `.mraw`."""
-    data = next((at for at in _siblings(path, (".mraw",))), None)
+    data = next(iter(_siblings(path, (".mraw",))), None)
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
     if side is None:
         raise RecordingError(
@@ -346,6 +314,17 @@ def _cih_values(data: bytes) -> dict[str, str]:
 
 def _cihx_values(name: str, data: bytes) -> dict[str, str]:
     """The same values, by the keys of a `.cih`, from the XML within a `.cihx`."""
+    places = {
+        "Record Rate(fps)": "recordInfo/recordRate",
+        "Shutter Speed(s)": "recordInfo/shutterSpeed",
+        "Total Frame": "frameInfo/totalFrame",
+        "Image Width": "imageDataInfo/resolution/width",
+        "Image Height": "imageDataInfo/resolution/height",
+        "Color Bit": "imageDataInfo/colorInfo/bit",
+        "Color Type": "imageDataInfo/colorInfo/type",
+        "EffectiveBit Depth": "imageDataInfo/effectiveBit/depth",
+        "File Format": "imageFileInfo/fileFormat",
+    }
     begin, end = data.find(b"<cih>"), data.rfind(b"</cih>")
     try:
         root = ElementTree.fromstring(data[begin : end + 6].decode("utf-8", "replace")) if begin >= 0 else None
@@ -353,7 +332,7 @@ def _cihx_values(name: str, data: bytes) -> dict[str, str]:
         root = None
     if root is None:
         raise RecordingError("its XML is damaged", "copy it from the camera again", name)
-    return {key: (root.findtext(place) or "").strip() for key, place in CIHX_PLACES.items()}
+    return {key: (root.findtext(place) or "").strip() for key, place in places.items()}
 
 
 def _as_number(text: str) -> float:
@@ -365,55 +344,49 @@ def _as_number(text: str) -> float:
         return 0.0
 
 
-JPEG_END, PNG_END = b"\xff\xd9", b"IEND\xaeB`\x82"
-
-
 def inspect_images(path: Path) -> Recording:
     """Read the facts of a folder of images or a TIFF stack from its first picture."""
-    if path.is_dir():
-        files, numbers, notes = _numbered_files(path)
-        kind = "folder"
-    else:
-        files, numbers, notes = (path,), (), ()
-        kind = "stack"
-        if path.stat().st_size == 0:
-            raise RecordingError("the file is empty", "copy it from the camera again", path.name)
+    import cv2
+
+    is_stack = not path.is_dir()
+    files, numbers, notes = ((path,), (), ()) if is_stack else _numbered_files(path)
+    if is_stack and path.stat().st_size == 0:
+        raise RecordingError("the file is empty", "copy it from the camera again", path.name)
     readable = next((p for p in map(_read_or_none, files[:3]) if p is not None), None)
     if readable is None:
         raise RecordingError(f"{files[0].name} is not an image that can be read", name=path.name)
     depth = 8 if readable.dtype == np.uint8 else 16
     fps, exposure = _dng_clock(files[0]) if files[0].suffix.lower() == ".dng" else (None, None)
-    count = _pages(path) if kind == "stack" else len(files)
+    count = int(cv2.imcount(str(path), cv2.IMREAD_ANYDEPTH)) if is_stack else len(files)
     height, width = readable.shape
     side = side_file_of(path, files[0].suffix.lower().removeprefix("."), (width, height), count)
     if side is not None and fps is None:
         fps, exposure, depth, notes = side.rate, side.exposure_s, side.depth or depth, (*notes, *side.notes)
+    kind = "stack" if is_stack else "folder"
     return Recording(path, kind, width, height, depth, count, fps, exposure, files, numbers, notes)
 
 
-def read_images(recording: Recording, region: Region) -> Frames:
-    """Read every picture, straight into one array; one that is truncated or cannot be read is partial or black, and
-    marked damaged.
-    """
+def read_images(recording: Recording) -> Frames:
+    """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged."""
     name, notes = recording.path.name, list(recording.notes)
-    dtype = np.dtype(np.uint8 if recording.bit_depth == 8 else np.uint16)
-    shape = (recording.declared_frames or 0, *region.shape)
-    if math.prod(shape) * dtype.itemsize > memory_for_pictures():
-        raise too_large(recording)
-    luma, damaged = np.zeros(shape, dtype), np.zeros(shape[0], dtype=bool)
-    if recording.kind == "stack":
-        n = 0
-        for n, page in enumerate(_stack_pages(recording), 1):
-            luma[n - 1] = page[region.slices]
-        if n < shape[0]:
-            notes.append(f"{name}: {n} pages read where the stack declares {shape[0]}: cut short")
-        luma, damaged = luma[:n], damaged[:n]
-    else:
-        for i, file in enumerate(recording.files):
+    count, dtype = recording.declared_frames or 0, np.dtype(np.uint8 if recording.bit_depth == 8 else np.uint16)
+    is_damaged: list[bool] = []
+
+    def pictures() -> Iterator[NDArray[Any]]:
+        for file in recording.files:
             picture = _read_or_none(file)
-            damaged[i] = picture is None or picture.shape != (recording.height, recording.width)
-            if picture is not None and not damaged[i]:
-                luma[i], damaged[i] = picture[region.slices], not _has_end_marker(file)
+            readable = picture is not None and picture.shape == (recording.height, recording.width)
+            is_damaged.append(not readable or not _has_end_marker(file))
+            yield picture if readable and picture is not None else np.zeros((recording.height, recording.width), dtype)
+
+    if recording.kind == "stack":
+        luma = filled(recording, _stack_pages(recording), count, dtype)
+        damaged = np.zeros(len(luma), dtype=bool)
+        if len(luma) < count:
+            notes.append(f"{name}: {len(luma)} pages read where the stack declares {count}: cut short")
+    else:
+        luma = filled(recording, pictures(), count, dtype)
+        damaged = np.array(is_damaged)
     if damaged.all():
         raise RecordingError("not one picture can be read", "the files are damaged", name)
     if damaged.any():
@@ -426,19 +399,18 @@ def read_images(recording: Recording, region: Region) -> Frames:
         slot, missing = _capture_periods(np.array(recording.numbers))
         if missing:
             notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
-    return Frames(recording, region, luma, slot, damaged, tuple(notes))
+    return Frames(recording, luma, slot, damaged, tuple(notes))
 
 
-def iterate_images(recording: Recording, region: Region) -> Iterator[NDArray[Any]]:
-    """Yield the region of each picture that can be read."""
+def iterate_images(recording: Recording) -> Iterator[NDArray[Any]]:
+    """Yield each picture that can be read."""
     if recording.kind == "stack":
-        for page in _stack_pages(recording):
-            yield page[region.slices]
+        yield from _stack_pages(recording)
         return
     for file in recording.files:
         picture = _read_or_none(file)
         if picture is not None and picture.shape == (recording.height, recording.width):
-            yield picture[region.slices]
+            yield picture
 
 
 def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tuple[str, ...]]:
@@ -460,12 +432,10 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
     files = tuple(file for _, file in group)
     numbers = tuple(number for number, _ in group)
     left_out = [f.name for f in images if f not in set(files)]
-    note = (
-        f"{folder.name}: {len(left_out)} images not numbered like the rest are left out, first {left_out[0]}"
-        if left_out
-        else ""
-    )
-    return files, numbers, (note,) if note else ()
+    if not left_out:
+        return files, numbers, ()
+    note = f"{folder.name}: {len(left_out)} images not numbered like the rest are left out, first {left_out[0]}"
+    return files, numbers, (note,)
 
 
 def _capture_periods(numbers: NDArray[np.int_]) -> tuple[NDArray[np.int_], int]:
@@ -484,13 +454,10 @@ def _capture_periods(numbers: NDArray[np.int_]) -> tuple[NDArray[np.int_], int]:
 
 def _has_end_marker(file: Path) -> bool:
     """Whether a JPEG or PNG has its end marker: decoders silently fill a missing part with grey."""
-    suffix = file.suffix.lower()
-    if suffix not in {".jpg", ".jpeg", ".png"}:
-        return True
+    markers = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
     with file.open("rb") as stream:
         stream.seek(max(file.stat().st_size - 64, 0))
-        end = stream.read()
-    return (PNG_END if suffix == ".png" else JPEG_END) in end
+        return markers.get(file.suffix.lower(), b"") in stream.read()
 
 
 def _read_or_none(file: Path) -> NDArray[Any] | None:
@@ -508,13 +475,6 @@ def _read_or_none(file: Path) -> NDArray[Any] | None:
     if picture is None or picture.dtype not in (np.uint8, np.uint16):
         return None
     return np.asarray(picture)
-
-
-def _pages(path: Path) -> int:
-    """Number of pages of a TIFF stack."""
-    import cv2
-
-    return int(cv2.imcount(str(path), cv2.IMREAD_ANYDEPTH))
 
 
 def _stack_pages(recording: Recording) -> Iterator[NDArray[Any]]:
@@ -540,21 +500,19 @@ def _dng_pages(tiff: Any) -> Iterator[Any]:
 
 
 def _dng_clock(file: Path) -> tuple[float | None, float | None]:
-    """Capture rate and exposure of a CinemaDNG frame (tags 51044 and 33434); None where absent."""
+    """Capture rate (tag 51044 of CinemaDNG) and exposure (33434 of TIFF/EP, ISO 12234-2) of a frame, None if absent."""
     import tifffile
 
-    tag_exposure = 33434  # Defined by TIFF/EP (ISO 12234-2): exposure time
-    tag_frame_rate = 51044  # Defined by CinemaDNG: frame rate
     values: dict[int, float] = {}
     with tifffile.TiffFile(file) as tiff:
         for page in _dng_pages(tiff):
-            for code in (tag_frame_rate, tag_exposure):
+            for code in (51044, 33434):
                 if code in page.tags and code not in values:
                     value = page.tags[code].value
                     top, bottom = (value[0], value[1]) if isinstance(value, tuple) else (value, 1)
                     if bottom:
                         values[code] = float(top) / float(bottom)
-    return values.get(tag_frame_rate), values.get(tag_exposure)
+    return values.get(51044), values.get(33434)
 
 
 def _read_dng(file: Path) -> NDArray[np.uint16]:

@@ -30,9 +30,8 @@ if TYPE_CHECKING:
 
 @njit(cache=True, nogil=True)
 def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the frame at which the mean brightness of each pixel changes most, and the power of that change. Returns
-    index of the first picture after the step, and the power of the step, each of shape (n_pixels,). Shapes: pictures
-    (n, n_pixels).
+    """Find the first picture after the largest step of each pixel's mean brightness, and the power of that step,
+    (n_pixels,) each. Shapes: pictures (n, n_pixels).
     """
     n, pixels = pictures.shape
     best, step_frame = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
@@ -119,12 +118,9 @@ def _sums_of_changes(pictures: np.ndarray, step: int) -> np.ndarray:
 
 
 WINDOW = 10  # Frames before and after a frame whose means are compared (chosen)
-# Peak score from which a column counts as changed (chosen)
-MIN_SCORE, PEAK_FRACTION, UNCHANGED_COLUMN_COST = 3.0, 0.15, 0.2
+PEAK_FRACTION = 0.15  # Part of the largest score of a column that its changes must exceed (chosen)
 # Number of frames at either end of the recording whose median shows the scene before and after growth (chosen)
 END_FRAMES = 5
-# Difference of initial and final appearance, in units of the noise, at which a pixel has half a vote (chosen)
-HALF_VOTE_NOISE = 4.0
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -218,13 +214,10 @@ def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
     # 100: fewest columns of a strip for which another thread is used (chosen)
     score = np.concatenate(in_parts(score_of, strip.values.shape[2], 100), axis=1)
     peak = score.max(axis=0)
-    column_weight = np.where(peak > MIN_SCORE, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(
-        np.float32
-    )
-    score = score * column_weight[None, :]
-    score = np.where(
-        column_weight[None, :] > 0, score - PEAK_FRACTION * score.max(axis=0, keepdims=True), -UNCHANGED_COLUMN_COST
-    ).astype(np.float32)
+    # 3.0, 0.2: peak score from which a column counts as changed, and the cost of any other (chosen)
+    weight = np.where(peak > 3.0, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(np.float32)
+    score = score * weight
+    score = np.where(weight > 0, score - PEAK_FRACTION * score.max(axis=0), -0.2).astype(np.float32)
     path, columns = collecting_path(score), np.arange(score.shape[1])
     passage = np.clip(np.searchsorted(path, columns + 0.5), 0, len(path) - 1)
     return path, np.max([score[np.clip(passage + d, 0, len(path) - 1), columns] for d in (-1, 0, 1)], axis=0)
@@ -233,21 +226,20 @@ def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
 def path_by_appearance(strip: Strip) -> tuple[Floats, Floats]:
     """Find the front as the path that separates pixels that look as at the end from pixels that look as at the start.
     The vote of a pixel is its distance from the final less that from the initial appearance, divided by the distance
-    between the two plus HALF_VOTE_NOISE times the noise: near −1 if it looks as at the end, near 1 if as at the start.
-    Returns column of the front, shape (n_frames,), px, change of each column from start to end, in the units of
-    `path_by_change`; shape (n_along,).
+    between the two plus 4 times the noise: near −1 if it looks as at the end, near 1 if as at the start. Also returned
+    is the change of each column from start to end, in the units of `path_by_change`.
     """
     first, last = _median_frame(strip, slice(0, END_FRAMES)), _median_frame(strip, slice(-END_FRAMES, None))
 
     def votes_of(begin: int, end: int) -> NDArray[np.float32]:
         scale, offset = strip.scale[begin:end], strip.offset[begin:end]
-        return _votes(strip.values[begin:end], scale, offset, first, last, HALF_VOTE_NOISE * strip.noise)
+        # 4.0: change of a pixel, in units of the noise, at which it has half a vote (chosen)
+        return _votes(strip.values[begin:end], scale, offset, first, last, 4.0 * strip.noise)
 
     votes = np.concatenate(in_parts(votes_of, len(strip.values), FEWEST_PICTURES))
     group_size = _group_size(strip)
-    power = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1]).mean(
-        axis=1
-    ) ** 2
+    grouped = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1])
+    power = grouped.mean(axis=1) ** 2
     times_noise = WINDOW / 2 * power.mean(axis=0) / (strip.noise**2 / group_size)
     return dividing_path(votes), (1 - PEAK_FRACTION) * np.log1p(times_noise)
 
@@ -333,15 +325,9 @@ def mean_appearance(
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def clipped_residual_sums(
-    strip: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-    noise: float,
-    path: np.ndarray,
-    appearance: np.ndarray,
-    begin: int,
-    end: int,
-) -> np.ndarray:
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, noise: float, path: np.ndarray, appearance: np.ndarray,
+    begin: int, end: int,
+) -> np.ndarray:  # fmt: skip
     """Sum the clipped squared residuals of a path: a frame against film behind it and background ahead of it. Shapes:
     strip (n_frames, n_across, n_along); scale, offset, path (n_frames,); appearance (2, n_across, end − begin) →
     (n_frames,).

@@ -21,15 +21,7 @@ from vinetrack.video.strip import Strip
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
 FLOOR_PX = 0.04  # Standard error that no check shows
 
-# Fewest fourth differences from which the roughness is estimated (chosen)
-FEWEST_DIFFERENCES, SMALLEST_FACTOR, LARGEST_FACTOR = 8, 0.5, 6.0
-# Largest factor for a body that is registered against itself, whose likelihood does not know the interpolation between
-# pixels (measured)
-LARGEST_BODY_FACTOR = 20.0
 REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while it stays this near to its level (chosen)
-# Steps this many times the tolerance of rest, followed by one last frame without a step, show an abrupt stop, though
-# elsewhere two equal positions are no rest (chosen)
-ABRUPT_STOP_RATIO = 5.0
 # Distance from the curve through its neighbours, in standard errors and in px, from which a point is an outlier
 # (chosen)
 OUTLIER_SIGMAS, OUTLIER_PX = 6.0, 1.0
@@ -51,10 +43,10 @@ class PointQuality:
     departure_px: Floats
 
 
-def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, largest: float = LARGEST_FACTOR) -> Floats:
+def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, is_body: bool = False) -> Floats:
     """Scale the stated errors to the roughness of the track. Fourth differences cancel any cubic motion and have the
     variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard deviation; it
-    stays 1 where there are fewer than FEWEST_DIFFERENCES. Shapes: edge_px, sigma_px, use (n_frames,) → (n_frames,).
+    stays 1 where there are fewer than eight. Shapes: edge_px, sigma_px, use (n_frames,) → (n_frames,).
     """
     weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     if len(edge_px) < 5:
@@ -63,16 +55,18 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, largest: 
     difference = windows(edge_px, 5) @ weights
     expected = np.sqrt(windows(sigma_px**2, 5) @ weights**2)
     inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
-    if inside.sum() < FEWEST_DIFFERENCES:
+    if inside.sum() < 8:
         return sigma_px
     factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
-    return sigma_px * float(np.clip(factor, SMALLEST_FACTOR, largest))
+    # 0.5, 6.0, 20.0: least and largest factor (chosen), the last for a body that is registered against itself, whose
+    # likelihood does not know the interpolation between pixels (measured)
+    return sigma_px * float(np.clip(factor, 0.5, 20.0 if is_body else 6.0))
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     """First and last moving frame; (0, n − 1) if the edge never rests, (n, −1) if it never moves. At rest means: over
     three frames or more, within three standard errors of the resting level (REST_PX at least; END_REST_PX at the end,
-    where a creeping stop must still show). Returns first and last frame. Shapes: edge_px, sigma_px (n_frames,).
+    where a creeping stop must still show).
     """
     good = np.flatnonzero(np.isfinite(edge_px))
     n = len(edge_px)
@@ -109,22 +103,14 @@ def _first_moving_point(y: Floats, tolerance: float) -> int:
 def _stops_abruptly(y: Floats, tolerance: float) -> bool:
     """Whether a fast edge stands still in the last two frames; the step before may be shorter than a whole one."""
     steps = np.diff(y[-7:])
-    return len(steps) == 6 and abs(steps[-1]) <= tolerance and float(steps[:-2].min()) > ABRUPT_STOP_RATIO * tolerance
+    # 5.0: ratio of the steps to the tolerance that shows so, though elsewhere two equal positions are no rest (chosen)
+    return len(steps) == 6 and abs(steps[-1]) <= tolerance and float(steps[:-2].min()) > 5.0 * tolerance
 
 
 def assess_points(
-    edge_px: Floats,
-    sigma_px: Floats,
-    slot: Indices,
-    number: Indices,
-    *,
-    unsure: Bools,
-    repeated: Bools,
-    end_px: float,
+    edge_px: Floats, sigma_px: Floats, slot: Indices, number: Indices, *, unsure: Bools, repeated: Bools, end_px: float
 ) -> PointQuality:
-    """Flag every frame, and correct the times for missing frames. Shapes: edge_px, sigma_px, slot, number
-    (n_frames,).
-    """
+    """Flag every frame, and correct the times for missing frames. Arrays have shape (n_frames,)."""
     n = len(edge_px)
     no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
     outside = np.flatnonzero(np.isfinite(edge_px) & (edge_px >= end_px))
@@ -139,7 +125,9 @@ def assess_points(
     if repeats.any():
         count, first_repeat = int(repeats.sum()), number[repeats][0]
         notes.append(f"{count} frames repeat the one before them and are dropped, first frame {first_repeat}")
-    departure_px = _outlier_distances(y, sigma_px, first, last)
+    # Distance of outlying points from where their neighbours lead; 0 of all others
+    inside, at_start = _off_parabola(y, sigma_px, first, last), _hidden_at_start(y, sigma_px, first)
+    departure_px = np.maximum(np.maximum(inside, at_start), _flying_on(y, sigma_px, first, last))
     is_outlier = departure_px > 0
     without_edge = no_edge & (np.arange(n) < first_outside)
     flags = [
@@ -162,13 +150,6 @@ def assess_points(
         np.array(flags, dtype=np.str_), missing.slot, tuple(notes), first, last,
         first_outside if first_outside < n else None, without_edge, departure_px,
     )  # fmt: skip
-
-
-def _outlier_distances(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
-    """Distance of outlying points from where their neighbours lead, shape (n_frames,), px; 0 of all others."""
-    inside = _off_parabola(y, sigma_px, first, last)
-    at_start, at_end = _hidden_at_start(y, sigma_px, first), _flying_on(y, sigma_px, first, last)
-    return np.asarray(np.maximum(np.maximum(inside, at_start), at_end))
 
 
 def _off_parabola(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
@@ -207,10 +188,7 @@ def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
         excess = y[i] - 2 * before[-1] + before[-2]
         roughness = float(np.max(np.abs(np.diff(before, 2))))
         # 0.5, 4.0: A last step that exceeds the extrapolated one by this part of a step (chosen)
-        limit = max(
-            OUTLIER_SIGMAS * sigma_px[i], 2 * OUTLIER_PX, 0.5 * (before[-1] - before[-2]),
-            4.0 * roughness,
-        )  # fmt: skip
+        limit = max(OUTLIER_SIGMAS * sigma_px[i], 2 * OUTLIER_PX, 0.5 * (before[-1] - before[-2]), 4.0 * roughness)
         if np.isfinite(excess) and excess > limit:
             distance_px[i : last + 1] = np.maximum(distance_px[i : last + 1], excess)
     return distance_px
@@ -260,25 +238,15 @@ def ending_of(
     grown_px, truncated_px = float(np.nanmedian(end) - np.nanmedian(start)) if both else math.nan, math.nan
     followed = np.flatnonzero(np.isfinite(edge_px))
     if whole and quality.last_moving >= followed[-1] and quality.left_picture is None:
-        truncated_px = float(edge_px[followed[-1]]) - float(
-            np.median(edge_px[followed][: max(quality.first_moving, 1)])
-        )
+        at_first = np.median(edge_px[followed][: max(quality.first_moving, 1)])
+        truncated_px = float(edge_px[followed[-1]]) - float(at_first)
     return Ending(grown_px, truncated_px, tuple(growth_end_notes(luma, quality, edge_px, name, number)), name, place)
-
-
-def body_end_note(frame: int, turns_back: bool) -> str:
-    """Say why a body is not followed to the end of the recording."""
-    if turns_back:
-        return f"the body turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
-    return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
 
 
 def growth_end_notes(
     luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_]
 ) -> list[str]:
-    """Say why the edge stops before the recording does. Shapes: luma (n_frames, height, width); edge_px, number
-    (n_frames,).
-    """
+    """Say why the edge stops before the recording does; arrays as in `ending_of`."""
     n, last = len(edge_px), quality.last_moving
     # 4: fewest frames of standstill at the end that are reported (chosen)
     if last < 0 or last >= n - 4 or quality.left_picture is not None:

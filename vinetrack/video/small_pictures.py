@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.frames import (
-    DECODER_THREADS,
     Frames,
     PacketIndex,
     Recording,
@@ -29,11 +28,8 @@ from vinetrack.video.frames import (
 )
 from vinetrack.video.kymograph import largest_steps
 
-SMALL_PX = 240  # Longer side of the pictures in which the axis is sought (chosen)
-MAX_FRAMES = 150  # Maximum number of frames in which it is sought, spread evenly over the changes (chosen)
-# Score of a pixel (measured)
-MIN_GROWTH_SCORE = 0.4
-MIN_GROWN_PART = 0.16  # Part of all change that must pass MIN_GROWTH_SCORE (chosen)
+MAX_FRAMES = 150  # Maximum number of frames in which the axis is sought, spread evenly over the changes (chosen)
+MIN_GROWN_PART = 0.16  # Part of all change that must be growth (chosen)
 
 Pixels = tuple[Floats, Floats, Floats, Floats, int]  # Pixels that change: x, y, time of change and weight, shape
 
@@ -70,7 +66,7 @@ class SmallPictures:
         frames, noise = self._busy
         rows, columns = y.astype(int), x.astype(int)
         lasting = _step_fraction(frames[:, rows, columns].astype(float), time.astype(int), noise)
-        kept = lasting * _contrast_gain(frames, rows, columns, noise) > MIN_GROWTH_SCORE
+        kept = lasting * _contrast_gain(frames, rows, columns, noise) > 0.4  # score of growth (measured)
         if weight[kept].sum() < MIN_GROWN_PART * weight.sum():
             return self.changed
         weight = weight[kept] * _timing_information(time[kept], weight[kept], n_times)
@@ -96,11 +92,11 @@ def _changed(busy: NDArray[np.float32], noise_power: float) -> Pixels:
 
 
 def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
-    """Shrink pictures to at most SMALL_PX and correct flicker; also return the factor."""
+    """Shrink pictures to at most 240 px (chosen) and correct flicker; also return the factor."""
     import cv2
 
     n, height, width = luma.shape
-    factor = max(1.0, max(height, width) / SMALL_PX)
+    factor = max(1.0, max(height, width) / 240)
     size = (max(8, round(width / factor)), max(8, round(height / factor)))
     small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
     sampled = small[:, ::4, ::4] + np.float32(1.0)
@@ -230,10 +226,6 @@ def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
 MAX_BYTES_WHOLE = 400_000_000  # Size of the pictures up to which a recording is read whole (chosen)
 MAX_SAMPLES = 400  # Maximum number of samples (chosen)
 MAX_SAMPLE_INTERVAL = 120  # Maximum number of frames from one sample to the next (chosen)
-SAMPLE_SIZE_PX = 320  # Longer side of the samples, px (chosen)
-CHANGE_THRESHOLD = 6.0  # Change of a pixel that counts, in units of its noise (measured)
-MIN_CHANGE = 3.0  # Smallest change that counts, grey levels of 255 (chosen)
-MIN_CHANGED_PIXELS = 8  # Number of pixels that must have changed (chosen)
 MARGIN_FRAMES, MARGIN_PART = 40, 0.15  # Frames, and fraction of the event, added at either end (chosen)
 
 
@@ -251,8 +243,8 @@ def read_event(recording: Recording, frame_range: tuple[int, int] | None = None)
 
 
 def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], count: int) -> tuple[int, int] | None:
-    """Return the first and last frame of the event, margin included, from samples of the recording. Returns first and
-    last frame, both included; None if nothing changes. Shapes: pictures (height, width); numbers (n_pictures,).
+    """Return the first and last frame of the event, both and a margin included, from samples of the recording; None if
+    nothing changes. Shapes: pictures (height, width); numbers (n_pictures,).
     """
     if len(pictures) < 8:
         return None
@@ -272,11 +264,12 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], co
     noise = 1.4826 / np.sqrt(2) * np.median(steps, axis=0)
     # The median of three samples at either end shows the scene at rest.
     first, last = (np.median([level(picture) for picture in end], axis=0) for end in (pictures[:3], pictures[-3:]))
-    limit = np.maximum(CHANGE_THRESHOLD * np.maximum(noise, np.median(noise)), MIN_CHANGE)
+    # 6.0, 3.0: change of a pixel that counts, in units of its noise (measured), and at least, grey levels (chosen)
+    limit = np.maximum(6.0 * np.maximum(noise, np.median(noise)), 3.0)
 
     def differ(still: NDArray[np.float32]) -> NDArray[np.int_]:
         counts = [np.count_nonzero(np.abs(level(picture) - still) > limit) for picture in pictures]
-        return np.flatnonzero(np.array(counts) >= MIN_CHANGED_PIXELS)
+        return np.flatnonzero(np.array(counts) >= 8)  # pixels that must have changed (chosen)
 
     differs_from_first, differs_from_last = differ(first), differ(last)
     if not len(differs_from_first) or not len(differs_from_last):
@@ -310,10 +303,10 @@ def _sample_film(recording: Recording, index: PacketIndex) -> tuple[list[NDArray
     candidates = keys if keys_only else np.arange(len(index.pts))
     chosen = {int(index.pts[i]): int(i) for i in candidates[:: max(1, -(-len(candidates) // MAX_SAMPLES))]}
     pictures = {}
-    for frame in decode_packets(recording.path, set(chosen) if keys_only else None, DECODER_THREADS):
+    for frame in decode_packets(recording.path, set(chosen) if keys_only else None):
         number = None if frame.pts is None else chosen.get(frame.pts)
         if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
-            pictures[number] = _shrunk(luma_plane(frame, recording.whole), recording.bit_depth)
+            pictures[number] = _shrunk(luma_plane(frame), recording.bit_depth)
     numbers = sorted(pictures)
     return [pictures[number] for number in numbers], np.array(numbers, dtype=int)
 
@@ -325,23 +318,17 @@ def _raw_event(recording: Recording, frame_range: tuple[int, int] | None) -> Fra
     count = len(raw.offsets)
     if frame_range is None:
         every = max(1, -(-count // MAX_SAMPLES))
-        chosen = np.arange(0, count, every)
         sparse = replace(raw, offsets=raw.offsets[::every])
         pictures = [_shrunk(picture, recording.bit_depth) for picture in sparse.pictures()]
-        frame_range = event_range(pictures, chosen[: len(pictures)], count)
+        frame_range = event_range(pictures, every * np.arange(len(pictures)), count)
     if frame_range is None or frame_range[0] >= count:
         return read_frames(recording)
     first, last = frame_range[0], min(frame_range[1], count - 1)
-    slots, irregular = np.arange(count), ""
-    if raw.times_s is not None:
-        slots, irregular = slots_from_times(raw.times_s[:count])
+    slots, irregular = (np.arange(count), "") if raw.times_s is None else slots_from_times(raw.times_s[:count])
     part = replace(raw, offsets=raw.offsets[first : last + 1], times_s=None)
     frames = read_frames(replace(recording, raw=part, declared_frames=len(part.offsets)))
-    name = recording.path.name
-    notes = [
-        f"{name}: of {count} frames only {first} to {last}, around the motion, are read; choose others in frames_used"
-    ]
-    notes += [f"{name}: {irregular}"] if irregular else []
+    part_read = f"of {count} frames only {first} to {last}, around the motion, are read; choose others in frames_used"
+    notes = [f"{recording.path.name}: {note}" for note in (part_read, irregular) if note]
     end = first + len(frames)
     return replace(
         frames, recording=recording, slot=slots[first:end], notes=(*frames.notes, *notes),
@@ -350,11 +337,11 @@ def _raw_event(recording: Recording, frame_range: tuple[int, int] | None) -> Fra
 
 
 def _shrunk(picture: NDArray[Any], bit_depth: int = 8) -> NDArray[np.uint8]:
-    """Shrink a picture to at most SAMPLE_SIZE_PX, grey levels of 255."""
+    """Shrink a picture to at most 320 px (chosen), grey levels of 255."""
     import cv2
 
     height, width = picture.shape
-    factor = max(1.0, max(height, width) / SAMPLE_SIZE_PX)
+    factor = max(1.0, max(height, width) / 320)
     size = (max(8, round(width / factor)), max(8, round(height / factor)))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     scale = 1.0 if picture.dtype == np.uint8 else 255.0 / (2**bit_depth - 1)

@@ -20,13 +20,7 @@ from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video.axis import Axis
 
 BAND_GAP_PX = 5  # Rows left out between tube and background, to allow for sway and blur (chosen)
-BAND_HEIGHT_PX = (14, 44)  # Rows of background on either side, at least and at most (chosen)
-BACKGROUND_PIXELS = 9000  # Pixels of the background that are used, evenly spaced (derived)
-REFERENCE_FRAMES = 15  # Frames whose median is the reference (derived)
 SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
-SHAKE_FLOOR_PX = 0.04  # Smaller shake is not removed (chosen)
-# Slope of an axis over its whole length up to which it is treated as lying along rows or columns (chosen)
-SNAP_TOLERANCE_PX = 0.4
 
 
 @dataclass(frozen=True)
@@ -89,9 +83,9 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
     return Strip(values, scale, offset, shift, _noise(values, scale), axis, stabilised)
 
 
-def snap_to_grid(axis: Axis, tolerance_px: float = SNAP_TOLERANCE_PX) -> Axis:
-    """Move an axis that lies along rows or columns, except for a small slope, onto whole rows or columns. Cutting then
-    needs no interpolation, and a tenth of the time.
+def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
+    """Move an axis that lies along rows or columns, except for a small slope over its whole length (0.4 px, chosen),
+    onto whole rows or columns. Cutting then needs no interpolation, and a tenth of the time.
     """
     if axis.bends:
         return axis
@@ -180,13 +174,14 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     n, unit = len(luma), camera_unit(luma)
     shift, shaken = np.zeros((n, 2)), False
     places = _beside(axis, half, luma.shape[1:])
-    picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
+    # 15: frames whose median is the reference (derived)
+    picks = np.unique(np.linspace(0, n - 1, 15).astype(int))
     basis = _reference(luma[picks], places, None) if len(places) else np.zeros((4, 0))
     if not basis[0].any():  # no background, or black all over
         return np.full(n, unit), np.zeros(n), shift, shaken
     fit, sigma = register(luma, places, basis, None)
-    # 2.5: median shift over its standard error below which it is noise (derived)
-    least_px = np.maximum(SHAKE_FLOOR_PX, 2.5 * np.median(sigma, axis=0))
+    # 0.04, 2.5: smaller shake is not removed, px (chosen), and one of so many standard errors is noise (derived)
+    least_px = np.maximum(0.04, 2.5 * np.median(sigma, axis=0))
     if (np.median(np.abs(fit[:, 2:]), axis=0) > least_px).any():
         halves = [_followed(luma, part, picks)[1:] for part in np.array_split(places, 2)]
         if shifts_agree(*halves):
@@ -200,14 +195,16 @@ def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> NDArray[np.int_]:
     """Whole pixels (x, y) of the background on both sides of a tube, from its start to its end, shape (n, 2); none
     where there is hardly any.
     """
-    rows = half + BAND_GAP_PX + np.arange(int(np.clip(half, *BAND_HEIGHT_PX)))
+    # 14, 44: rows of background on either side, at least and at most (chosen)
+    rows = half + BAND_GAP_PX + np.arange(int(np.clip(half, 14, 44)))
     along, across = np.meshgrid(np.arange(1.0, axis.length_px), np.concatenate([-rows, rows]), indexing="ij")
     places = np.rint(axis.points(along.ravel(), across.ravel())).astype(int)
     places = places[((places >= 2) & (places < np.array(shape[::-1]) - 2)).all(axis=1)]
     # 6: fewest rows, of the whole length together, that tell of flicker and shift (chosen)
     if len(places) < 6 * axis.length_px:
         return places[:0]
-    places = places[:: max(1, len(places) // BACKGROUND_PIXELS) | 1]  # odd: rows come in pairs, and none is left out
+    # 9000: pixels used (derived), every so-manieth, an odd number: rows come in pairs, and none is left out
+    places = places[:: max(1, len(places) // 9000) | 1]
     return places[np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1]
 
 

@@ -160,13 +160,7 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
 # A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out
 # as physics.
 
-EXPOSURE_TOLERANCE_PX = 3.0  # Difference of the blur lengths of stated and seen exposure that is allowed (measured)
 ERROR_FACTOR = 1.5  # Factor between picture and sheet above which the difference is an error (chosen)
-# Difference of logarithms within which width and growth are off by the same factor (chosen)
-SAME_FACTOR_LOG = 0.1
-# Angle, in degrees, between growth and the picture's rows above which growth runs up or down (chosen)
-STEEP_DEG = 60.0
-OR_SKIP_COMPARISON = "or write compare_sizes: no where only part of the tube is seen"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,10 +224,12 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     growth_too_long = growth > 1 + 0.06
     width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
     growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
-    remedy = f"check it, its unit and the scale, {OR_SKIP_COMPARISON}"
-    if width_off and _near_one(facts.tube_width_mm / length_mm) and _near_one(facts.growth_mm / diameter_mm):
+    remedy = "check it, its unit and the scale, or write compare_sizes: no where only part of the tube is seen"
+    # 0.2, 0.1: difference from 1 of a ratio that may be of swapped sizes, and of the logarithms of two factors that
+    # are the same (chosen)
+    if width_off and max(abs(facts.tube_width_mm / length_mm - 1), abs(facts.growth_mm / diameter_mm - 1)) < 0.2:
         remedy = "diameter_mm and length_mm are swapped"
-    elif width_off and growth > 0 and abs(math.log(width / growth)) < SAME_FACTOR_LOG:
+    elif width_off and growth > 0 and abs(math.log(width / growth)) < 0.1:
         both = f"{width_text}, and {growth_text} ({length_mm:g} in the sheet)"
         return [_problem("diameter_mm", diameter_mm, both, width, "check the scale: calibration, mm_per_px")]
     problems = [_problem("diameter_mm", diameter_mm, width_text, width, remedy)] if width_off else []
@@ -241,34 +237,25 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
 
 
 def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
-    """Report a stated exposure that the blur of the moving edge contradicts. It is a warning beyond
-    EXPOSURE_TOLERANCE_PX, and an error beyond twice that.
+    """Report a stated exposure that the blur of the moving edge contradicts: a warning, or an error where it is twice
+    as much as is allowed.
     """
+    allowed_px = 3.0  # Difference of the blur lengths of stated and seen exposure (measured)
     stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
     difference_px = abs(stated - seen) * tracking.fast_px_per_frame
-    if not (
-        difference_px > EXPOSURE_TOLERANCE_PX
-        and max(stated / seen, seen / stated) > ERROR_FACTOR
-        and trial.exposure_s > 0
-    ):
+    off = difference_px > allowed_px and max(stated / seen, seen / stated) > ERROR_FACTOR
+    if not (off and trial.exposure_s > 0):
         return []
     stated_us, seen_us = 1e6 * trial.exposure_s, 1e6 * trial.exposure_s * seen / stated
     message = (
         f"differs: the edge is blurred as by {number(seen_us, 2)} µs, a factor {_factor(stated / seen)}, where it "
         f"moves {number(tracking.fast_px_per_frame, 2)} px a frame"
     )
-    severity = "error" if difference_px > 2 * EXPOSURE_TOLERANCE_PX else "warning"
-    given: dict[str, Any] = {
-        "column": "exposure_us",
-        "value": f"{stated_us:g}",
-        "remedy": "check exposure_us, its unit and capture_fps",
-    }
-    return [Problem(message=message, severity=severity, of_a_measurement=True, **given)]
-
-
-def _near_one(ratio: float) -> bool:
-    """Whether a ratio is 1 to within 0.2."""
-    return abs(ratio - 1) < 0.2
+    problem = Problem(
+        message=message, severity="error" if difference_px > 2 * allowed_px else "warning", column="exposure_us",
+        value=f"{stated_us:g}", remedy="check exposure_us, its unit and capture_fps", of_a_measurement=True,
+    )  # fmt: skip
+    return [problem]
 
 
 def _factor(ratio: float) -> str:
@@ -290,6 +277,7 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
     That is a vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as
     straight down and that runs level.
     """
+    steep_deg = 60.0  # Angle between growth and the picture's rows above which growth runs up or down (chosen)
     upright, level = [], []
     for fact, trial in zip(facts, trials, strict=True):
         if fact.axis is None or isinstance(fact.axis, CurvedAxis) or trial.travel_ratio == 1:
@@ -297,8 +285,8 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
         right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
         slope_deg = math.degrees(math.atan2(down, right))
         from_level_deg = math.degrees(math.asin(min(abs(math.cos(trial.growth_angle_rad)), 1.0)))
-        upright += [trial.name] if slope_deg > STEEP_DEG and from_level_deg < 90 - STEEP_DEG else []
-        level += [trial.name] if slope_deg < 90 - STEEP_DEG and trial.name in blank else []
+        upright += [trial.name] if slope_deg > steep_deg and from_level_deg < 90 - steep_deg else []
+        level += [trial.name] if slope_deg < 90 - steep_deg and trial.name in blank else []
     findings = (
         (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
         (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
@@ -339,18 +327,18 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
 
 
 def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
-    """Convert the facts of a recording to a JSON mapping. Returns mapping; units are in the keys."""
-    entry = {key: value for key, value in vars(facts).items() if key != "axis"}
+    """Convert the facts of a recording to a JSON mapping; units are in the keys."""
     axis = None if facts.axis is None else axis_entry(facts.axis)
-    return entry | {"duration_s": facts.duration_s, "axis": axis}
+    return {key: value for key, value in vars(facts).items() if key != "axis"} | {
+        "duration_s": facts.duration_s,
+        "axis": axis,
+    }
 
 
 def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
     """Cells of one recording's row."""
-    axis = "–"
-    if facts.axis is not None:
-        ends = (*facts.axis.from_px, *facts.axis.to_px)
-        axis = "{},{} → {},{}".format(*(round(end) for end in ends))
+    ends = () if facts.axis is None else (*facts.axis.from_px, *facts.axis.to_px)
+    axis = "{},{} → {},{}".format(*(round(end) for end in ends)) if ends else "–"
     return (
         facts.trial,
         "–" if facts.n_frames is None else str(facts.n_frames),
@@ -506,22 +494,19 @@ def _scale_problems(
     unscaled = [trial for trial in opened if not math.isfinite(trial.m_per_px)]
     sizes = sorted({(opened[trial].width, opened[trial].height) for trial in unscaled})
     if unscaled and settings.calibration is None:
-        lacking = "no recording has" if len(unscaled) == len(opened) else f"{len(unscaled)} recordings have no"
+        none = len(unscaled) == len(opened)
+        lacking = "no recording has a scale" if none else f"{len(unscaled)} recordings have no scale"
         remedy = "give it here, or mm_per_px in the sheet"
-        message = f"is missing: {lacking} a scale" if lacking.startswith("no ") else f"is missing: {lacking} scale"
-        problems.append(Problem(message=message, file=SETTINGS, column="calibration", remedy=remedy))
+        problems.append(Problem(f"is missing: {lacking}", file=SETTINGS, column="calibration", remedy=remedy))
     elif unscaled:
         problems += _calibration_problems(settings, folder, sizes, calibrations)
+    of_all: list[Problem] = []  # of the axis that all share, in the first picture that it does not fit
     for trial, recording in opened.items():
         if trial.axis is not None:
             problems += _axis_problems(trial, trial.axis, recording, {"trial": trial.name}, calibrations)
-    if settings.axis is not None:
-        for trial, recording in opened.items():
-            axis_problems = _axis_problems(trial, settings.axis, recording, {"file": SETTINGS}, calibrations)
-            if trial.axis is None and axis_problems:
-                problems += axis_problems
-                break
-    return problems, calibrations
+        elif settings.axis is not None:
+            of_all = of_all or _axis_problems(trial, settings.axis, recording, {"file": SETTINGS}, calibrations)
+    return problems + of_all, calibrations
 
 
 def _axis_problems(

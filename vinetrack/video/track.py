@@ -16,11 +16,9 @@ from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import (
     CENTRED_PX,
     CurvedAxis,
-    check_curve,
-    curve_note,
+    curve_problem,
     find_growth_axis,
     outline_stretches,
-    path_error_px,
     recentred_curve,
 )
 from vinetrack.video.edge import Outline, outline, track_edge
@@ -29,13 +27,10 @@ from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
 from vinetrack.video.point_quality import (
     FLOOR_PX,
-    LARGEST_BODY_FACTOR,
-    LARGEST_FACTOR,
     LOST_SIGMA_PX,
     Ending,
     PointQuality,
     assess_points,
-    body_end_note,
     calibrated_sigma,
     ending_of,
 )
@@ -47,19 +42,16 @@ from vinetrack.video.strip import Positions, Strip, cut_strip, snap_to_grid
 
 
 def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
-    """Cut the strip about the tube that grows along an axis. An outline is found for anything that changes in order.
-    Where that is no tube, the outline is arbitrary and no front passes along its middle, which the front share along
-    the middle shows. Returns the strip, centred on the tube, and the tube's outline in it; None where no single front
-    passes along the axis, or, none along the middle of what it leaves behind.. Shapes: luma (n_frames, height, width).
+    """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too.
+    An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
+    passes along its middle. None where no single front passes along the axis, or along the middle of what it leaves.
     """
     # Most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
     most_recuts = 3
-    # Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows
-    # or columns (chosen)
-    first_slope = 0.08
     if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
-    strip = first = cut_strip(luma, snap_to_grid(axis, first_slope * axis.width_px), 0.65 * axis.width_px + 3)
+    # 0.08: part of its width by which an axis may slope for the strip to be cut along whole rows or columns (chosen)
+    strip = first = cut_strip(luma, snap_to_grid(axis, 0.08 * axis.width_px), 0.65 * axis.width_px + 3)
     tube = outline(strip, outline_stretches(axis))
     try:
         for _ in range(2 * most_recuts if axis.bends else most_recuts):
@@ -75,7 +67,7 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
 
 def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
     """Cut the strip anew about the tube's centreline; the same strip where it is centred already. The ends of a given
-    axis keep their places along it: only the position across is corrected. Shapes: luma (n_frames, height, width).
+    axis keep their places along it: only the position across is corrected.
     """
     shift, slope, half = tube.shift_px, tube.slope, tube.half_px
     room = (strip.values.shape[1] - 1) / 2 - half - 3
@@ -89,10 +81,9 @@ def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
     # 0.8: tilt of the axis over its length, or shift, that is left uncorrected (chosen)
     if abs(middle) + abs(tilt) / 2 < 0.8 and 0 <= room < 0.3 * half + 6:
         return strip
-    start = strip.axis.points(np.array(0.0), shift)
-    stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
-    turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
-    return cut_strip(luma, snap_to_grid(turned), half * 1.15 + 5, strip)
+    ends = strip.axis.points(np.array([0.0, strip.axis.length_px]), np.array([shift, shift + tilt]))
+    start, stop = ((float(x), float(y)) for x, y in ends)
+    return cut_strip(luma, snap_to_grid(Axis(start, stop, 2 * half)), half * 1.15 + 5, strip)
 
 
 # ------------------------------------------------------------------------------
@@ -104,7 +95,7 @@ def follow(
 ) -> tuple[Strip, Positions, tuple[float, float]]:
     """Follow a body (travel ratio 1) or the edge of a tube; where there is no tube, the arrival of whatever comes.
     Returns the strip, centred on what moves along the axis, the positions along it, and the tube's width with its
-    standard error, px, NaN where there is none. Shapes: luma (n_frames, height, width).
+    standard error, px, NaN where there is none.
     """
     no_width = math.nan, math.nan
     try:
@@ -195,8 +186,6 @@ def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
 
 FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)
 
-GIVEN_AXIS_MARGIN = 0.08  # Width added to a given axis, as a fraction of its length (derived)
-
 STABILISED_PX = 0.1  # Error left after a shaken camera was stabilised on the still background (measured)
 
 
@@ -227,34 +216,19 @@ class Tracking:
         return np.arange(len(self.track.time_s)) if self.strip_frames is None else self.strip_frames
 
 
-def track_recording(
-    trial: Trial,
-    axis: Axis | None = None,
-    *,
-    m_per_px: float | None = None,
-    position_m: Callable[[Floats], Floats] | None = None,
-) -> Tracking:
-    """Track the leading edge of one recording, or the body where the travel ratio is 1. Shapes: position_m (n, 2)."""
+def track_recording(trial: Trial, axis: Axis | None = None) -> Tracking:
+    """Track the leading edge of one recording, or the body where the travel ratio is 1, by the trial's own scale."""
     if trial.video is None:
         raise RecordingError("no recording is named", "fill in the column video", trial.name)
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording)
-    frames = read_event(recording, trial.frames_used)
-    return track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
+    return track_frames(read_event(recording, trial.frames_used), trial, capture_fps, axis)
 
 
-def track_frames(
-    frames: Frames,
-    trial: Trial,
-    capture_fps: float,
-    axis: Axis | None = None,
-    *,
-    m_per_px: float | None = None,
-    position_m: Callable[[Floats], Floats] | None = None,
-) -> Tracking:
+def track_frames(frames: Frames, trial: Trial, capture_fps: float, axis: Axis | None = None) -> Tracking:
     """Track frames that are already in memory; see `track_recording`."""
-    scale = trial.m_per_px if m_per_px is None else m_per_px
-    return in_metres(track_pixels(frames, trial, capture_fps, axis, trial.diameter_m / scale), trial, scale, position_m)
+    tracking = track_pixels(frames, trial, capture_fps, axis, trial.diameter_m / trial.m_per_px)
+    return in_metres(tracking, trial, trial.m_per_px)
 
 
 def track_pixels(
@@ -265,8 +239,8 @@ def track_pixels(
     """
     name = frames.recording.path.name
     exposure_s = capture_exposure(trial, frames.recording)
-    selection = _select_frames(frames, trial)
-    rows, number = selection.rows, selection.number
+    rows, left_out = _select_frames(frames, trial)
+    number = frames.first + rows
     luma = frames.luma if len(rows) == len(frames) else frames.luma[rows]
     axis_given = axis is not None
     try:
@@ -282,32 +256,31 @@ def track_pixels(
     )  # fmt: skip
     if quality.last_moving < 0:
         raise RecordingError(f"{_why_motionless(total_px, quality)}", name=name)
-    errors_px = _random_error(random_px, followed, quality), _slow_error(strip, followed)
-    notes, ending = _notes(frames, selection, luma, trial, strip, followed, quality, axis_given)
+    # Random, with the disagreement of bands and the distance of outliers; and shared by neighbouring frames: of edge,
+    # stabilisation and path.
+    random_px = np.hypot(np.maximum(random_px, followed.bands_sigma_px), quality.departure_px)
+    slow_px = np.hypot(np.broadcast_to(followed.slow_px, random_px.shape), STABILISED_PX if strip.stabilised else 0.0)
+    # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
+    slow_px = np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad if isinstance(strip.axis, CurvedAxis) else 0.0)
+    errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
+    notes, ending = _notes(frames, number, luma, trial, strip, followed, quality, axis_given)
+    notes += left_out
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
     pictures = tuple((int(number[i]), luma[i].copy()) for i in shown)
+    kymograph = strip.values.mean(axis=1, dtype=np.float32) * strip.scale[:, None] + strip.offset[:, None]
     shake_px = np.zeros(frames.n_recorded)
     shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
-        track, strip.axis, _kymograph(strip), pictures, followed.blur_px, followed.exposure_frames, shake_px,
+        track, strip.axis, kymograph.astype(np.float32), pictures, followed.blur_px, followed.exposure_frames, shake_px,
         *width_px, followed.seen_exposure_frames, followed.fast_px_per_frame, strip_frames=number, ending=ending,
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Selection:
-    """Frames to be tracked: their `rows` among the decoded frames and their `number` in the recording. `notes` say
-    which others are left out.
+def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
+    """Rows of the decoded frames that the sheet allows, of the longest undamaged stretch, without odd ones at the
+    start; and notes on the others.
     """
-
-    rows: Indices
-    number: Indices
-    notes: tuple[str, ...]
-
-
-def _select_frames(frames: Frames, trial: Trial) -> _Selection:
-    """Frames that the sheet allows, of the longest undamaged stretch, without odd ones at the start."""
     name = frames.recording.path.name
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"only {len(frames)} frames can be decoded", f"at least {FEWEST_FRAMES} are needed", name)
@@ -330,7 +303,7 @@ def _select_frames(frames: Frames, trial: Trial) -> _Selection:
     if odd.any():
         first_odd = int(number[odd][0])
         notes.append(f"{name}: {int(odd.sum())} frames are unlike all others and rejected, first frame {first_odd}")
-    return _Selection(rows, number[rows], tuple(notes))
+    return rows, notes
 
 
 def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Floats, Floats]:
@@ -341,33 +314,17 @@ def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Float
     edge_px = followed.edge_px
     # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
     moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
-    largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
-    random_px = calibrated_sigma(edge_px, followed.sigma_px, moving & np.isfinite(edge_px), largest=largest)
+    use, is_body = moving & np.isfinite(edge_px), trial.travel_ratio == 1
+    random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
     return random_px, np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
 
 
-def _random_error(random_px: Floats, followed: Positions, quality: PointQuality) -> Floats:
-    """Random error with the disagreement of bands and the distance of outliers in it, LOST_SIGMA_PX at most."""
-    larger_px = np.maximum(random_px, followed.bands_sigma_px)
-    return np.minimum(np.hypot(larger_px, quality.departure_px), LOST_SIGMA_PX)
-
-
-def _slow_error(strip: Strip, followed: Positions) -> Floats:
-    """Error that neighbouring frames share: of edge, stabilisation and path, LOST_SIGMA_PX at most."""
-    slow_px = np.broadcast_to(followed.slow_px, followed.edge_px.shape)
-    slow_px = np.hypot(slow_px, STABILISED_PX if strip.stabilised else 0.0)
-    return np.minimum(np.hypot(slow_px, path_error_px(strip.axis)), LOST_SIGMA_PX)
-
-
 def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
     """The message for a recording in which no frame is moving."""
-    # Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing
-    # moves (chosen)
-    mostly_lost = 0.5
-    outlying_px = np.minimum(np.hypot(total_px, quality.departure_px), LOST_SIGMA_PX)
-    total_px = np.where(total_px < LOST_SIGMA_PX, outlying_px, total_px)
-    if np.mean(~(total_px < LOST_SIGMA_PX)) > mostly_lost:
+    lost = ~(total_px < LOST_SIGMA_PX) | ~(np.hypot(total_px, quality.departure_px) < LOST_SIGMA_PX)
+    # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
+    if np.mean(lost) > 0.5:
         return (
             "something moves, but its edge is too vague to be followed: film it nearer, with more light or"
             " contrast, or at more frames a second"
@@ -376,54 +333,56 @@ def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
 
 
 def _notes(
-    frames: Frames, selection: _Selection, luma: NDArray[Any], trial: Trial, strip: Strip, followed: Positions,
+    frames: Frames, number: Indices, luma: NDArray[Any], trial: Trial, strip: Strip, followed: Positions,
     quality: PointQuality, axis_given: bool,
 ) -> tuple[list[str], Ending]:  # fmt: skip
-    """Sentences about the track: its points, its end, its axis, and the frames left out; and how it ends."""
-    name, number = frames.recording.path.name, selection.number
+    """Sentences about the track: its points, its end and its axis; and how it ends."""
+    name = frames.recording.path.name
     notes, ending = [*frames.notes, *quality.notes], Ending()
     if followed.end is not None:
-        last_frame, turns_back = followed.end
-        notes.append(f"{name}: {body_end_note(int(number[last_frame]), turns_back)}")
+        frame, turns_back = int(number[followed.end[0]]), followed.end[1]
+        why = f"is not recognised after frame {frame}: it is gone, hidden or turned over"
+        if turns_back:
+            why = f"turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
+        notes.append(f"{name}: the body {why}")
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
     if isinstance(strip.axis, CurvedAxis) and not axis_given:
-        notes.append(f"{name}: {curve_note(strip.axis)}")
+        notes.append(
+            f"{name}: the vine bends by {np.degrees(strip.axis.total_turn_rad):.0f}° in all, and positions are those "
+            "along a curve that was found: look at its overlay, and draw the curve (column `axis`) if the edge is not "
+            "on it"
+        )
     if not followed.is_edge:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
             "to about a pixel"
         )
-    return [*notes, *selection.notes], ending
+    return notes, ending
 
 
 def locate_axis(luma: NDArray[Any], small: SmallPictures, axis: Axis | None, trial: Trial, diameter_px: float) -> Axis:
-    """Find the growth axis, or give a known one a width and centre it on the motion. Shapes: luma (n_frames, height,
-    width).
-    """
+    """Find the growth axis, or give a known one a width and centre it on the motion."""
     given = axis is not None
     if axis is None:
         axis = find_growth_axis(small) if trial.travel_ratio == 2 else find_axis(small, grows=False)
-    width_px = 2 * _half_width(axis, diameter_px)
+    # The width of the axis, else the sheet's diameter by the scale, else a fifth of the axis
+    widths_px = (axis.width_px, diameter_px, 0.2 * axis.length_px)
+    width_px = next(width for width in widths_px if np.isfinite(width))
     if not given:
         return replace(axis, width_px=width_px)
-    # A margin for an axis a few degrees off; it is centred on the motion, here or by `tube_strip`.
-    wide_px = width_px + GIVEN_AXIS_MARGIN * axis.length_px
+    # A margin for an axis a few degrees off (derived); it is centred on the motion, here or by `tube_strip`.
+    wide_px = width_px + 0.08 * axis.length_px
     if axis.bends:
         width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
-        check_curve(axis, width_px / 2 if width_known else math.nan, luma.shape[1:])
+        size_px = luma.shape[2], luma.shape[1]
+        if complaint := curve_problem(axis, width_px / 2 if width_known else math.nan, size_px):
+            raise RecordingError(f"the growth axis {complaint[0]}", complaint[1])
         wide_px = min(wide_px, 2 * axis.largest_half_px)
         return replace(axis, width_px=max(wide_px, width_px) if width_known else wide_px)
     axis = replace(axis, width_px=wide_px)
     return centred_on_motion(small, axis) if trial.travel_ratio == 1 else axis
-
-
-def _half_width(axis: Axis, diameter_px: float) -> float:
-    """Half the width of the tube, px: the axis's, else the sheet's diameter by the scale, else a tenth of the axis."""
-    if np.isfinite(axis.width_px):
-        return axis.width_px / 2
-    return diameter_px / 2 if np.isfinite(diameter_px) else 0.1 * axis.length_px
 
 
 def _assemble(
@@ -480,9 +439,3 @@ def in_metres(
         lead_position_systematic_m=None if slow_px is None else slow_px * local_m_per_px,
     )
     return replace(tracking, track=track)
-
-
-def _kymograph(strip: Strip) -> NDArray[np.float32]:
-    """Brightness of the strip averaged across, shape (n_frames, n_along), grey levels."""
-    mean = strip.values.mean(axis=1, dtype=np.float32)
-    return (mean * strip.scale[:, None] + strip.offset[:, None]).astype(np.float32)
