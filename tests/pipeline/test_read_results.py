@@ -70,7 +70,7 @@ def test_a_fit_comes_back_as_it_was_written(tmp_path: Path) -> None:
     assert back["B"].value == 6.4
     assert back.between[0, 0] == 0.04
     assert back.fitted_values == {"eversion_damping.B": {"v": 6.4}, "yield_pressure.P_y": 3000.0}
-    assert back.trial_table()["release_sigma_s"].tolist() == [0.1]
+    assert [trial.release_sigma_s for trial in back.trials.values()] == [0.1]
     assert str(back) == str(fit())
 
 

@@ -20,8 +20,9 @@ import unicodedata
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -398,6 +399,29 @@ def _plain(content: Any) -> Any:
     if isinstance(content, float):
         return content if math.isfinite(content) else None
     return content.as_posix() if isinstance(content, Path) else content
+
+
+class JsonRecord:
+    """A dataclass that a JSON file holds, each field under its name or its alias; absent keys take their defaults."""
+
+    def to_json(self) -> dict[str, Any]:
+        """As the file holds it."""
+        adapter = _adapter(type(self))  # type: ignore[arg-type]
+        entry: dict[str, Any] = adapter.dump_python(self, by_alias=True, warnings=False)
+        return entry
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Self:
+        """Read what `to_json` wrote."""
+        read: Self = _adapter(cls).validate_python(entry)  # type: ignore[arg-type]
+        return read
+
+
+@cache
+def _adapter(record: type) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(record)
 
 
 # ------------------------------------------------------------------------------

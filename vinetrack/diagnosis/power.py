@@ -16,10 +16,11 @@ from pydantic import Field
 
 from vinetrack.core.notebook import plot
 from vinetrack.core.records import Trial
+from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.experiment.schema import COLUMNS
-from vinetrack.inference.fit_result import JsonRecord, OrNaN, or_open
+from vinetrack.inference.fit_result import OrNaN, or_open
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

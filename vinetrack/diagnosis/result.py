@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from vinetrack.core.notebook import plot
+from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.remarks import Remark, StoredRemark, in_words, remark
-from vinetrack.inference.fit_result import Fit, JsonRecord, Number, OrNaN
+from vinetrack.inference.fit_result import Fit, Number, OrNaN
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -536,9 +536,6 @@ def _cross_products_of(predictor: Predictor, trial_effects: Floats, rows: NDArra
     return at_correlation(all_products(columns, [predictor.data[row].first for row in rows]), rho)
 
 
-__all__ = ["FitError", "fit", "predict", "refit"]
-
-
 @in_one_blas_thread
 def fit(
     model: Model,

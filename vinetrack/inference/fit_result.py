@@ -6,15 +6,16 @@ import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import BeforeValidator, Field
 
 from vinetrack.core.notebook import html_table, plot
 from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
@@ -318,27 +319,6 @@ OrNaN = Annotated[float, BeforeValidator(or_nan)]  # A number of a JSON file, wh
 def or_open(end: float) -> BeforeValidator:
     """A number of a JSON file, where null means this end of the numbers."""
     return BeforeValidator(lambda value: end if value is None else value)
-
-
-class JsonRecord:
-    """A dataclass that a JSON file holds, each field under its name or its alias; absent keys take their defaults."""
-
-    def to_json(self) -> dict[str, Any]:
-        """As the file holds it."""
-        adapter = _adapter(type(self))  # type: ignore[arg-type]
-        entry: dict[str, Any] = adapter.dump_python(self, by_alias=True, warnings=False)
-        return entry
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Self:
-        """Read what `to_json` wrote; a number that is null is NaN."""
-        read: Self = _adapter(cls).validate_python(entry)  # type: ignore[arg-type]
-        return read
-
-
-@cache
-def _adapter(record: type) -> TypeAdapter[Any]:
-    return TypeAdapter(record)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.robust_covariance import FILM_ERROR, film_errors, sandwich
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 
 # ------------------------------------------------------------------------------
@@ -134,15 +134,6 @@ class FitSummary(NumberTable):
     def fitted_values(self) -> dict[str, Value]:
         """Fitted values by `effect.parameter`, SI, as `Model.with_values` takes them."""
         return values_by_key((number.key, number.vine, number.value) for number in self.numbers)
-
-    def trial_table(self) -> pd.DataFrame:
-        """One row per trial: `trial, release_s, release_sigma_s, origin_m, …`; deviations are relative."""
-        import pandas as pd
-
-        columns = ["trial", *(entry.name for entry in fields(TrialEstimates))]
-        return pd.DataFrame(
-            [{"trial": name, **asdict(estimates)} for name, estimates in self.trials.items()], columns=columns
-        )
 
     def to_json(self) -> dict[str, Any]:
         """As `fit.json` holds it, SI; a refused fit has its model and the reason alone."""
