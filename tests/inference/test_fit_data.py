@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grown import grown, pairs_of
 from hidden_truth import sheet
 from lsoda_vine import N_TRUE, small_campaign
 from vine_truth import Vine, record
@@ -18,7 +19,6 @@ from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.whitening import at_correlation, products, whiten
-from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 STEP_M = 2e-3
 
@@ -117,17 +117,11 @@ def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials()
         for trial in bare
         for load in (0.0, 0.03)
     ]
-    nature = GroundTruth(
-        effects=(*BASE, "payload_friction"),
-        values={**damping_values(trials), "payload_friction.mu_p": 0.3},
-        damping_scatter=2e-3,
-        pressure_scatter=5e-3,
-        noise_m=2e-5,
-        noise_correlation=0.0,
-        seed=20_411,
-        frames_after_end=4,
-    )
-    fit = vt.fit(vt.base_model(), [(each.stated, each.track) for each in grow(trials, nature)], profile=False)
+    virtual = grown(
+        trials, 20_411, ["payload_friction"], {"payload_friction.mu_p": 0.3},
+        damping_scatter=2e-3, pressure_scatter=5e-3, noise_m=2e-5, frames_after_end=4,
+    )  # fmt: skip
+    fit = vt.fit(vt.base_model(), pairs_of(virtual), profile=False)
     candidates = candidates_of(fit.model, ["payload_friction"], None)
     questions = misfit_tests(fit, hypotheses.testable(candidates, fit.predictor.data)[0], FALSE_ALARM_LEVEL_FIRST_ROUND)
     size, sigma = (float(values[0]) for values in (questions.scores.size, questions.scores.plain_sigma))

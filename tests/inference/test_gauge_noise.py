@@ -152,14 +152,6 @@ def test_readings_of_an_interpolated_trace_are_recovered(per_reading: float):
     assert np.max(np.abs(held.places + frames[0] - read_at[: held.places.size])) <= 1.0
 
 
-def test_white_noise_and_exact_curves_are_not_taken_for_interpolated():
-    draw = np.random.default_rng(3)
-    white_Pa = 20e3 + 100.0 * draw.standard_normal(200)
-    traces = [white_Pa, 16e3 * -np.expm1(-TIMES_S / 0.2), np.full(50, 20e3)]
-    for told, trace in zip(gauge_readings(traces), traces, strict=True):
-        np.testing.assert_array_equal(told.values_Pa, trace)
-
-
 @pytest.mark.parametrize("digit_Pa", [0.01, 1.0, 10.0])
 @pytest.mark.parametrize("per_reading", [5.0, 40.0])
 def test_readings_are_recovered_from_samples_rounded_after_interpolation(per_reading: float, digit_Pa: float):
@@ -224,16 +216,14 @@ def test_readings_that_are_nearly_all_equal_are_handled():
     told_Pa = np.full(60, 20e3)
     told_Pa[30] = 20.1e3
     assert noise_correlation([told_Pa] * 4) == 0.0
-    (quiet,) = denoised_traces([as_track(TIMES_S[:60], TIMES_S[:60], told_Pa)])
-    assert quiet is not None
-    assert np.isfinite(quiet.pressure_Pa).all()
+    assert np.isfinite(without_noise(told_Pa)).all()
 
 
 @pytest.mark.parametrize("digit_Pa", [1.0, 10.0, 100.0])
 def test_noise_of_about_a_digit_is_not_taken_for_readings(digit_Pa: float):
     draw = np.random.default_rng(12)
     falls = 20e3 * (1 + TIMES_S / 0.4) ** -0.01
-    for sigma_Pa in (0.0, 0.3 * digit_Pa, digit_Pa):
+    for sigma_Pa in (0.0, 0.3 * digit_Pa, digit_Pa, 100.0 * digit_Pa):
         noisy = falls + sigma_Pa * draw.standard_normal((8, falls.size))
         traces = list(digit_Pa * np.round(noisy / digit_Pa))
         for told, trace in zip(gauge_readings(traces), traces, strict=True):

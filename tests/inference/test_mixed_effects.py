@@ -272,15 +272,3 @@ def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence() -> 
     assert decrease > CONVERGED_DECREASE
     assert damping == 0
     assert step == pytest.approx(levenberg_marquardt_step(cross_products, frame, state, 0.0)[0])
-
-
-def test_one_step_solves_a_linear_problem() -> None:
-    columns = columns_of(3, 25, 2, seed=8)
-    truth = np.array([0.3, -0.7])
-    for c in columns:
-        c[:, -1] = c[:, 4:6] @ truth + 0.2 * c[:, 0] - 0.1
-    frame, state = frame_of(3, 25, 2, flat_sd=1e6), state_of(3, 2, 1e-3, sigma=1e-3)
-    step, own, predicted_decrease = levenberg_marquardt_step(crossed(columns), frame, state, 0.0)
-    assert step == pytest.approx(truth, abs=1e-6)
-    assert own[:, 0] == pytest.approx(0.2, abs=1e-6)
-    assert predicted_decrease > 0
