@@ -57,17 +57,13 @@ def wandering(*, at_rest: bool) -> Pairs:
     return spoilt
 
 
-@pytest.fixture(scope="module")
-def complete() -> list[Fit]:
-    return [fitted(grown(seed=seed)) for seed in (32, 33, 34)]
-
-
 def test_replicates_that_deviate_together_are_seen() -> None:
     assert between_conditions_p(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
 
 
 @pytest.mark.slow
-def test_replicates_that_scatter_and_noise_that_is_the_same_at_rest_are_none(complete: list[Fit]) -> None:
+def test_replicates_that_scatter_and_noise_that_is_the_same_at_rest_are_none() -> None:
+    complete = [fitted(grown(seed=seed)) for seed in (32, 33, 34)]
     assert all(between_conditions_p(fit) > 0.05 for fit in complete)
     assert all(noise_in_motion_p(fit) > 1e-2 for fit in [*complete, fitted(wandering(at_rest=True))])
 
