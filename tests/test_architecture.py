@@ -45,13 +45,13 @@ FLOORS = (
 
 BUDGETS = {
     "cli": (649, 4, 7),
-    "core": (1443, 9, 57),
-    "diagnosis": (11600, 23, 137),
+    "core": (1467, 9, 57),
+    "diagnosis": (11602, 23, 137),
     "dynamics": (2501, 8, 28),
     "effects": (2580, 43, 143),
     "experiment": (1948, 7, 17),
     "figures": (3054, 9, 40),
-    "inference": (6773, 14, 62),
+    "inference": (6741, 14, 62),
     "interface": (651, 3, 2),
     "kinematics": (1940, 6, 12),
     "laboratory": (1846, 6, 13),

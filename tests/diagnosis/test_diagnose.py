@@ -8,27 +8,31 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import grown as campaigns
 import numpy as np
 import pandas as pd
 import pytest
 from hidden_truth import Pairs, grown, sheet
 from lsoda_vine import as_track, small_campaign
 from own_effect import NAME, write_effect
+from tube.folder import write_folder
+from tube.models import fit_tubes, models, threshold_kPa
+from tube.recordings import read_recordings, thresholds
 
 import vinetrack as vt
-from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.core.records import Floats, Track, Trial, plain_track
+from vinetrack.core.tables import write_json
 from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
 from vinetrack.diagnosis.missing_force import RankedLaw
-from vinetrack.diagnosis.remarks import remark
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.replicates import LostFrames, with_lost_frames
-from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
+from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.selection import contradictions
 from vinetrack.effects import EffectError, own_effects
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 from vinetrack.tracks.importers import flag_end_of_motion
 
 FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
@@ -49,78 +53,54 @@ def depleted(depleted_pairs: Pairs) -> Diagnosis:
     return vt.diagnose(depleted_pairs, candidates=FEW)
 
 
-def test_nothing_missing_is_adequate(nothing_missing: Diagnosis) -> None:
+def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_said(nothing_missing: Diagnosis) -> None:
     assert nothing_missing.verdict == nothing_missing.final_verdict == "adequate"
     assert nothing_missing.effects == nothing_missing.answer_set == ()
-
-
-def test_adequate_says_how_large_an_effect_could_still_be(nothing_missing: Diagnosis) -> None:
     ranking = {one.effect: one for one in nothing_missing.rounds[0].ranking}
-    friction = ranking["tail_friction"]
-    assert 0 < friction.largest["tail_friction.mu_w"] < 0.2
-    scale = ranking["length_scale"]
-    assert abs(scale.largest["length_scale.eps"]) < 0.05
-
-
-def behind_a_known_lens(pairs: Pairs) -> Pairs:
-    """The same tracks from a camera whose lens is known: no smooth error of position is allowed for."""
-    return [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
-
-
-@pytest.fixture(scope="module")
-def largest() -> float:
-    """Friction that could hide behind a known lens."""
-    pairs = grown(seed=7000, trials=sheet()[::2])
-    nothing = vt.diagnose(behind_a_known_lens(pairs), candidates=FEW, ladder=False, advice=False)
-    return next(o for o in nothing.rounds[0].ranking if o.effect == "tail_friction").largest["tail_friction.mu_w"]
-
-
-@pytest.mark.slow
-def test_a_size_well_beyond_what_could_hide_would_have_been_seen(largest: float) -> None:
-    """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
-    hidden = grown({"tail_friction.mu_w": 4 * largest}, seed=7000, trials=sheet()[::2])
-    diagnosis = vt.diagnose(behind_a_known_lens(hidden), candidates=FEW, ladder=False, advice=False)
-    assert diagnosis.verdict in ("missing", "ambiguous")
-    assert "tail_friction" in diagnosis.answer_set
-
-
-def test_what_these_conditions_cannot_show_is_not_testable(nothing_missing: Diagnosis) -> None:
-    blind = {one.effect: one.reason for one in nothing_missing.rounds[0].ranking if one.status == NOT_TESTABLE}
+    assert 0 < ranking["tail_friction"].largest["tail_friction.mu_w"] < 0.2
+    assert abs(ranking["length_scale"].largest["length_scale.eps"]) < 0.05
+    blind = {name: one.reason for name, one in ranking.items() if one.status == NOT_TESTABLE}
     assert blind["inlet_loss"].facts["column"] == "inlet_mm"
     assert blind["payload_drag"].facts["column"] == "payload_g"
     assert "static_yield" in blind
 
 
-def test_a_missing_effect_is_named_with_its_size(depleted: Diagnosis) -> None:
+@pytest.mark.slow
+def test_a_size_well_beyond_what_could_hide_would_have_been_seen() -> None:
+    """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
+
+    def asked(**hidden: float) -> Diagnosis:
+        values = {f"tail_friction.{name}": size for name, size in hidden.items()}
+        pairs = grown(values, seed=7000, trials=sheet()[::2])
+        known = [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
+        return vt.diagnose(known, candidates=FEW, ladder=False, advice=False)
+
+    largest = next(one.largest for one in asked().rounds[0].ranking if one.effect == "tail_friction")
+    found = asked(mu_w=4 * largest["tail_friction.mu_w"])
+    assert found.verdict in ("missing", "ambiguous")
+    assert "tail_friction" in found.answer_set
+
+
+def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted: Diagnosis) -> None:
     assert (depleted.verdict, depleted.final_verdict) == ("missing", "adequate")
     assert depleted.effects == depleted.answer_set == ("reservoir_depletion",)
     gamma = depleted.fit["gamma"]
     assert abs(gamma.value - 1.25) < 3 * gamma.sigma
     assert gamma.sigma < 0.02
-
-
-def test_the_ladder_falls_to_the_replicates(depleted: Diagnosis) -> None:
-    ladder = depleted.ladder
-    assert ladder is not None
-    assert list(ladder["added"]) == ["", "reservoir_depletion"]
-    before, after = ladder.iloc[0], ladder.iloc[1]
-    assert after["rms_left_out_m"] < 0.5 * before["rms_left_out_m"]
-    assert after["rms_in_sample_m"] < 2 * after["floor_m"]
-
-
-def test_n_and_B_come_home(depleted: Diagnosis) -> None:
-    before, after = depleted.fits[0]["n"], depleted.fits[1]["n"]
+    before, after = (fit["n"] for fit in depleted.fits)
     assert abs(after.value - 0.37) < 4 * after.sigma
     assert abs(after.value - 0.37) < 0.5 * abs(before.value - 0.37)
+    assert depleted.ladder is not None
+    assert list(depleted.ladder["added"]) == ["", "reservoir_depletion"]
+    first, last = depleted.ladder.iloc[0], depleted.ladder.iloc[1]
+    assert last["rms_left_out_m"] < 0.5 * first["rms_left_out_m"]
+    assert last["rms_in_sample_m"] < 2 * last["floor_m"]
 
 
 def test_the_answer_can_be_written_as_json(depleted: Diagnosis, tmp_path: Path) -> None:
-    from vinetrack.core.tables import write_json
-
     write_json(tmp_path / "diagnosis.json", depleted.to_json())
     read = json.loads((tmp_path / "diagnosis.json").read_text())
-    assert read["verdict"] in VERDICTS
-    assert read["effects"] == ["reservoir_depletion"]
+    assert (read["verdict"], read["effects"]) == ("missing", ["reservoir_depletion"])
     assert [one["verdict"] for one in read["rounds"]] == ["missing", "adequate"]
     assert read["rounds"][0]["ranking"][0]["effect"] == "reservoir_depletion"
     matrix = np.array(read["cosines"]["matrix"], dtype=float)
@@ -144,15 +124,7 @@ def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
     trial, track = next((trial, track) for trial, track in once if trial.pressure_Pa == 40e3)
     moving = int(np.searchsorted(track.lead_position_m, track.lead_position_m[0] + 0.05))
     keep = np.arange(track.time_s.size) != moving
-    time_s = track.time_s[:-1]
-    cut = replace(
-        track,
-        time_s=time_s,
-        lead_position_m=track.lead_position_m[keep],
-        lead_position_sigma_m=track.lead_position_sigma_m[keep],
-        flag=track.flag[keep],
-        edge_px=track.edge_px[keep],
-    )
+    cut = plain_track(track.time_s[:-1], track.lead_position_m[keep])
     others = [(one, other) for one, other in once if one.name != trial.name]
     few = ["reservoir_depletion", "tail_friction", "length_scale"]
     found = vt.diagnose([(trial, cut), *others], candidates=few, ladder=False, advice=False)
@@ -173,7 +145,9 @@ def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diag
 @pytest.mark.slow
 def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
     own = own_effects([write_effect(tmp_path)])
-    pairs = _with_own(own[NAME], "k", 1.5, seed=7003)
+    scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005, "longest_frames": 420}
+    virtual = campaigns.grown(sheet()[::2], 7003, own=[tmp_path / f"{NAME}.py"], values={f"{NAME}.k": 1.5}, **scatter)
+    pairs = campaigns.pairs_of(virtual)
     found = vt.diagnose(pairs, user_effects=own, candidates=(*FEW, NAME), ladder=False, advice=False)
     assert found.verdict == "missing"
     assert found.effects == (NAME,)
@@ -181,45 +155,7 @@ def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
     assert abs(size.value - 1.5) < 4 * size.sigma
 
 
-def _with_own(effect: vt.effects.Effect, symbol: str, size: float, *, seed: int) -> Pairs:
-    """Trials grown with an effect that only its file knows; their B and P scatter, release lies between frames."""
-    draw = np.random.default_rng(seed)
-    trials = sheet()[::2]
-    coefficients = damping_values(trials)["eversion_damping.B"]
-    pairs = []
-    for trial in trials:
-        B = coefficients[trial.vine] * math.exp(0.02 * draw.standard_normal())
-        true = replace(trial, pressure_Pa=trial.pressure_Pa * (1 + 0.005 * draw.standard_normal()))
-        model = (vt.base_model() + effect).with_values(
-            {"eversion_damping.B": {trial.vine: B}, "eversion_damping.n": 0.37, f"{effect.name}.{symbol}": size}
-        )
-        since = np.arange(-20, 400) / trial.capture_fps + draw.uniform(0, 1) / trial.capture_fps
-        y = vt.simulate(model, true, since).lead_position_m
-        last = int(np.searchsorted(y, 0.9 * trial.length_m))
-        position_m = 0.03 + y[:last] + 1e-4 * draw.standard_normal(last)
-        nothing = np.full(last, np.nan)
-        flags = np.full(last, "", dtype=object)
-        pairs.append((trial, Track(since[:last] - since[0], position_m, nothing, flags, nothing)))
-    return pairs
-
-
-@pytest.mark.slow
-def test_what_no_effect_explains_is_unexplained_and_drawn() -> None:
-    pairs = []
-    for trial, track in grown(seed=7004, trials=sheet()[:6:2]):  # one vine
-        y = track.lead_position_m - track.lead_position_m[:5].mean()
-        bump = 1.5e-3 * np.sin(2 * math.pi * np.clip(y, 0, None) / 0.05) * (y > 0.03)
-        pairs.append((trial, replace(track, lead_position_m=track.lead_position_m + bump)))
-    found = vt.diagnose(pairs, candidates=FEW, ladder=False)
-    assert found.verdict == "unexplained"
-    assert found.effects == ()
-    assert found.missing_force is not None
-    assert found.force_table is not None
-    assert len(found.force_table)
-    assert found.learned_table is not None
-
-
-def test_an_unknown_candidate_is_an_error_that_suggests(depleted_pairs: Pairs) -> None:
+def test_an_unknown_candidate_is_an_error(depleted_pairs: Pairs) -> None:
     with pytest.raises(EffectError):
         vt.diagnose(depleted_pairs, candidates=["air_drage"])
 
@@ -243,49 +179,24 @@ def plain() -> Fit:
     return fit(vt.base_model(), grown(seed=51), profile=False)
 
 
-def exponents_apart(by: float) -> list[tuple[Trial, Track]]:
-    """Two vines that the sheet lets share one n, and whose n differ."""
-    pairs = []
-    for prefix, change in (("a", -by / 2), ("b", by / 2)):
-        trials = [trial for trial in sheet() if trial.name.startswith(prefix)]
-        values = {**damping_values(trials), "eversion_damping.n": 0.37 + change}
-        nature = GroundTruth(
-            effects=BASE, values=values, damping_scatter=5e-3, pressure_scatter=1e-3, noise_m=3e-5, seed=9
-        )
-        pairs += [(one.stated, one.track) for one in grow(trials, nature)]
-    return pairs
-
-
-def errors(*left_out_m: float) -> pd.DataFrame:
-    return pd.DataFrame({"rms_left_out_m": left_out_m})
-
-
 def test_an_effect_that_predicts_no_condition_better_is_said_to(plain: Fit) -> None:
-    (told,) = contradictions((plain,), ("latch_release",), errors(4.09e-3, 4.09e-3))
-    assert told == remark("left_out_error_does_not_fall", name="latch_release", without_m=4.09e-3, with_m=4.09e-3)
-    assert contradictions((plain,), ("latch_release",), errors(4.09e-3, 3.2e-3)) == ()
-    assert contradictions((plain,), ("latch_release",), errors(4.09e-3, np.nan)) == ()
+    def told(left_out_m: float) -> tuple[Remark, ...]:
+        return contradictions((plain,), ("latch_release",), pd.DataFrame({"rms_left_out_m": [4.09e-3, left_out_m]}))
 
-
-def test_a_model_that_holds_is_not_contradicted(plain: Fit) -> None:
-    assert contradictions((plain,), (), None) == ()
-
-
-@pytest.mark.slow
-def test_n_that_differs_between_vines_contradicts_an_adequate_model() -> None:
-    found = fit(vt.base_model(), exponents_apart(0.06), profile=False)
-    assert {told.code for told in contradictions((found,), (), None)} == {"still_drifts"}
+    expected = remark("left_out_error_does_not_fall", name="latch_release", without_m=4.09e-3, with_m=4.09e-3)
+    assert told(4.09e-3) == (expected,)
+    assert told(3.2e-3) == told(np.nan) == contradictions((plain,), (), None) == ()
 
 
 @pytest.mark.slow
 def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain: Fit) -> None:
-    steps, pressure_step = plain.predictor.steps.copy(), plain.predictor.pressure_step.copy()
+    of_fit = {name: getattr(plain.predictor, name) for name in ("steps", "pressure_step")}
+    kept = {name: array.copy() for name, array in of_fit.items()}
     theta = plain.solution.state.theta.copy()
     diagnosis = vt.diagnose(plain, candidates=["leak", "air_drag"], ladder=False, advice=False)
-    assert not np.shares_memory(diagnosis.fits[0].predictor.steps, plain.predictor.steps)
-    assert not np.shares_memory(diagnosis.fits[0].predictor.pressure_step, plain.predictor.pressure_step)
-    np.testing.assert_array_equal(plain.predictor.steps, steps)
-    np.testing.assert_array_equal(plain.predictor.pressure_step, pressure_step)
+    for name, array in of_fit.items():
+        assert not np.shares_memory(getattr(diagnosis.fits[0].predictor, name), array)
+        np.testing.assert_array_equal(array, kept[name])
     np.testing.assert_array_equal(plain.solution.state.theta, theta)
 
 
@@ -293,37 +204,29 @@ def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain: Fit) -> Non
 
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")
 DRAG = 0.5
-NOISE_M = 2e-3
 TUBES_ALONE = {"capstan_friction", "gas_inertia", "tail_friction", "latch_release", "fold_inertia", "wall_stretch"}
 
 
-def dropped(name: str, seed: int, diameter_m: float, mass_kg: float) -> tuple[Trial, Track]:
-    """A ball that falls in air, y = (v²/g) ln cosh(g t/v) with the terminal speed v = √(2 m g / (ρ A C_D)), filmed."""
-    trial = Trial(
-        name=name,
-        condition=f"{1e3 * mass_kg:g} g",
-        diameter_m=diameter_m,
-        pressure_Pa=0.0,
-        yield_pressure_Pa=0.0,
-        payload_kg=mass_kg,
-        travel_ratio=1.0,
-    )
-    terminal_m_s = math.sqrt(2 * mass_kg * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * DRAG))
-    time_s = np.arange(100) / 120
-    fallen_s = np.maximum(time_s - 0.0513, 0.0)
-    fallen_m = terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * fallen_s / terminal_m_s))
-    noise_m = np.random.default_rng(seed).normal(0, NOISE_M, time_s.size)
-    return trial, as_track(time_s, fallen_m + 0.004 + noise_m)
+def fallen_m(time_s: Floats, trial: Trial) -> Floats:
+    """Of a ball in air, y = (v²/g) ln cosh(g t/v) with the terminal speed v = √(2 m g / (ρ A C_D))."""
+    terminal_m_s = math.sqrt(2 * trial.payload_kg * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * DRAG))
+    return terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * np.maximum(time_s, 0.0) / terminal_m_s))
+
+
+def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:
+    still = {"pressure_Pa": 0.0, "yield_pressure_Pa": 0.0, "travel_ratio": 1.0, "condition": f"{1e3 * mass_kg:g} g"}
+    return Trial(name=name, diameter_m=diameter_m, payload_kg=mass_kg, **still)
 
 
 @pytest.fixture(scope="module")
 def balls() -> list[tuple[Trial, Track]]:
-    kinds = ((0.04, 2.7e-3), (0.1, 20e-3), (0.038, 60e-3))
-    return [
-        dropped(f"d{kind}_{repeat}", 20100 + 10 * kind + repeat, *size)
-        for kind, size in enumerate(kinds)
-        for repeat in range(3)
-    ]
+    made, time_s = [], np.arange(100) / 120
+    for kind, size in enumerate(((0.04, 2.7e-3), (0.1, 20e-3), (0.038, 60e-3))):
+        for repeat in range(3):
+            trial = of_ball(f"d{kind}_{repeat}", *size)
+            noise_m = np.random.default_rng(20100 + 10 * kind + repeat).normal(0, 2e-3, time_s.size)
+            made.append((trial, as_track(time_s, fallen_m(time_s - 0.0513, trial) + 0.004 + noise_m)))
+    return made
 
 
 @pytest.mark.slow
@@ -359,17 +262,17 @@ def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_
     time_s = np.arange(-8, 60) / 15
     drops = []
     for seed in (10, 11):
-        (trial, _), noise_m = dropped(f"d{seed}", seed, 0.074, 0.145), np.random.default_rng(seed).normal(0, 5e-3, 68)
-        limit_m_s = math.sqrt(2 * 0.145 * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * 0.5))
-        fallen_m = limit_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * np.maximum(time_s, 0) / limit_m_s))
-        seen, part = fallen_m < 47, 2 * fallen_m / 47 - 1
+        trial, noise_m = of_ball(f"d{seed}", 0.074, 0.145), np.random.default_rng(seed).normal(0, 5e-3, 68)
+        y = fallen_m(time_s, trial)
+        seen, part = y < 47, 2 * y / 47 - 1
         lens_m = 0.018 * (part**3 - 0.6 * part) + 0.01 * (part**2 - 1)
-        drops.append((trial, plain_track(time_s[seen], (fallen_m + lens_m + noise_m)[seen])))
+        drops.append((trial, plain_track(time_s[seen], (y + lens_m + noise_m)[seen])))
     found = vt.diagnose(drops, model=vt.make_model(model), ladder=False, advice=False)
     assert found.verdict == verdict
     assert abs(found.fits[-1]["C_D"].value - 0.5) < 3 * found.fits[-1]["C_D"].sigma
 
 
+@pytest.mark.real
 @pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
 def test_the_drag_of_eight_real_paper_cups_is_named() -> None:
     found = vt.diagnose(Path(REAL) / "falling_cups", ladder=False, advice=False)
@@ -377,13 +280,31 @@ def test_the_drag_of_eight_real_paper_cups_is_named() -> None:
     assert found.fits[-1]["C_D"].value == pytest.approx(1.24, abs=0.03)
 
 
-def test_a_local_force_narrower_than_a_millimetre_is_not_named() -> None:
-    assert Law("patch", n_shapes=2, low=-2e-3, high=4e-4).is_unresolved
-    assert not Law("patch", n_shapes=2, low=0.02, high=0.04).is_unresolved
+@pytest.mark.real
+@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
+def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_mends_most_of_it(tmp_path: Path) -> None:
+    """Its authors fit a pressure to start above one to stop, and drag that rises with the length."""
+    sticking = [one for one in read_recordings(Path(REAL) / "everting_tube") if one.name == "tube2_hi_2"]
+    experiment = vt.read_experiment(write_folder(sticking, tmp_path))
+    # Whether a model is adequate is decided before any candidate is tried.
+    assert vt.diagnose(experiment, candidates=("tail_friction",), ladder=False, advice=False).verdict != "adequate"
+    named, mended = models(), "+ static_yield + tail_friction + reel_inertia"
+    before, after = (fit_tubes(name, named[name], experiment, sticking) for name in ("Eq. (2)", mended))
+    assert before.rms_m > 0.03
+    assert after.rms_m < before.rms_m / 2
+    assert after.fits["2"].chi2_per_dof > 100  # and it is still not what happened
+    # The slope of the friction alone is what the starts show: fits of nearly the same error, which rounding decides
+    # between, put the first start at 9.3 or 11.5 kPa where 12.1 was read off.
+    start, fit = thresholds(sticking[0], "start"), after.fits[sticking[0].tube]
+    slope = threshold_kPa(fit, "start", 1.0) - threshold_kPa(fit, "start", 0.0)
+    assert slope == pytest.approx(start[1], rel=1 / 3)
 
 
-def test_a_force_far_beyond_drive_and_weight_is_not_named() -> None:
-    estimate = ForceEstimate(100.0, np.array([-1.6e6]), 10.0, np.empty(0), 1)
+def test_a_force_narrower_than_a_millimetre_or_far_beyond_drive_and_weight_is_not_named() -> None:
+    estimate = ForceEstimate(100.0, np.array([-20.0]), 1.0, np.empty(0), 1)
     law = Law("patch", n_shapes=2, low=0.274, high=0.294)
-    assert not RankedLaw(law, estimate, 0.0, largest_N=50.0).is_detected
-    assert RankedLaw(law, replace(estimate, amplitude=np.array([-20.0]), sigma=1.0), 0.0, largest_N=50.0).is_detected
+    assert RankedLaw(law, estimate, 0.0, largest_N=50.0).is_detected
+    absurd = replace(estimate, amplitude=np.array([-1.6e6]), sigma=10.0)
+    assert not RankedLaw(law, absurd, 0.0, largest_N=50.0).is_detected
+    assert not law.is_unresolved
+    assert replace(law, low=-2e-3, high=4e-4).is_unresolved

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from hidden_truth import Pairs, sheet
+from grown import Pairs, grown, pairs_of
+from hidden_truth import sheet
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -25,47 +26,28 @@ from vinetrack.diagnosis.misfit_tests import (
     MisfitTests,
     misfit_tests,
 )
-from vinetrack.diagnosis.result import Confounder
 from vinetrack.diagnosis.score_test import fit_columns, levers_of
 from vinetrack.diagnosis.selection import confounders_of, size_not_excluded
+from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit
 from vinetrack.inference.robust_covariance import Systematics
-from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 
 def careful(payload_g: float, seed: int) -> Pairs:
     """Twenty-four trials of two vines that scatter by a tenth of a per cent, half of them with a payload."""
     loads = [(f"{trial.name}_{load:g}g", load, trial) for load in (0.0, payload_g) for trial in sheet()]
     trials = [replace(trial, name=name, payload_kg=1e-3 * load) for name, load, trial in loads]
-    nature = GroundTruth(
-        effects=BASE,
-        values=damping_values(trials),
-        damping_scatter=1e-3,
-        pressure_scatter=1e-3,
-        yield_error_kPa=0.05,
-        noise_m=2e-5,
-        noise_correlation=0.0,
-        seed=seed,
-    )
-    return [(one.stated, one.track) for one in grow(trials, nature)]
+    care = {"damping_scatter": 1e-3, "pressure_scatter": 1e-3, "yield_error_kPa": 0.05, "noise_m": 2e-5}
+    return pairs_of(grown(trials, seed, **care))
 
 
-def asked(pairs: Pairs) -> MisfitTests:
-    model = vt.base_model()
+def questioned(pairs: Pairs, model: Model, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND) -> MisfitTests:
+    """What tests say of the model, fitted to these trials, beside all other effects."""
     candidates = candidates_of(model, None, None)
     found = fit(model, pairs, host=host_for(model, candidates), profile=False)
-    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], FALSE_ALARM_LEVEL_FIRST_ROUND)
-
-
-@pytest.fixture
-def without_doubts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def none(*about: Any, film: bool) -> Systematics:  # noqa: ARG001
-        return Systematics.none([trial.time_s.size for trial in about[-1]])
-
-    monkeypatch.setattr(questions, "systematics_of", none)
-    return
+    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], level)
 
 
 def misweighed() -> Pairs:
@@ -76,34 +58,25 @@ def misweighed() -> Pairs:
 def seen_crookedly() -> Pairs:
     """Tracks that say of themselves that they err by 20 µm, and do, slowly and all alike."""
 
-    def bent(position_m: np.ndarray) -> np.ndarray:
-        grown_m = position_m - position_m[0]
-        return position_m + 2e-5 * np.cos(2 * np.pi * grown_m / 0.28)
-
-    return [
-        (
-            replace(trial, video=Path("filmed.mp4")),
-            replace(
-                track,
-                lead_position_m=bent(track.lead_position_m),
-                lead_position_sigma_m=np.full(track.time_s.size, 2e-5),
-            ),
-        )
-        for trial, track in careful(0.0, 9)
-    ]
+    made = []
+    for trial, track in careful(0.0, 9):
+        y = track.lead_position_m
+        bent_m, sigma_m = y + 2e-5 * np.cos(2 * np.pi * (y - y[0]) / 0.28), np.full(y.size, 2e-5)
+        stated = replace(track, lead_position_m=bent_m, lead_position_sigma_m=sigma_m)
+        made.append((replace(trial, video=Path("filmed.mp4")), stated))
+    return made
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
-def test_a_doubt_shared_by_trials_is_no_missing_effect(make):
-    assert not asked(make()).rejects_model
+def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(make, monkeypatch):
+    def none(*about: Any, film: bool) -> Systematics:  # noqa: ARG001
+        return Systematics.none([trial.time_s.size for trial in about[-1]])
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [misweighed, seen_crookedly])
-@pytest.mark.usefixtures("without_doubts")
-def test_unless_it_is_left_out(make):
-    assert asked(make()).rejects_model
+    asked = questioned(make(), vt.base_model())
+    assert not asked.rejects_model
+    monkeypatch.setattr(questions, "systematics_of", none)
+    assert misfit_tests(asked.fit, asked.effects, FALSE_ALARM_LEVEL_FIRST_ROUND).rejects_model
 
 
 def through_a_lens(allowance_m: float) -> Pairs:
@@ -120,8 +93,8 @@ def through_a_lens(allowance_m: float) -> Pairs:
 
 @pytest.mark.slow
 def test_a_lens_of_a_tenth_of_a_millimetre_is_no_physics_where_that_much_is_allowed_for():
-    assert not asked(through_a_lens(1e-4)).rejects_model
-    assert asked(through_a_lens(0.0)).rejects_model
+    assert not questioned(through_a_lens(1e-4), vt.base_model()).rejects_model
+    assert questioned(through_a_lens(0.0), vt.base_model()).rejects_model
 
 
 # What of a fitted size another effect may account for: against refits and quadrature.
@@ -134,30 +107,14 @@ TRUE_DRAG, TRUE_INLET = 1.2, 1.0
 def both_act() -> Pairs:
     """Trials of two tubes through connectors a third as wide: air slows down there as drag would slow the vine."""
     trials = [replace(trial, inlet_m=0.33 * trial.diameter_m) for trial in sheet()]
-    nature = GroundTruth(
-        effects=(*BASE, "inlet_loss", "air_drag"),
-        values={**damping_values(trials), INLET: TRUE_INLET, DRAG: TRUE_DRAG},
-        damping_scatter=5e-3,
-        pressure_scatter=1e-3,
-        yield_error_kPa=0.05,
-        noise_m=3e-5,
-        seed=31,
-    )
-    return [(one.stated, one.track) for one in grow(trials, nature)]
+    care = {"damping_scatter": 5e-3, "pressure_scatter": 1e-3, "yield_error_kPa": 0.05, "noise_m": 3e-5}
+    return pairs_of(grown(trials, 31, ["inlet_loss", "air_drag"], {INLET: TRUE_INLET, DRAG: TRUE_DRAG}, **care))
 
 
 @pytest.fixture(scope="module")
 def after() -> MisfitTests:
     """The model with the inlet loss alone, fitted to trials that have drag too, held against all other effects."""
-    model = vt.base_model() + vt.effects.inlet_loss
-    candidates = candidates_of(model, None, None)
-    found = fit(model, both_act(), host=host_for(model, candidates), profile=False)
-    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], FALSE_ALARM_LEVEL_LATER_ROUNDS)
-
-
-@pytest.fixture(scope="module")
-def by_effect(after: MisfitTests) -> dict[str, Confounder]:
-    return {one.effect: one for one in confounders_of(after, ["inlet_loss"])}
+    return questioned(both_act(), vt.base_model() + vt.effects.inlet_loss, FALSE_ALARM_LEVEL_LATER_ROUNDS)
 
 
 def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after: MisfitTests) -> None:
@@ -172,18 +129,14 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after: 
     assert fell == pytest.approx(lever * drag, rel=0.1)
 
 
-def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth(
-    after: MisfitTests, by_effect: dict[str, Confounder]
-) -> None:
+def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth(after: MisfitTests) -> None:
+    by_effect = {one.effect: one for one in confounders_of(after, ["inlet_loss"])}
     # Linear damping takes the same sign of the force, fold inertia the other: found in refits with either held.
     linear, fold = by_effect["linear_damping"], by_effect["fold_inertia"]
     assert linear.value < linear.number.value < fold.value
     number = after.fit[INLET]
     for one in by_effect.values():
         assert one.low_95 <= number.low < TRUE_INLET < number.high <= one.high_95
-
-
-def test_a_size_that_stands_alone_carries_no_warning(after: MisfitTests) -> None:
     assert confounders_of(after, ["air_drag"]) == ()
 
 
@@ -222,9 +175,7 @@ def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_colu
     fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False, thorough=False)
     before = fit_columns(fit)
 
-    def cannot(*_: object, **__: object) -> None:
-        raise SimulationError("Trial t: the model could not be integrated beyond 3.7 s.")
-
+    cannot = Mock(side_effect=SimulationError("Trial t: the model could not be integrated beyond 3.7 s."))
     monkeypatch.setattr(fit.predictor, "linearise", cannot)
     columns = fit_columns(replace(fit))
     assert len(columns) == len(before)

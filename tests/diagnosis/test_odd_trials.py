@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -39,51 +40,32 @@ def campaign() -> list[tuple[Trial, Track]]:
 
 def stated(pairs: list[tuple[Trial, Track]], **kPa: float) -> list[tuple[Trial, Track]]:
     """The campaign with other pressures in these rows, and other conditions therefore."""
-    return [
-        (
-            replace(trial, pressure_Pa=1e3 * kPa[trial.name], condition=f"12mm_{kPa[trial.name]}")
-            if trial.name in kPa
-            else trial,
-            track,
-        )
-        for trial, track in pairs
-    ]
+    told = {name: {"pressure_Pa": 1e3 * value, "condition": f"12mm_{value}"} for name, value in kPa.items()}
+    return [(replace(trial, **told.get(trial.name, {})), track) for trial, track in pairs]
 
 
 def odd(pairs: list[tuple[Trial, Track]]) -> dict[str, float]:
     return {trial.name: trial.implied_pressure_Pa for trial in odd_trials(prepare(pairs)[0])}
 
 
-def test_trials_that_agree_are_none_of_them_odd(campaign):
-    assert odd(campaign) == {}
-
-
-def test_swapped_digits_are_named_with_the_pressure_that_was(campaign):
-    assert odd(stated(campaign, t2=12)) == {"t2": pytest.approx(21e3, rel=0.05)}
-
-
-def test_two_rows_that_were_exchanged_are_both_named(campaign):
-    assert odd(stated(campaign, t0=40, t11=18)) == {
-        "t0": pytest.approx(18e3, rel=0.05),
-        "t11": pytest.approx(40e3, rel=0.05),
-    }
-
-
-def test_a_trial_that_its_row_could_not_move_is_odd(campaign):
-    assert odd(stated(campaign, t5=2)) == {"t5": pytest.approx(25e3, rel=0.05)}
-
-
-def test_what_all_replicates_of_a_condition_share_is_no_slip(campaign):
-    assert odd(stated(campaign, t2=12, t3=12)) == {}
-
-
-def test_a_tenth_more_or_less_is_within_what_trials_differ_by(campaign):
-    assert odd(stated(campaign, t2=22.5)) == {}
-
-
-def test_few_trials_say_nothing_and_many_odd_ones_are_no_slips(campaign):
-    assert odd(stated(campaign[:7], t2=12)) == {}
-    assert odd(stated(campaign, t0=12, t4=10, t6=13, t9=15)) == {}
+@pytest.mark.parametrize(
+    ("trials", "told_kPa", "true_kPa"),
+    [
+        (12, {}, {}),
+        (12, {"t2": 12}, {"t2": 21}),
+        (12, {"t0": 40, "t11": 18}, {"t0": 18, "t11": 40}),
+        (12, {"t5": 2}, {"t5": 25}),
+        (12, {"t2": 12, "t3": 12}, {}),
+        (12, {"t2": 22.5}, {}),
+        (7, {"t2": 12}, {}),
+        (12, {"t0": 12, "t4": 10, "t6": 13, "t9": 15}, {}),
+    ],
+    ids=["all agree", "swapped digits", "exchanged rows", "could not move", "all replicates", "a tenth", "few", "many"],
+)
+def test_rows_of_other_recordings_are_named_with_the_pressure_that_was(campaign, trials, told_kPa, true_kPa):
+    """What all replicates share is no slip, a tenth is what trials differ by, few trials say nothing."""
+    expected = {name: pytest.approx(1e3 * value, rel=0.05) for name, value in true_kPa.items()}
+    assert odd(stated(campaign[:trials], **told_kPa)) == expected
 
 
 @pytest.mark.slow
@@ -93,49 +75,45 @@ def test_a_diagnosis_without_a_cause_names_the_row(campaign):
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
 
 
+@pytest.fixture(scope="module")
+def adequate(campaign) -> Diagnosis:
+    return diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
+
+
 @pytest.mark.slow
-def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
-    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
-    assert result.verdict == "adequate"
+def test_an_odd_trial_of_an_adequate_campaign_is_a_note(adequate):
+    assert adequate.verdict == "adequate"
     odd_ones = [OddTrial("t2", 12e3, 21e3), OddTrial("t5", 2e3, math.nan)]
-    outcome = with_odd_trials(result, odd_ones, lambda _: pytest.fail("there is nothing to ask"))
+    outcome = with_odd_trials(adequate, odd_ones, lambda _: pytest.fail("there is nothing to ask"))
     assert outcome.verdict == "adequate"
     assert outcome.notes[-1] == remark("odd_trials", odd=odd_ones, count=12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("others_say", ["tail_friction", "air_drag", "nothing"])
-def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they_do_not(campaign, others_say):
-    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
-    (row,) = [candidate for candidate in result.rounds[0].ranking if candidate.effect == "tail_friction"]
+def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they_do_not(adequate, others_say):
+    (row,) = [candidate for candidate in adequate.rounds[0].ranking if candidate.effect == "tail_friction"]
     ranking = (replace(row, in_answer_set=True),)
-    last = replace(result.rounds[-1], verdict="missing", answer_set=("tail_friction",), ranking=ranking)
-    named = replace(result, rounds=(last,), effects=("tail_friction",), explanation="A friction is missing.")
+    last = replace(adequate.rounds[-1], verdict="missing", answer_set=("tail_friction",), ranking=ranking)
+    named = replace(adequate, rounds=(last,), effects=("tail_friction",), explanation="A friction is missing.")
     others = {
         "tail_friction": named,
         "air_drag": replace(named, rounds=(replace(last, answer_set=("air_drag",)),)),
-        "nothing": result,
+        "nothing": adequate,
     }[others_say]
     outcome = with_odd_trials(named, [OddTrial("t2", 12e3, 21e3)], lambda _: others)
+    said = (outcome.verdict, outcome.answer_set, outcome.effects)
     if others_say == "tail_friction":
-        assert (outcome.verdict, outcome.answer_set, outcome.effects) == (
-            "missing",
-            ("tail_friction",),
-            ("tail_friction",),
-        )
+        assert said == ("missing", ("tail_friction",), ("tail_friction",))
         assert outcome.notes[-1].code == "odd_trials"
         return
-    assert (outcome.verdict, outcome.answer_set, outcome.effects) == ("unexplained", (), ())
+    assert said == ("unexplained", (), ())
     assert not any(candidate.in_answer_set for candidate in outcome.rounds[0].ranking)
 
 
-def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(campaign):
-    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
-    unexplained = replace(result, rounds=(replace(result.rounds[-1], verdict="unexplained"),))
-
-    def without(_: list[str]) -> Diagnosis:
-        raise FitError("there is nothing to fit")
-
+def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(adequate):
+    unexplained = replace(adequate, rounds=(replace(adequate.rounds[-1], verdict="unexplained"),))
+    without = Mock(side_effect=FitError("there is nothing to fit"))
     outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], without)
     assert outcome.notes[-1].code == "odd_trials"
 
@@ -154,24 +132,17 @@ def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(c
 
 def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
     """Normal scatter of 24 trials of six vines; the curves take a third of the degrees of freedom."""
-    monkeypatch.setattr(odd_trials_module, "CHANCE", 1e-2)
-    monkeypatch.setattr(odd_trials_module, "middle_speed", lambda data: data.speed)
-    monkeypatch.setattr(odd_trials_module, "_stated_Pa", lambda _: math.nan)
-    monkeypatch.setattr(odd_trials_module, "_force_N", lambda trial, _: trial.force_N)
-    monkeypatch.setattr(odd_trials_module, "_implied_pressure_Pa", lambda *_: math.nan)
+    given = {"middle_speed": lambda data: data.speed, "_force_N": lambda trial, _: trial.force_N}
+    given |= {"_stated_Pa": lambda _: math.nan, "_implied_pressure_Pa": lambda *_: math.nan, "CHANCE": 1e-2}
+    for name, value in given.items():
+        monkeypatch.setattr(odd_trials_module, name, value)
     draw = np.random.default_rng(20050)
     campaigns_with_odd = 0
     for _ in range(150):
         log_speed = draw.uniform(0, 1.5, 24)
         force_N = np.exp(0.37 * log_speed + 0.05 * draw.standard_normal(24))
-        data = [
-            SimpleNamespace(
-                speed=math.exp(log_speed[k]),
-                trial=SimpleNamespace(
-                    travel_ratio=2, force_N=force_N[k], name=str(k), vine=str(k % 6), condition=str(k)
-                ),
-            )
-            for k in range(24)
-        ]
+        named = [{"name": str(k), "vine": str(k % 6), "condition": str(k)} for k in range(24)]
+        trials = [SimpleNamespace(travel_ratio=2, force_N=force_N[k], **names) for k, names in enumerate(named)]
+        data = [SimpleNamespace(speed=math.exp(log_speed[k]), trial=trial) for k, trial in enumerate(trials)]
         campaigns_with_odd += bool(odd_trials(data))
     assert campaigns_with_odd <= 6

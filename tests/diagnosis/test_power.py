@@ -20,12 +20,7 @@ from vinetrack.diagnosis.campaign_power import (
     rates_of,
     simulated_diagnosis,
 )
-from vinetrack.diagnosis.further_trials import (
-    InformativeTrials,
-    _alone_and_distinct,
-    exploratory_trials,
-    further_trials,
-)
+from vinetrack.diagnosis.further_trials import _alone_and_distinct, exploratory_trials, further_trials
 from vinetrack.diagnosis.linear_power import (
     effect_power,
     fitted_without,
@@ -81,10 +76,6 @@ def place_of(questions: MisfitTests, name: str) -> int:
     return questions.sensitivities.effects.index(name)
 
 
-def test_a_noise_free_campaign_raises_no_alarm(six: MisfitTests) -> None:
-    assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold
-
-
 def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed() -> None:
     noise_m = 1e-3
     design = replace(planned(2), cameras=(FilmingPlan(500.0, noise_m),) * 6)
@@ -97,11 +88,14 @@ def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed() -> No
 
 
 def test_detectable_sizes_follow_the_normal_distribution(six: MisfitTests, power: Power) -> None:
+    assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold  # without noise there is no alarm
     # Fewer trials than a scatter can be told from: only the noise model decides.
     sigma = six.scores.plain_sigma[place_of(six, "tail_friction")]
     entry = power["tail_friction"]
     assert (entry.size_at(0.9) - entry.size_at(0.5)) / sigma == pytest.approx(norm.ppf(0.9), abs=0.06)
     assert entry.size_at(0.5) / sigma >= six.family.threshold("tail_friction") - 0.1
+    assert power["leak"].is_visible
+    assert not power["air_drag"].is_visible
 
 
 @pytest.mark.slow
@@ -120,22 +114,13 @@ def test_two_equivalent_effects_are_confused_with_each_other() -> None:
     assert "area_scale" in power["pressure_gain"].taken_for
 
 
-def test_an_effect_too_weak_for_these_trials_is_not_visible(power: Power) -> None:
-    assert not power["air_drag"].is_visible
-    assert power["leak"].is_visible
-
-
-def test_a_small_effect_has_the_score_of_linear_theory(six: MisfitTests, power: Power) -> None:
-    k = place_of(six, "leak")
-    assert score_ratio(six, k, 0.3 * power["leak"].size_at(0.5), noiseless_start(six.fit)) == pytest.approx(
-        1.0, abs=0.03
-    )
-
-
-def test_residual_displacements_equal_those_of_a_refit_without_the_effect(six: MisfitTests, power: Power) -> None:
-    k, size = place_of(six, "leak"), 0.5 * power["leak"].size_at(0.5)
+def test_a_small_effect_has_the_score_of_linear_theory_and_leaves_what_a_refit_without_it_leaves(
+    six: MisfitTests, power: Power
+) -> None:
+    k, start, size = place_of(six, "leak"), noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
+    assert score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
     moved_m = size * residual_displacements(six.fit, six.products)[k]
-    after = fitted_without(six.fit, six.sensitivities.shapes[k], size, noiseless_start(six.fit))
+    after = fitted_without(six.fit, six.sensitivities.shapes[k], size, start)
     left = [block[:, -1] for block in after.solution.columns]
     assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
 
@@ -146,25 +131,15 @@ def test_power_is_unchanged_by_writing_and_reading(power: Power) -> None:
     assert again.to_json() == power.to_json()
 
 
-def entry(**changes: object) -> EffectPower:
-    sizes = tuple(1 + 0.1 * norm.ppf(PROBABILITIES))
-    given = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
-    return replace(given, **changes)  # type: ignore[arg-type]
-
-
 def test_probabilities_invert_sizes() -> None:
+    sizes = tuple(1 + 0.1 * norm.ppf(PROBABILITIES))
+    entry = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
     for probability in (0.1, 0.5, 0.9):
-        assert entry().probability_at(entry().size_at(probability)) == pytest.approx(probability)
-    assert (entry().probability_at(0.1), entry().probability_at(3.0)) == (0.0, 1.0)
+        assert entry.probability_at(entry.size_at(probability)) == pytest.approx(probability)
+    assert (entry.probability_at(0.1), entry.probability_at(3.0)) == (0.0, 1.0)
 
 
-def test_the_exact_interval_of_a_rate() -> None:
-    # Clopper and Pearson's for nine of ten, from the quantiles of the beta distribution.
-    assert Rate(9, 10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
-    assert Rate(0, 0).interval == (0.0, 1.0)
-
-
-def test_simulated_diagnoses_are_counted() -> None:
+def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate() -> None:
     answers = [
         SimulatedDiagnosis("leak", "missing", ("leak",)),
         SimulatedDiagnosis("leak", "ambiguous", ("supply_refill", "leak")),
@@ -174,7 +149,9 @@ def test_simulated_diagnoses_are_counted() -> None:
     ]
     rates = rates_of(answers, 0.5, 0.9)
     assert (rates.detections, rates.alarms, rates.failed) == (Rate(2, 4), Rate(3, 4), 1)
-    assert rates.to_json()["rate"] == 0.5
+    # Clopper and Pearson's for nine of ten, from the quantiles of the beta distribution.
+    assert Rate(9, 10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
+    assert Rate(0, 0).interval == (0.0, 1.0)
 
 
 @pytest.mark.slow
@@ -222,26 +199,21 @@ def test_the_power_of_a_plan_is_that_of_a_sheet_with_its_trials(few: CampaignDes
     assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
 
 
-def test_one_pair_less_is_not_enough(further: FurtherTrials) -> None:
+def test_trials_stay_within_the_limits_come_in_pairs_and_are_no_more_than_needed(further: FurtherTrials) -> None:
     fewer = [added.probability for added in further.trials if added.probability < further.target]
     assert len(fewer) == len(further.trials) - 2
-
-
-def test_trials_stay_within_the_limits_and_come_in_pairs(further: FurtherTrials) -> None:
     pressures = [added.trial.pressure_Pa for added in further.trials]
     assert all(14e3 <= pressure <= 40e3 for pressure in pressures)
     assert not any(added.new_vine for added in further.trials)
     assert all(count % 2 == 0 for count in np.unique(pressures, return_counts=True)[1])
 
 
-def test_no_trials_are_added_where_none_are_needed(few: CampaignDesign, few_power: Power) -> None:
+def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_reported(
+    few: CampaignDesign, few_power: Power
+) -> None:
     enough = further_trials(few, few_power["leak"], 1.5 * few_power["leak"].size_at(0.98), 0.9, LIMITS)
     assert enough.trials == ()
-
-
-def test_a_target_out_of_reach_within_the_limits_is_reported(few: CampaignDesign, few_power: Power) -> None:
-    tight = LIMITS.model_copy(update={"trials": 4})
-    never = further_trials(few, few_power["air_drag"], 0.05, 0.9, Limits(**tight.model_dump()))
+    never = further_trials(few, few_power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
     assert not never.is_reached
     assert never.unlimited < 0.9
 
@@ -263,56 +235,29 @@ CONNECTOR_LIMITS = Limits(
 NAMES = ("inlet_loss", "linear_damping", "leak")
 
 
-@pytest.fixture(scope="module")
-def one_connector() -> CampaignDesign:
-    """Three trials of one vine at each of two pressures, through a connector that is always the same."""
-    return planned(3, (0.005, 0.02), ("14", "24"), NAMES, chamber_l="3.7", inlet_mm="8")
-
-
-@pytest.fixture(scope="module")
-def one_connector_power(one_connector: CampaignDesign) -> Power:
-    return power_of(planned_tests(one_connector)[0], nonlinear=True)
-
-
-@pytest.fixture(scope="module")
-def informative(one_connector: CampaignDesign, one_connector_power: Power) -> InformativeTrials:
-    found = exploratory_trials(one_connector, one_connector_power, CONNECTOR_LIMITS)
-    assert found is not None
-    return found
-
-
 def sizes_with(design: CampaignDesign, settings: list[tuple[float, float]]) -> np.ndarray:
     """Sizes of all effects found nine times in ten with trials at these pressures, kPa, and connectors, mm, as well."""
     like = design.trials[0]
-    added = [
-        replace(like, name=f"a{k}", pressure_Pa=1e3 * kPa, pressure_sigma_Pa=like.pressure_sigma_Pa, inlet_m=mm / 1e3)
-        for k, (kPa, mm) in enumerate(settings)
-    ]
-    made = with_trials(design, added)
-    powers = [effect_power(planned_tests(made)[0], name) for name in NAMES]
+    added = [replace(like, name=f"a{k}", pressure_Pa=1e3 * P, inlet_m=mm / 1e3) for k, (P, mm) in enumerate(settings)]
+    powers = [effect_power(planned_tests(with_trials(design, added))[0], name) for name in NAMES]
     return np.array([power.size_at(0.9) for power in powers if power is not None])
 
 
 @pytest.mark.slow
-def test_the_promised_sizes_are_those_of_a_sheet_with_these_trials(
-    one_connector: CampaignDesign, informative: InformativeTrials
-) -> None:
-    settings = [(t["pressure_kPa"], t["inlet_mm"]) for t in informative.trials for _ in range(t["replicates"])]
+def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promised() -> None:
+    """After three trials of one vine at each of two pressures, through a connector that is always the same."""
+    design = planned(3, (0.005, 0.02), ("14", "24"), NAMES, chamber_l="3.7", inlet_mm="8")
+    found = exploratory_trials(design, power_of(planned_tests(design)[0], nonlinear=True), CONNECTOR_LIMITS)
+    assert found is not None
+    settings = [(t["pressure_kPa"], t["inlet_mm"]) for t in found.trials for _ in range(t["replicates"])]
     assert len(settings) == 4
-    promised = [informative.then[name].size_at(0.9) for name in NAMES]
-    assert promised == pytest.approx(sizes_with(one_connector, settings).tolist(), rel=0.03)
-
-
-@pytest.mark.slow
-def test_what_is_recommended_reveals_more_than_repeats_do(
-    one_connector: CampaignDesign, informative: InformativeTrials
-) -> None:
-    repeated = sizes_with(one_connector, [(14.0, 8.0), (14.0, 8.0), (24.0, 8.0), (24.0, 8.0)])
-    recommended = np.array([informative.then[name].size_at(0.9) for name in NAMES])
+    recommended = np.array([found.then[name].size_at(0.9) for name in NAMES])
+    assert recommended.tolist() == pytest.approx(sizes_with(design, settings).tolist(), rel=0.03)
+    repeated = sizes_with(design, [(14.0, 8.0), (14.0, 8.0), (24.0, 8.0), (24.0, 8.0)])
     # The loss of a connector shows once another connector is used, and what it is taken for with it; a leak is found
     # by either design at a thousandth of its largest plausible size.
     assert np.all(recommended[:2] < 0.1 * repeated[:2])
-    assert recommended[2] < 1e-3 * informative.now["leak"].largest
+    assert recommended[2] < 1e-3 * found.now["leak"].largest
 
 
 def test_information_apart_from_the_most_similar_rival() -> None:

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, FPS, N_TRUE, as_track, filmed, grown_position, small_campaign, vine_trial
+from lsoda_vine import B_TRUE, filmed, grown_position, small_campaign, vine_trial
 
 import vinetrack as vt
-from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS, Comparison, compare, position_errors, trajectory_table
+from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.ladder import compare, position_errors, trajectory_table
 from vinetrack.diagnosis.replicates import align_replicates, replicates_of
 from vinetrack.inference.fit_data import ImpreciseRest
 from vinetrack.inference.fit_result import TrialFit
@@ -19,60 +19,30 @@ STEP_S = 1e-3
 
 
 def trial_fit(
-    name: str,
-    time_s: Floats,
-    position_m: Floats,
-    model_m: Floats,
-    speed_m_s: Floats,
-    *,
-    release_s: float,
-    origin_m: float,
+    name: str, time_s: Floats, position_m: Floats, model_m: Floats, speed_m_s: Floats, release_s: float, origin_m: float
 ) -> TrialFit:
     """A measurement and what a model predicts of it."""
-    errors = ("release_sigma_s", "origin_sigma_m", "pressure_deviation_sigma", "damping_deviation_sigma")
+    off_m = position_m - model_m
+    nothing = ("release_sigma_s", "origin_sigma_m", "pressure_deviation", "pressure_deviation_sigma",
+               "damping_deviation", "damping_deviation_sigma")  # fmt: skip
     return TrialFit(
-        trial=Trial(name=name, vine="v", condition="c"),
-        time_s=time_s,
-        lead_position_m=position_m,
-        predicted_position_m=model_m,
-        predicted_velocity_m_s=speed_m_s,
-        residual_m=position_m - model_m,
-        whitened=position_m - model_m,
-        release_s=release_s,
-        origin_m=origin_m,
-        pressure_deviation=0.0,
-        damping_deviation=0.0,
-        noise_m=1e-5,
-        **dict.fromkeys(errors, 0.0),
-    )
+        trial=Trial(name=name, vine="v", condition="c"), time_s=time_s, lead_position_m=position_m,
+        predicted_position_m=model_m, predicted_velocity_m_s=speed_m_s, residual_m=off_m, whitened=off_m,
+        release_s=release_s, origin_m=origin_m, noise_m=1e-5, **dict.fromkeys(nothing, 0.0),
+    )  # fmt: skip
 
 
 def grown(
-    name: str,
-    *,
-    speed: float = 1.0,
-    noise_m: float = 0.0,
-    rest: int = 30,
-    clock_s: float = 0.0,
-    origin_m: float = 0.0,
-    seed: int = 0,
+    name: str, *, speed: float = 1.0, noise_m: float = 0.0, rest: int = 30, clock_s: float = 0.0, origin_m: float = 0.0
 ) -> TrialFit:
     """A vine that speeds up as 1 − exp(−t / 20 ms) towards 2 m/s times `speed`, begun `clock_s` after its time 0."""
     time_s = clock_s + STEP_S * np.arange(-rest, 151)
     since_s = np.maximum(time_s - clock_s - 0.0004, 0.0)
-    position_m = 2.0 * speed * (since_s - 0.02 * (1 - np.exp(-since_s / 0.02))) + origin_m
-    position_m = position_m + noise_m * np.random.default_rng(seed).standard_normal(time_s.size)
+    noise = noise_m * np.random.default_rng(20000 + len(name)).standard_normal(time_s.size)
+    position_m = 2.0 * speed * (since_s - 0.02 * (1 - np.exp(-since_s / 0.02))) + origin_m + noise
     model_m = origin_m + 1.9 * np.maximum(time_s - clock_s, 0.0)
     speed_m_s = np.where(time_s > clock_s, 1.9, 0.0)
-    return trial_fit(name, time_s, position_m, model_m, speed_m_s, release_s=clock_s, origin_m=origin_m)
-
-
-def scattered(count: int, **same: float) -> list[TrialFit]:
-    draw = np.random.default_rng(20000)
-    return [
-        grown(f"t{i}", speed=1 + 0.02 * draw.standard_normal(), noise_m=5e-5, seed=20000 + i, **same)
-        for i in range(count)
-    ]
+    return trial_fit(name, time_s, position_m, model_m, speed_m_s, clock_s, origin_m)
 
 
 def another_model(trial: TrialFit) -> TrialFit:
@@ -89,7 +59,9 @@ def another_model(trial: TrialFit) -> TrialFit:
 
 @pytest.mark.parametrize("rest", [30, 0])
 def test_the_floor_is_the_same_for_every_model(rest):
-    trials = scattered(4, rest=rest)
+    draw = np.random.default_rng(20000)
+    speeds = 1 + 0.02 * draw.standard_normal(4)
+    trials = [grown("t" * (i + 1), speed=speed, noise_m=5e-5, rest=rest) for i, speed in enumerate(speeds)]
     others = [another_model(trial) if i % 2 else trial for i, trial in enumerate(trials)]
     one, other = (position_errors(each, replicates_of(each)) for each in (trials, others))
     assert one["replicate_floor_m"] == other["replicate_floor_m"] > 0
@@ -107,13 +79,8 @@ def test_equal_motions_with_clocks_and_origins_of_their_own_differ_by_nothing(re
 def test_a_track_that_begins_in_motion_is_laid_on_one_that_shows_its_rest():
     one, whole = grown("a"), grown("b", clock_s=0.2)
     kept = whole.time_s > 0.2 + 0.015
-    late = replace(
-        whole,
-        time_s=whole.time_s[kept],
-        lead_position_m=whole.lead_position_m[kept],
-        predicted_position_m=whole.predicted_position_m[kept],
-        residual_m=whole.residual_m[kept],
-    )
+    arrays = ("time_s", "lead_position_m", "predicted_position_m", "residual_m")
+    late = replace(whole, **{name: getattr(whole, name)[kept] for name in arrays})
     aligned = align_replicates([one, late])
     assert aligned.floor_m < 2e-5
     assert aligned.release_s[1] - aligned.release_s[0] == pytest.approx(0.2, abs=5e-4)
@@ -158,37 +125,30 @@ def by_hand(
     time_s = release_s + STEP_S * np.arange(-rest, round(end_s / STEP_S) + 1)
     since_s = time_s - release_s
     model_m = 0.3 + SPEED_M_S * np.maximum(since_s, 0)
-    residual_m = np.where(since_s > 1e-9, np.zeros(time_s.size), 0.0)
+    residual_m = np.zeros(time_s.size)
     residual_m[since_s > 1e-9] += misfit_m
     speed_m_s = np.where(since_s > 0, SPEED_M_S, 0.0)
-    return trial_fit(name, time_s, model_m + residual_m, model_m, speed_m_s, release_s=release_s, origin_m=0.3)
+    return trial_fit(name, time_s, model_m + residual_m, model_m, speed_m_s, release_s, 0.3)
 
 
 def errors_of(*trials: TrialFit) -> dict[str, float]:
     return position_errors(trials, replicates_of(trials))
 
 
-def test_the_error_of_position_is_that_of_the_growth_however_long_the_rest_was_filmed() -> None:
+def test_the_error_of_position_is_that_of_the_growth_and_trials_count_alike() -> None:
+    """However long the rest was filmed, and however many frames a trial has."""
     # 100 moving frames off by 3 mm, and the frame of the release itself: √(100/101) · 3 mm.
     for rest in (10, 500):
         assert errors_of(by_hand("a", 3e-3, rest=rest))["rms_position_m"] == pytest.approx(3e-3 * np.sqrt(100 / 101))
-
-
-def test_trials_count_alike_however_many_frames_they_have() -> None:
     error = errors_of(by_hand("a", 1e-3, end_s=0.4), by_hand("b", 3e-3, end_s=0.04))["rms_position_m"]
     assert error == pytest.approx(np.sqrt((1e-6 * 400 / 401 + 9e-6 * 40 / 41) / 2))
 
 
-def test_one_trial_has_no_floor_and_no_ratio() -> None:
-    error = errors_of(by_hand("a", 1e-3))
-    assert np.isnan(error["replicate_floor_m"])
-    assert np.isnan(error["ratio"])
-
-
-def test_replicates_that_differ_by_release_and_origin_alone_have_no_floor() -> None:
-    one, other = by_hand("a"), by_hand("b", release_s=0.0123)
+def test_one_trial_has_no_floor_and_replicates_that_differ_by_release_and_origin_alone_none_to_speak_of() -> None:
+    assert np.isnan([errors_of(by_hand("a", 1e-3))[name] for name in ("replicate_floor_m", "ratio")]).all()
+    other = by_hand("b", release_s=0.0123)
     later = replace(other, release_s=other.release_s - 0.0007)
-    assert errors_of(one, later)["replicate_floor_m"] < 1e-5
+    assert errors_of(by_hand("a"), later)["replicate_floor_m"] < 1e-5
 
 
 @pytest.mark.parametrize("n_trials", [2, 3, 5])
@@ -212,65 +172,19 @@ def test_the_band_is_that_of_the_replicates() -> None:
     assert last["lead_position_m"] == pytest.approx(SPEED_M_S * 0.1 + 1e-3)
 
 
-@pytest.fixture(scope="module")
-def true_model() -> Comparison:
+@pytest.mark.slow
+def test_a_model_that_lacks_nothing_stands_at_the_floor() -> None:
     """Two vines, four pressures, four replicates that scatter; the model is the one they were grown with."""
     pairs, _ = small_campaign(seed=11, replicates=4)
-    return vt.compare(vt.fit(vt.base_model(), pairs, profile=False))
-
-
-@pytest.mark.slow
-def test_a_model_that_lacks_nothing_stands_at_the_floor(true_model: Comparison) -> None:
+    true_model = vt.compare(vt.fit(vt.base_model(), pairs, profile=False))
     table = true_model.table
     together = np.sqrt(np.mean(table["rms_position_m"] ** 2) / np.mean(table["replicate_floor_m"] ** 2))
     assert 0.8 < together < 1.25
     assert table["ratio"].max() < 2.0
-
-
-@pytest.mark.slow
-def test_the_table_has_a_row_a_condition_and_the_columns_of_the_file(true_model: Comparison) -> None:
-    assert tuple(true_model.table.columns) == COMPARISON_COLUMNS
-    assert len(true_model.table) == 8
-    assert list(true_model.trajectories) == true_model.table["condition"].tolist()
-
-
-@pytest.mark.slow
-def test_a_prediction_has_a_release_and_an_origin_of_its_own_and_nothing_else(true_model: Comparison) -> None:
+    assert len(table) == 8
+    assert list(true_model.trajectories) == table["condition"].tolist()
+    # A prediction has a release and an origin of its own and nothing else.
     assert {(trial.pressure_deviation, trial.damping_deviation) for trial in true_model.trials} == {(0.0, 0.0)}
-
-
-@pytest.fixture(scope="module")
-def emptying() -> list[tuple[Trial, Track]]:
-    """Vines on a chamber of 3.7 L that nothing refills: of gauge pressure, most is lost at the lowest."""
-    draw = np.random.default_rng(11)
-    pairs = []
-    for pressure_kPa in (12, 18, 28):
-        for k in range(2):
-            trial = replace(vine_trial(f"p{pressure_kPa}_{k}", pressure_kPa), vine="v", condition=f"p{pressure_kPa}")
-            time_s = np.arange(4000) / FPS
-
-            def boyle(y: float, trial: Trial = trial) -> float:
-                absolute = trial.pressure_Pa + trial.ambient_pressure_Pa
-                return absolute * 3.7e-3 / (3.7e-3 + trial.area_m2 * max(y, 0.0)) - trial.ambient_pressure_Pa
-
-            position_m = grown_position(trial, time_s - 0.02, B_TRUE[24.0], pressure_along=boyle)
-            seen = np.isfinite(position_m)
-            noise_m = 1e-4 * draw.standard_normal(int(seen.sum()))
-            pairs.append((trial, as_track(time_s[seen], position_m[seen] + noise_m)))
-    return pairs
-
-
-@pytest.mark.slow
-def test_the_base_model_fails_on_a_chamber_that_empties(emptying: list[tuple[Trial, Track]]) -> None:
-    assert compare(vt.fit(vt.base_model(), emptying, profile=False), emptying).table["ratio"].min() > 3
-
-
-def test_with_its_damping_known_it_fails_worst_at_the_lowest_pressure(emptying: list[tuple[Trial, Track]]) -> None:
-    """Fitted, B and n bend until the misfit is shared out among the pressures."""
-    known = vt.base_model().with_values({"eversion_damping.B": B_TRUE[24.0], "eversion_damping.n": N_TRUE})
-    held = vt.fit(known, emptying, fixed=["eversion_damping.B", "n", "P_y"], profile=False)
-    rms_m = compare(held, emptying).table.set_index("condition")["rms_position_m"]
-    assert rms_m["p12"] > rms_m["p18"] > rms_m["p28"]
 
 
 def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model() -> None:

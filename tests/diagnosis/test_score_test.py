@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import vinetrack as vt
-from vinetrack.core.records import Floats
 from vinetrack.diagnosis import misfit_tests, score_test
 from vinetrack.diagnosis.likelihood_ratio import (
     LikelihoodRatio,
@@ -104,57 +102,34 @@ def test_a_candidate_of_many_shapes_is_no_more_often_a_false_alarm_than_all_shou
     assert alarms <= 18  # of 500 at 2 %, more once in 100
 
 
-def test_a_candidate_of_seven_standard_errors_is_found() -> None:
-    draw = np.random.default_rng(20603)
-    found = 0
-    for _ in range(40):
-        asked = questioned(scores(draw, 24, 4, sizes=[7 / math.sqrt(24), 0, 0, 0]))
-        found += bool(asked.one_sided_z[0] > asked.family.threshold("effect_0"))
-    assert found >= 36
-
-
-@pytest.mark.parametrize("scatter", [1.0, 3.0])
-def test_probes_of_nothing_find_structure_as_often_as_they_say(scatter: float) -> None:
+@pytest.mark.parametrize(("trials", "probes", "scatter"), [(24, 8, 1.0), (24, 8, 3.0), (6, 12, 1.0)])
+def test_probes_of_nothing_find_structure_as_often_as_they_say(trials: int, probes: int, scatter: float) -> None:
     draw = np.random.default_rng(20604)
-    found = [structure_from_scores(scores(draw, 24, 8, scatter)) for _ in range(400)]
+    found = [structure_from_scores(scores(draw, trials, probes, scatter)) for _ in range(400)]
     assert np.mean([one.p < 0.05 for one in found]) < 0.09
     assert np.mean([one.smallest_probe_p < 0.05 for one in found]) < 0.08
-    if scatter == 1:
+    if (trials, scatter) == (24, 1.0):
         assert np.mean([one.p < 0.2 for one in found]) > 0.05
 
 
-def test_six_trials_hear_a_force_that_one_probe_feels_and_seldom_one_that_is_not_there() -> None:
-    """Of noise alone one campaign in twenty at that level; thirty standard errors in one of 12 always."""
-    draw = np.random.default_rng(9)
-    nothing = [structure_from_scores(scores(draw, 6, 12)) for _ in range(200)]
-    assert np.mean([one.p < 0.05 for one in nothing]) < 0.09
-    assert np.mean([one.smallest_probe_p < 0.05 for one in nothing]) < 0.09
+def test_six_trials_hear_a_force_of_thirty_standard_errors_that_one_probe_feels() -> None:
+    draw, level = np.random.default_rng(9), 0.1 * FALSE_ALARM_LEVEL_LATER_ROUNDS
     loud = [structure_from_scores(scores(draw, 6, 12, sizes=[30 / math.sqrt(6), *[0] * 11])) for _ in range(40)]
-    level = 0.1 * FALSE_ALARM_LEVEL_LATER_ROUNDS
     assert all(one.p < level and one.smallest_probe_p < level for one in loud)
 
 
-def test_what_all_probes_feel_a_little_shows_in_their_sum_and_in_none_alone() -> None:
-    draw = np.random.default_rng(20605)
-    heard = []
-    for _ in range(40):
-        structure = structure_from_scores(scores(draw, 60, 24, sizes=3.0 / math.sqrt(60) * np.resize([1, -1], 24)))
-        if structure.smallest_probe_p > SINGLE_PROBE_LEVEL:
-            heard.append(questioned(scores(draw, 12, 2), structure=structure).probes_reject)
-    assert len(heard) >= 10
-    assert np.mean(heard) > 0.7
-
-
-def test_what_one_probe_alone_feels_drowns_in_the_sum_and_is_heard_as_the_loudest() -> None:
+@pytest.mark.parametrize("alone", [False, True], ids=["all feel a little", "one feels alone"])
+def test_the_sum_over_probes_and_the_loudest_each_hear_what_the_other_misses(alone: bool) -> None:
     """At six standard errors in one of 24 the sum hears one campaign in eight, the smallest_probe_p six of seven."""
-    draw = np.random.default_rng(20606)
-    drowned = []
+    draw, heard = np.random.default_rng(20606 if alone else 20605), []
+    sizes = [6.0, *[0] * 23] if alone else 3.0 * np.resize([1, -1], 24)
     for _ in range(60):
-        structure = structure_from_scores(scores(draw, 60, 24, sizes=[6.0 / math.sqrt(60), *[0] * 23]))
-        if structure.p > 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND:
-            drowned.append(questioned(scores(draw, 12, 2), structure=structure).probes_reject)
-    assert len(drowned) >= 15
-    assert np.mean(drowned) > 0.6
+        structure = structure_from_scores(scores(draw, 60, 24, sizes=np.array(sizes) / math.sqrt(60)))
+        by_sum, by_one = structure.p < 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND, structure.smallest_probe_p
+        if not by_sum if alone else by_one > SINGLE_PROBE_LEVEL:
+            heard.append(questioned(scores(draw, 12, 2), structure=structure).probes_reject)
+    assert len(heard) >= 15
+    assert np.mean(heard) > 0.6
 
 
 def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselves(
@@ -189,41 +164,24 @@ def test_a_misfit_no_larger_than_the_slow_errors_of_tracks_is_not_far_off(
     chi2: float, residual_m: float, slow: bool, systematic_m: float, exceeds: bool
 ) -> None:
     """Of 100 mm of growth. Nothing is then sought beyond a model that passes: 14 s instead of 71 for 24 films."""
-    track: Any = SimpleNamespace(
-        position_systematic_m=systematic_m,
-        lead_position_m=np.array([0.0, 0.1]),
-        slow_m=0.0 if slow else None,
-        trace=None,
-    )
-    fit: Any = SimpleNamespace(
-        chi2_per_dof=chi2,
-        predictor=SimpleNamespace(data=[track] * 3),
-        solution=SimpleNamespace(columns=[np.full((4, 1), residual_m)] * 3),
-    )
+    seen = {"lead_position_m": np.array([0.0, 0.1]), "slow_m": 0.0 if slow else None, "trace": None}
+    track = SimpleNamespace(position_systematic_m=systematic_m, **seen)
+    solution = SimpleNamespace(columns=[np.full((4, 1), residual_m)] * 3)
+    fit: Any = SimpleNamespace(chi2_per_dof=chi2, predictor=SimpleNamespace(data=[track] * 3), solution=solution)
     assert misfit_tests.exceeds_slow_errors(fit) == exceeds
 
 
 def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
     draw = np.random.default_rng(20608)
-    friction = vt.effects.tail_friction
-    shape = CandidateShape(friction, (), 1e-3)
+    friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, cast(Any, None)
+    answers = EffectSensitivities((CandidateShape(friction, (), 1e-3),), [], ())
     held = []
     for _ in range(300):
-        true = 0.05
-        unit = scores(draw, 12, 1, sizes=true * 300)
-        scale = np.array([[300.0]])
-        of = Scores(
-            unit.score * 300,
-            unit.information * scale**2,
-            unit.trial_scores * 300,
-            unit.trial_informations * scale**2,
-            11.0,
-        )
-        answers = EffectSensitivities((shape,), [], ())
-        fit: Any = None
-        limits, testable = MisfitTests(
-            fit, (friction,), answers, fit, of, QUIET, FALSE_ALARM_LEVEL_FIRST_ROUND
-        ).upper_limits(friction)
+        one = scores(draw, 12, 1, sizes=true * unit)
+        of_trials = (one.trial_scores * unit, one.trial_informations * unit**2)
+        of = Scores(one.score * unit, one.information * unit**2, *of_trials, 11.0)
+        asked = MisfitTests(fit, (friction,), answers, fit, of, QUIET, FALSE_ALARM_LEVEL_FIRST_ROUND)
+        limits, testable = asked.upper_limits(friction)
         assert testable
         held.append(limits["tail_friction.mu_w"] > true)
     assert 0.92 < np.mean(held) < 0.99
@@ -241,12 +199,10 @@ def test_systematic_errors_that_imitate_a_shape_are_integrated_out() -> None:
     assert (together.trial_scores @ turn).sum(axis=0) == pytest.approx(score)
 
 
-def known_fit(log_likelihood: float, numbers: tuple[Number, ...] = (), covariance: Floats | None = None) -> Any:
+def known_fit(log_likelihood: float, numbers: tuple[Number, ...] = ()) -> Any:
     """What a likelihood ratio asks of a fit of few trials, whose film is free already."""
-    matrix = np.diag([number.sigma**2 for number in numbers]) if covariance is None else covariance
-    return SimpleNamespace(
-        log_likelihood=log_likelihood, numbers=numbers, covariance=matrix, trials=(), model=("film_mass",)
-    )
+    known = {"covariance": np.diag([number.sigma**2 for number in numbers]), "trials": (), "model": ("film_mass",)}
+    return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, **known)
 
 
 def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> LikelihoodRatio:
@@ -264,10 +220,10 @@ def test_hypotheses_are_excluded_by_less_where_trials_scatter_more(inflation: fl
     assert weights["inlet_loss"] / weights["air_drag"] == pytest.approx(math.exp(-10 / inflation))
 
 
-@pytest.mark.parametrize(("value", "named"), [(0.5, True), (2.0, False)])
-def test_a_size_smaller_than_its_error_is_compatible_with_none(value: float, named: bool) -> None:
-    drag = Number("air_drag.C_D", "", "C_D", "1", value, 0.8, value - 1.6, value + 1.6, math.inf, "linear")
-    found = likelihood_ratio(known_fit(-120.0), [vt.effects.air_drag], known_fit(-100.0, (drag,)))
+@pytest.mark.parametrize(("values", "named"), [([0.5], True), ([2.0], False), ([0.5, 2.0], False), ([0.5, 0.4], True)])
+def test_a_size_smaller_than_its_error_in_every_vine_is_compatible_with_none(values: list[float], named: bool) -> None:
+    numbers = (Number("air_drag.C_D", "", "C_D", "1", v, 0.8, v - 1.6, v + 1.6, math.inf, "linear") for v in values)
+    found = likelihood_ratio(known_fit(-120.0), [vt.effects.air_drag], known_fit(-100.0, tuple(numbers)))
     assert (found.reason.code == "size_may_be_zero") == named
     assert found.credible != named
 
@@ -304,22 +260,22 @@ def alike_within() -> np.ndarray:
     return np.asarray(shapes @ shapes.T)
 
 
-@pytest.mark.parametrize(("sign", "tails"), [(0, 2.0), (1, 1.0)])
-@pytest.mark.parametrize("level", [0.02, 1e-4])
-def test_the_threshold_of_one_candidate_is_the_quantile_of_the_normal(sign: int, tails: float, level: float) -> None:
-    family = family_test(np.eye(1), [sign], ["only"], level)
-    assert family.threshold("only") == pytest.approx(norm.isf(level / tails), abs=0.01)
-
-
-def test_independent_candidates_share_as_sidak_says() -> None:
-    family = family_test(np.eye(20), [0] * 20, [str(k) for k in range(20)], 3e-3)
-    assert family.candidate_level == pytest.approx(1 - (1 - 3e-3) ** (1 / 20), rel=0.02)
-
-
-@pytest.mark.parametrize("shapes", [2, 30])
-def test_shapes_that_are_the_same_curve_count_once(shapes: int) -> None:
-    family = family_test(np.ones((shapes, shapes)), [0] * shapes, ["only"] * shapes, 3e-3)
-    assert family.threshold("only") == pytest.approx(norm.isf(3e-3 / 2), abs=0.02)
+@pytest.mark.parametrize(
+    ("cosines", "names", "level", "sign", "share"),
+    [
+        (np.eye(1), "a", 0.02, 0, 0.02 / 2),
+        (np.eye(1), "a", 1e-4, 1, 1e-4),
+        (np.eye(20), "abcdefghijklmnopqrst", 3e-3, 0, (1 - (1 - 3e-3) ** (1 / 20)) / 2),
+        (np.ones((30, 30)), "a" * 30, 3e-3, 0, 3e-3 / 2),
+        (np.diag([1.0, 1.0, 0.0]), "abs", 3e-3, 0, 3e-3 / 4),
+    ],
+    ids=["of either sign", "of one sign", "Šidák's share", "the same curve counts once", "the silent take no share"],
+)
+def test_thresholds_are_quantiles_of_the_normal(
+    cosines: np.ndarray, names: str, level: float, sign: int, share: float
+) -> None:
+    family = family_test(cosines, [sign] * len(names), list(names), level)
+    assert family.threshold("a") == pytest.approx(norm.isf(share), abs=0.01)
 
 
 @pytest.mark.slow
@@ -338,13 +294,6 @@ def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share(
     assert alarms / total == pytest.approx(level, rel=0.05)
     assert by_many / total == pytest.approx(family.candidate_level, rel=0.25)
     assert family.threshold("effect_12") > family.threshold("effect_1") + 0.4
-
-
-def test_shapes_that_the_data_say_nothing_of_take_no_share() -> None:
-    cosines = np.eye(3)
-    cosines[2, 2] = 0.0
-    family = family_test(cosines, [0, 0, 0], ["a", "b", "silent"], 3e-3)
-    assert family.threshold("a") == pytest.approx(norm.isf(3e-3 / 4), abs=0.01)
 
 
 # Predicted gains of effects, compared with regressions.
@@ -394,18 +343,10 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
 GAUGE = Parameter("delta", "δ", "Pa", 500.0, plausible=(-2e3, 2e3))
 
 
-@dataclass
-class KnownFit:
-    """What these functions read of a fit."""
-
-    numbers: tuple[Number, ...]
-    log_likelihood: float = -10.0
-    covariance: Any = field(default_factory=lambda: np.eye(1))
-
-
 def fitted(value: float, sigma: float) -> Any:
+    """What these functions read of a fit."""
     number = Number("g.delta", "", "δ", "Pa", value, sigma, value - 2 * sigma, value + 2 * sigma, math.inf, "linear")
-    return KnownFit((number,), covariance=np.array([[sigma**2]]))
+    return SimpleNamespace(numbers=(number,), log_likelihood=-10.0, covariance=np.array([[sigma**2]]))
 
 
 @pytest.mark.parametrize(("value", "sigma"), [(300.0, 200.0), (7.1e3, 1.7e3), (-1.5e3, 30.0)])
@@ -424,20 +365,14 @@ def test_a_gauge_seven_kilopascals_off_is_a_surprise_and_one_within_two_is_none(
     assert prior_penalty(fitted(7.1e3, 5e3), {"g.delta": GAUGE}) == 0
 
 
-def test_a_number_of_which_the_data_say_nothing_costs_nothing() -> None:
+def test_a_number_of_which_the_data_say_nothing_costs_nothing_and_weights_follow_the_evidence() -> None:
     assert log_evidence(fitted(0.0, 1e7), {"g.delta": GAUGE}) == pytest.approx(-10, abs=1e-6)
-
-
-def test_weights_add_up_and_follow_the_evidence() -> None:
-    weights = posterior_weights([-10.0, -10.0 - math.log(3), -800.0])
-    assert weights == pytest.approx([0.75, 0.25, 0.0])
+    assert posterior_weights([-10.0, -10.0 - math.log(3), -800.0]) == pytest.approx([0.75, 0.25, 0.0])
     assert posterior_weights([]) == []
 
 
-@pytest.mark.parametrize("phase_rad", [-3.67, 6.9, 3.0])
-def test_any_phase_of_a_swing_is_plausible(phase_rad: float) -> None:
+def test_any_phase_of_a_swing_is_plausible() -> None:
     """A phase of −3.67 rad is one of 2.61."""
-    phase = next(parameter for parameter in catalogue()["supply_pulsation"].parameters if parameter.name == "phi")
-    assert is_plausible(phase, phase_rad, 0.0)
-    frequency = next(parameter for parameter in catalogue()["supply_pulsation"].parameters if parameter.name == "f")
-    assert not is_plausible(frequency, 480.0, 0.0)
+    of = {parameter.name: parameter for parameter in catalogue()["supply_pulsation"].parameters}
+    assert all(is_plausible(of["phi"], phase_rad, 0.0) for phase_rad in (-3.67, 6.9, 3.0))
+    assert not is_plausible(of["f"], 480.0, 0.0)

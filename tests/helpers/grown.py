@@ -26,7 +26,6 @@ FORCES = {
     "ripple": "np.sin(2 * np.pi * s.lead_position / 0.06)",
     "stribeck": "np.exp(-s.tail_velocity / 1.5)",
     "growing": "s.time / 0.2",
-    "odd": "np.sin(2 * np.pi * s.lead_position / 0.1) * np.sin(s.pressure / 3e3)",
     "bump": "np.exp(-0.5 * ((s.lead_position - 0.08) / 0.01) ** 2)",
     "slow": "1 / (0.3 + s.tail_velocity)",
     "waves": "np.sin(2 * np.pi * (s.lead_position / 0.12) ** 1.5)",
@@ -36,12 +35,8 @@ FORCES = {
 PRESSURES = {1: (16.0, 22.0, 30.0), 2: (30.0, 40.0, 50.0, 60.0), 4: (24.0, 30.0, 38.0, 48.0)}
 
 
-def sheet(
-    scales: Sequence[int] = (2, 4),
-    replicates: int = 3,
-    payloads_g: Sequence[float] = (0.0,),
-) -> list[Trial]:
-    """Isometric vines at a few pressures each, with these payloads."""
+def sheet(scales: Sequence[int] = (2, 4), replicates: int = 3, payloads_g: Sequence[float] = (0.0,)) -> list[Trial]:
+    """Isometric vines at a few pressures each, with these payloads, on a chamber of 3.7 L."""
     trials = [
         replace(trial, chamber_m3=3.7e-3)
         for scale in scales

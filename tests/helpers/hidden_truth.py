@@ -20,11 +20,9 @@ def sheet(payload_g: float = 0.0) -> list[Trial]:
     return [replace(trial, chamber_m3=3.7e-3) for trial in with_names(trials)]
 
 
-def grown(
-    values: Mapping[str, float] | None = None, *, seed: int, payload_g: float = 0.0, trials: list[Trial] | None = None
-) -> Pairs:
+def grown(values: Mapping[str, float] | None = None, *, seed: int, trials: list[Trial] | None = None) -> Pairs:
     """Trials as a sheet and tracks state them, with effects whose values are given at work behind them."""
-    trials = trials if trials is not None else sheet(payload_g)
+    trials = trials if trials is not None else sheet()
     effects = tuple(dict.fromkeys(name.split(".")[0] for name in values or {}))
     scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005, "yield_error_kPa": 0.1, "noise_correlation": 0.3}
     return pairs_of(campaigns.grown(trials, seed, effects, values, **scatter))

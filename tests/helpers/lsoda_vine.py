@@ -67,16 +67,14 @@ def filmed(
     *,
     damping: float = 1.0,
     pressure: float = 1.0,
-    n: float = N_TRUE,
     rho: float = 0.0,
-    rest_frames: int = 20,
 ) -> tuple[Track, float, float]:
     """A track of a trial whose B and P are off by these factors, its release, s, and its origin, m."""
-    release_s = (rest_frames - draw.uniform()) / FPS
+    release_s = (20 - draw.uniform()) / FPS
     origin_m = float(draw.uniform(-0.05, 0.05))
     time_s = np.arange(4000) / FPS
     B = B_TRUE[round(trial.diameter_m * 1e3, 3)] * damping
-    position = grown_position(trial, time_s - release_s, B, n, pressure)
+    position = grown_position(trial, time_s - release_s, B, N_TRUE, pressure)
     seen = np.isfinite(position)
     noise = NOISE_M * ar1(int(seen.sum()), rho, draw)
     return as_track(time_s[seen], origin_m + position[seen] + noise), release_s, origin_m

@@ -7,20 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grown import grown, pairs_of
 from hidden_truth import sheet
 from lsoda_vine import N_TRUE, small_campaign
 from vine_truth import Vine, record
 
 import vinetrack as vt
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Trial
 from vinetrack.diagnosis import score_test as hypotheses
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
-from vinetrack.dynamics.simulate import Trajectory
 from vinetrack.inference.fit_data import prepare
-from vinetrack.inference.sensitivity import position_change
 from vinetrack.inference.whitening import at_correlation, products, whiten
-from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 STEP_M = 2e-3
 
@@ -33,13 +31,14 @@ def rounded(seed: int, step_m: float = STEP_M):
     ], truth
 
 
-def test_a_rest_without_visible_noise_counts_as_one_point():
+def test_a_rest_counts_as_one_point_where_rounding_hides_its_noise():
     data, _ = prepare(rounded(1)[0])
     assert len(data) > 12
     for each in data:
         assert each.n_rest == 0
         assert each.imprecise_rest.sigma_m == pytest.approx(STEP_M / np.sqrt(12))
         assert each.noise_m >= 0.999 * STEP_M / np.sqrt(12)
+    assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
 
 
 def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_travel():
@@ -49,10 +48,6 @@ def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_trave
     first, *others = prepare(stated)[0]
     assert first.position_systematic_m == 2.5e-4
     assert [each.position_systematic_m for each in others] == pytest.approx([4e-4 * longest_m] * len(others))
-
-
-def test_a_rest_with_visible_noise_is_kept_despite_rounding():
-    assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
 
 
 @pytest.mark.slow
@@ -71,45 +66,34 @@ def test_origins_of_rounded_tracks_have_the_stated_errors():
 
 # Points of unequal noise in a fit: the same estimates as from data divided by their noise.
 
-RHO = 0.4
-
-
-def columns_and_gaps() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    draw = np.random.default_rng(20000)
-    first = np.isin(np.arange(60), [0, 25])
-    return draw.standard_normal((60, 3)), first, np.exp(draw.uniform(-1, 1, 60))
-
 
 def test_weighted_products_are_those_of_columns_divided_by_their_noise():
-    columns, first, relative_sd = columns_and_gaps()
+    draw = np.random.default_rng(20000)
+    first = np.isin(np.arange(60), [0, 25])
+    columns, relative_sd = draw.standard_normal((60, 3)), np.exp(draw.uniform(-1, 1, 60))
     np.testing.assert_array_equal(
         products(columns, first, relative_sd), products(columns / relative_sd[:, None], first)
     )
-    white = whiten(columns, first, RHO, relative_sd)
+    white = whiten(columns, first, 0.4, relative_sd)
     np.testing.assert_allclose(
-        at_correlation(products(columns, first, relative_sd)[None], RHO)[0], white.T @ white, rtol=1e-12
+        at_correlation(products(columns, first, relative_sd)[None], 0.4)[0], white.T @ white, rtol=1e-12
     )
 
 
-def fast_trials(blur_s: float) -> tuple[list[tuple[Trial, Track]], list[np.ndarray]]:
-    """Sixteen fast vines filmed with 0.06 mm of noise and a blur, and the true standard deviation of every point."""
+def test_trials_are_weighted_where_noise_grows_with_speed():
+    """Sixteen fast vines filmed with 0.06 mm of noise and a blur of as many µs."""
     pairs, true_sd = [], []
     for i in range(16):
         draw = np.random.default_rng(20100 + i)
         vine = Vine(2, 10.0)
         made = record(vine, draw, noise_m=6e-5)
-        blurred = blur_s * made.lead_velocity_m_s
+        blurred = 6e-5 * made.lead_velocity_m_s
         positions = made.track.lead_position_m + blurred * draw.standard_normal(blurred.size)
         trial = Trial(
             name=f"t{i}", diameter_m=vine.diameter_m, thickness_m=1e-4, pressure_Pa=3e4, yield_pressure_Pa=1e3
         )
         pairs.append((trial, replace(made.track, lead_position_m=positions)))
         true_sd.append(np.hypot(6e-5, blurred))
-    return pairs, true_sd
-
-
-def test_trials_are_weighted_where_noise_grows_with_speed():
-    pairs, true_sd = fast_trials(6e-5)
     data, left_out = prepare(pairs)
     assert not left_out
     for item, true in zip(data, true_sd, strict=True):
@@ -120,44 +104,7 @@ def test_trials_are_weighted_where_noise_grows_with_speed():
         ratio = np.log(item.noise_m * item.relative_sd / true)
         assert np.sqrt(np.mean(ratio**2)) < 0.4
         assert item.mean_noise_m == pytest.approx(np.sqrt(np.mean(true**2)), rel=0.3)
-
-
-def test_points_have_equal_weights_if_the_noise_is_given():
-    pairs, _ = fast_trials(6e-5)
     assert all(trial_data.relative_sd is None for trial_data in prepare(pairs, weighted=False)[0])
-
-
-# A trial recorded to the end of growth carries no more information on an effect than one cut off before.
-
-TIMES_S = np.arange(0.0, 0.3, 1e-3)
-LENGTH_M = 0.4
-
-
-def grown(speed_m_s: float) -> Trajectory:
-    """A tube that grows evenly until its film runs out."""
-    position_m = np.minimum(speed_m_s * TIMES_S, LENGTH_M)
-    ended = bool(position_m[-1] >= LENGTH_M)
-    return Trajectory(
-        time_s=TIMES_S,
-        lead_position_m=position_m,
-        lead_velocity_m_s=np.where(position_m < LENGTH_M, speed_m_s, 0.0),
-        lead_acceleration_m_s2=np.zeros(TIMES_S.size),
-        observed_position_m=position_m,
-        travel_ratio=0.5,
-        status="ended" if ended else "running",
-        end_time_s=LENGTH_M / speed_m_s if ended else float("nan"),
-        end_lead_velocity_m_s=speed_m_s,
-        n_steps=1,
-    )
-
-
-@pytest.mark.parametrize("step_m_s", [0.03, -0.03])
-def test_the_sensitivity_is_zero_after_the_end_of_growth(step_m_s: float):
-    plain = grown(2.0)
-    change = position_change(plain, grown(2.0 + step_m_s)) / step_m_s
-    growing = plain.time_s <= plain.end_time_s
-    np.testing.assert_allclose(change[growing], TIMES_S[growing], atol=1e-12)
-    np.testing.assert_array_equal(change[~growing], 0.0)
 
 
 @pytest.mark.slow
@@ -170,17 +117,11 @@ def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials()
         for trial in bare
         for load in (0.0, 0.03)
     ]
-    nature = GroundTruth(
-        effects=(*BASE, "payload_friction"),
-        values={**damping_values(trials), "payload_friction.mu_p": 0.3},
-        damping_scatter=2e-3,
-        pressure_scatter=5e-3,
-        noise_m=2e-5,
-        noise_correlation=0.0,
-        seed=20_411,
-        frames_after_end=4,
-    )
-    fit = vt.fit(vt.base_model(), [(each.stated, each.track) for each in grow(trials, nature)], profile=False)
+    virtual = grown(
+        trials, 20_411, ["payload_friction"], {"payload_friction.mu_p": 0.3},
+        damping_scatter=2e-3, pressure_scatter=5e-3, noise_m=2e-5, frames_after_end=4,
+    )  # fmt: skip
+    fit = vt.fit(vt.base_model(), pairs_of(virtual), profile=False)
     candidates = candidates_of(fit.model, ["payload_friction"], None)
     questions = misfit_tests(fit, hypotheses.testable(candidates, fit.predictor.data)[0], FALSE_ALARM_LEVEL_FIRST_ROUND)
     size, sigma = (float(values[0]) for values in (questions.scores.size, questions.scores.plain_sigma))

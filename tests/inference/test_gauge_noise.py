@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lsoda_vine import as_track
+from lsoda_vine import ar1, as_track
 
 from vinetrack.inference.gauge_noise import (
     DenoisedTrace,
@@ -21,10 +21,9 @@ TIMES_S = np.arange(0.0, 0.6, 1e-3)
 LET_DOWN = np.interp(TIMES_S, [0.1, 0.12, 0.2, 0.5], [16e3, 3e3, 3e3, 16e3])
 
 
-def without_noise(pressure_Pa: np.ndarray, growth_m: np.ndarray | None = None) -> np.ndarray:
-    """A trace alone; the tip stands still where no growth is given."""
-    growth_m = np.zeros(pressure_Pa.size) if growth_m is None else growth_m
-    (quiet,) = denoised_traces([as_track(1e-3 * np.arange(pressure_Pa.size), growth_m, pressure_Pa)])
+def without_noise(pressure_Pa: np.ndarray) -> np.ndarray:
+    """A trace alone, of a tip that stands still."""
+    (quiet,) = denoised_traces([as_track(1e-3 * np.arange(pressure_Pa.size), np.zeros(pressure_Pa.size), pressure_Pa)])
     assert quiet is not None
     return quiet.pressure_Pa
 
@@ -48,29 +47,15 @@ def test_exact_pressures_are_unchanged():
     np.testing.assert_array_equal(without_noise(np.full(5, 3.0)), np.full(5, 3.0))
 
 
+GROWTH_M = 0.3 * -np.expm1(-np.maximum(TIMES_S - 0.06, 0.0) / 0.3)
+
+
 def emptied(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A chamber that a tube empties from 0.06 s on: pressure, the same with 50 Pa of noise, and the growth."""
     rng = np.random.default_rng(seed)
-    growth_m = 0.3 * -np.expm1(-np.maximum(TIMES_S - 0.06, 0.0) / 0.3)
-    pressure_Pa = 127e3 * (1 + 0.1 * growth_m) ** -1.4 - 101e3
+    pressure_Pa = 127e3 * (1 + 0.1 * GROWTH_M) ** -1.4 - 101e3
     noise_Pa, noise_m = 50.0 * rng.standard_normal(TIMES_S.size), 4e-5 * rng.standard_normal(TIMES_S.size)
-    return pressure_Pa, pressure_Pa + noise_Pa, growth_m + noise_m
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("late_frames", [0, 12, -12])
-def test_the_growth_shows_where_a_chamber_begins_to_empty_at_any_clock_offset(late_frames: int):
-    # What moves a vine is the time integral of the pressure. That of the noise wanders by σ √n = 1.2 kPa samples
-    # before the best curve is taken out; a corner rounded by 70 Pa over 40 samples is worth more than twice that.
-    wanders, at_corner = [], []
-    for seed in range(20):
-        pressure_Pa, noisy_Pa, growth_m = emptied(seed)
-        place = np.clip(np.arange(TIMES_S.size) + late_frames, 0, TIMES_S.size - 1)
-        left = without_noise(noisy_Pa, growth_m[place]) - pressure_Pa
-        wanders.append(np.ptp(np.cumsum(left)))
-        at_corner.append(left[60])
-    assert np.mean(wanders) < 1.5 * 50.0 * np.sqrt(TIMES_S.size)
-    assert abs(np.mean(at_corner)) < 15.0
+    return pressure_Pa, pressure_Pa + noise_Pa, GROWTH_M + noise_m
 
 
 @pytest.mark.parametrize("offset", [0.0, 12.4, -7.8])
@@ -105,16 +90,10 @@ def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset: float)
 @pytest.mark.parametrize("exponent", [1.0, 1.4])
 def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent: float):
     """Twenty traces with 5 Pa of noise: their mean is off by no more than a fifth of a pascal."""
-    tracks, true_Pa = [], []
-    for seed in range(20):
-        rng = np.random.default_rng(300 + seed)
-        growth_m = 0.3 * -np.expm1(-np.maximum(TIMES_S - 0.06, 0.0) / 0.3)
-        pressure_Pa = 115e3 * (1 + 0.2 * growth_m / exponent) ** -exponent - 101_325.0
-        tracks.append(as_track(TIMES_S, growth_m, pressure_Pa + 5.0 * rng.standard_normal(TIMES_S.size)))
-        true_Pa.append(pressure_Pa)
-    off = np.array(
-        [trace.pressure_Pa - true for trace, true in zip(denoised_traces(tracks), true_Pa, strict=True) if trace]
-    )
+    pressure_Pa = 115e3 * (1 + 0.2 * GROWTH_M / exponent) ** -exponent - 101_325.0
+    draws = [np.random.default_rng(300 + seed).standard_normal(TIMES_S.size) for seed in range(20)]
+    quiet = denoised_traces([as_track(TIMES_S, GROWTH_M, pressure_Pa + 5.0 * draw) for draw in draws])
+    off = np.array([trace.pressure_Pa - pressure_Pa for trace in quiet if trace])
     assert off.shape == (20, TIMES_S.size)
     assert np.max(np.abs(np.mean(off, axis=0))) < 1.0
 
@@ -135,19 +114,6 @@ def test_a_corner_between_two_readings_is_where_the_growth_begins():
     assert len(off_Pa) == 12
     assert np.max(cut_Pa) > 50.0
     assert np.max(np.abs(off_Pa)) < 0.5 * np.max(cut_Pa)
-
-
-@pytest.mark.slow
-def test_a_bend_that_few_of_many_steady_traces_show_by_chance_is_noise():
-    draw = np.random.default_rng(8)
-    noisy = [20e3 + 100.0 * draw.standard_normal(150) for _ in range(60)]
-    growth_m = np.cumsum(np.linspace(0.0, 1.0, 150)) * 2e-3
-    alone = [without_noise(pressure_Pa, growth_m) for pressure_Pa in noisy]
-    assert sum(np.ptp(curve) > 0 for curve in alone) > 3
-    together = denoised_traces([as_track(TIMES_S[:150], growth_m, pressure_Pa) for pressure_Pa in noisy])
-    bent = sum(trace is None or np.ptp(trace.pressure_Pa) > 1e-6 for trace in together)
-    # Of sixty traces each is refused every curve by chance once in a few hundred, and left to straight lines.
-    assert bent <= 2
 
 
 @pytest.mark.slow
@@ -184,14 +150,6 @@ def test_readings_of_an_interpolated_trace_are_recovered(per_reading: float):
     (held,) = gauge_readings([readings_Pa[np.searchsorted(read_at, frames, side="right") - 1]])
     assert np.isin(held.values_Pa, readings_Pa).all()
     assert np.max(np.abs(held.places + frames[0] - read_at[: held.places.size])) <= 1.0
-
-
-def test_white_noise_and_exact_curves_are_not_taken_for_interpolated():
-    draw = np.random.default_rng(3)
-    white_Pa = 20e3 + 100.0 * draw.standard_normal(200)
-    traces = [white_Pa, 16e3 * -np.expm1(-TIMES_S / 0.2), np.full(50, 20e3)]
-    for told, trace in zip(gauge_readings(traces), traces, strict=True):
-        np.testing.assert_array_equal(told.values_Pa, trace)
 
 
 @pytest.mark.parametrize("digit_Pa", [0.01, 1.0, 10.0])
@@ -258,16 +216,14 @@ def test_readings_that_are_nearly_all_equal_are_handled():
     told_Pa = np.full(60, 20e3)
     told_Pa[30] = 20.1e3
     assert noise_correlation([told_Pa] * 4) == 0.0
-    (quiet,) = denoised_traces([as_track(TIMES_S[:60], TIMES_S[:60], told_Pa)])
-    assert quiet is not None
-    assert np.isfinite(quiet.pressure_Pa).all()
+    assert np.isfinite(without_noise(told_Pa)).all()
 
 
 @pytest.mark.parametrize("digit_Pa", [1.0, 10.0, 100.0])
 def test_noise_of_about_a_digit_is_not_taken_for_readings(digit_Pa: float):
     draw = np.random.default_rng(12)
     falls = 20e3 * (1 + TIMES_S / 0.4) ** -0.01
-    for sigma_Pa in (0.0, 0.3 * digit_Pa, digit_Pa):
+    for sigma_Pa in (0.0, 0.3 * digit_Pa, digit_Pa, 100.0 * digit_Pa):
         noisy = falls + sigma_Pa * draw.standard_normal((8, falls.size))
         traces = list(digit_Pa * np.round(noisy / digit_Pa))
         for told, trace in zip(gauge_readings(traces), traces, strict=True):
@@ -277,13 +233,8 @@ def test_noise_of_about_a_digit_is_not_taken_for_readings(digit_Pa: float):
 def test_noise_behind_a_filter_is_detected_as_correlated():
     draw = np.random.default_rng(5)
     for rho in (0.0, 0.5, 0.85):
-        traces = []
-        for _ in range(24):
-            new = np.sqrt(1 - rho**2) * draw.standard_normal(300)
-            noise = np.zeros(300)
-            for i in range(1, 300):
-                noise[i] = rho * noise[i - 1] + new[i]
-            traces.append(20e3 * (1 + TIMES_S[:300] / 0.4) ** -0.3 + 100.0 * noise)
+        falls = 20e3 * (1 + TIMES_S[:300] / 0.4) ** -0.3
+        traces = [falls + 100.0 * ar1(300, rho, draw) for _ in range(24)]
         told = noise_correlation(traces)
         assert told == pytest.approx(rho, abs=0.05)
         sigmas = [noise.sigma_Pa for noise in noise_of_traces(gauge_readings(traces), told)]
@@ -321,5 +272,3 @@ def test_a_pressure_is_extrapolated_linearly_but_not_below_ambient():
     assert longer.mean_error_Pa == 5.0
     let_out = DenoisedTrace(times_s, np.maximum(20e3 - 1e5 * times_s, 0.0), 0.0, np.zeros((201, 0))).extended()
     assert let_out.pressure_Pa[-1] == 0.0
-    level = DenoisedTrace(times_s, np.full(201, 2e4), 0.0, np.zeros((201, 0))).extended()
-    assert level.pressure_Pa[-1] == pytest.approx(2e4)

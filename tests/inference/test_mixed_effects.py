@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from mixed_problem import RHO, SIGMA, columns_of, covariance, frame_of, state_of
+from scipy.linalg import toeplitz
 from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
@@ -23,13 +23,57 @@ from vinetrack.inference.marginal_likelihood import (
     estimate_noise,
     levenberg_marquardt_step,
     marginal,
-    sum_matrix_blocks,
     trial_deviation_sd,
     without_deviations,
 )
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
 from vinetrack.inference.position_errors import degrees_of_freedom, precision
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
+
+RHO, SIGMA = 0.45, 0.3
+
+
+def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
+    return np.asarray(sigma**2 * toeplitz(rho ** np.arange(count)))
+
+
+def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> MixedProblem:
+    return MixedProblem(
+        index=np.tile(np.arange(keys), (n_trials, 1)),
+        has_deviation=np.tile([False, True], (n_trials, 1)),
+        gauge_error=np.zeros(n_trials),
+        release_origin_mean=np.zeros((n_trials, 2)),
+        release_origin_precision=np.full((n_trials, 2), flat_sd**-2),
+        prior_mean=np.zeros(keys),
+        prior_precision=np.zeros(keys),
+        lower=np.full(keys, -np.inf),
+        upper=np.full(keys, np.inf),
+        free=np.ones(keys, dtype=bool),
+        points=np.full(n_trials, float(count)),
+        stretches=np.ones(n_trials),
+        random=np.zeros(keys, dtype=bool),
+    )
+
+
+def state_of(n_trials: int, keys: int, spread: float, rho: float = RHO, sigma: float = SIGMA) -> FitState:
+    variance = np.full(n_trials, sigma**2 * (1 - rho**2))
+    return FitState(np.zeros(keys), np.zeros((n_trials, 4)), (1e-5, spread), rho, variance)
+
+
+def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarray]:
+    """Random columns; the pressure deviation is silent, the deviation of B moves what the first key moves."""
+    draw = np.random.default_rng(seed)
+    out = []
+    for _ in range(n_trials):
+        shared = draw.standard_normal((count, keys))
+        own = np.column_stack([draw.standard_normal(count), np.ones(count), np.zeros(count), shared[:, 0]])
+        out.append(np.column_stack([own, shared, draw.standard_normal(count)]))
+    return out
+
+
+def crossed(columns: list[np.ndarray]) -> np.ndarray:
+    """Cross products of the columns of trials, each in one stretch."""
+    return all_products(columns, [np.arange(len(columns[0])) == 0] * len(columns))
 
 
 def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
@@ -46,9 +90,8 @@ def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
 def test_the_marginal_likelihood_agrees_with_the_dense_gaussian() -> None:
     n_trials, count, keys, spread, flat_sd = 3, 12, 2, 0.7, 50.0
     columns = columns_of(n_trials, count, keys, seed=2)
-    first = [np.arange(count) == 0] * n_trials
     frame, state = frame_of(n_trials, count, keys, flat_sd), state_of(n_trials, keys, spread)
-    part = marginal(all_products(columns, first), frame, state)
+    part = marginal(crossed(columns), frame, state)
     found = deviance(part, frame, state, state.spread, restricted=False)
     # The same by brute force: shared numbers by least squares, then the density of what is left.
     noise = covariance(count, RHO, SIGMA)
@@ -65,15 +108,12 @@ def test_the_marginal_likelihood_agrees_with_the_dense_gaussian() -> None:
 
 def test_residuals_at_zero_deviations_are_restored() -> None:
     columns = columns_of(3, 15, 2, seed=8)
-    first = [np.arange(15) == 0] * 3
     state = replace(state_of(3, 2, 0.5), trial_effects=np.random.default_rng(9).standard_normal((3, 4)))
     whole = [c.copy() for c in columns]
     for column, effects in zip(whole, state.trial_effects, strict=True):
         column[:, -1] += column[:, 2:4] @ effects[2:]
-    white = at_correlation(all_products(columns, first), RHO)
-    assert at_zero_deviations(white, state, -1) == pytest.approx(
-        at_correlation(all_products(whole, first), RHO), rel=1e-9
-    )
+    white = at_correlation(crossed(columns), RHO)
+    assert at_zero_deviations(white, state, -1) == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
 
 
 def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -> None:
@@ -116,42 +156,25 @@ def test_collinear_parameters_are_left_to_least_squares() -> None:
 
 def test_the_restricted_likelihood_adds_the_information() -> None:
     columns = columns_of(4, 20, 2, seed=3)
-    first = [np.arange(20) == 0] * 4
     frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
-    part = marginal(all_products(columns, first), frame, state)
+    part = marginal(crossed(columns), frame, state)
     more = deviance(part, frame, state, state.spread) - deviance(part, frame, state, state.spread, restricted=False)
-    covariance_of_numbers = precision(Solution(state, frame, all_products(columns, first), (), (False, True), True, 1))
+    covariance_of_numbers = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
     assert more == pytest.approx(-np.linalg.slogdet(covariance_of_numbers.covariance)[1], rel=1e-8)
-
-
-def balanced(n_trials: int, count: int, spread: float, seed: int) -> tuple[list[np.ndarray], np.ndarray]:
-    """A level of its own for every trial about a common one: the textbook's one-way layout, white noise of 0.01."""
-    draw = np.random.default_rng(seed)
-    level = 2.0 + spread * draw.standard_normal(n_trials)
-    columns = []
-    for i in range(n_trials):
-        own = np.zeros((count, 4))
-        own[:, 3] = 1.0
-        seen = level[i] + 0.01 * draw.standard_normal(count)
-        columns.append(np.column_stack([own, np.ones(count), seen]))
-    return columns, np.array([c[:, -1].mean() for c in columns])
-
-
-def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Solution, np.ndarray]:
-    columns, means = balanced(n_trials, count, spread, seed)
-    cross_products = all_products(columns, [np.arange(count) == 0] * n_trials)
-    frame = frame_of(n_trials, count, 1)
-    state = state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
-    found = estimate_between_trial_sd(marginal(cross_products, frame, state), frame, state, (False, True))
-    state = FitState(state.theta, state.trial_effects, found, 0.0, state.variance)
-    return Solution(state, frame, cross_products, (), (False, True), True, 1), means
 
 
 def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
     """So are the error of the common level, which is that of a mean of trials, and its degrees of freedom."""
-    solution, means = one_way(12, 25, 0.05, seed=4)
-    expected = math.sqrt(means.var(ddof=1) - 0.01**2 / 25)
-    assert solution.state.spread[1] == pytest.approx(expected, rel=2e-3)
+    n_trials, count, draw = 12, 25, np.random.default_rng(4)
+    levels = 2.0 + 0.05 * draw.standard_normal(n_trials)
+    own = np.tile([0.0, 0.0, 0.0, 1.0, 1.0], (count, 1))
+    columns = [np.column_stack([own, level + 0.01 * draw.standard_normal(count)]) for level in levels]
+    means = np.array([c[:, -1].mean() for c in columns])
+    cross_products = crossed(columns)
+    frame, state = frame_of(n_trials, count, 1), state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
+    found = estimate_between_trial_sd(marginal(cross_products, frame, state), frame, state, (False, True))
+    solution = Solution(replace(state, spread=found), frame, cross_products, (), (False, True), True, 1)
+    assert found[1] == pytest.approx(math.sqrt(means.var(ddof=1) - 0.01**2 / 25), rel=2e-3)
     assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
     assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
 
@@ -168,7 +191,7 @@ def test_two_between_trial_standard_deviations_are_found_from_any_start(start: t
         columns.append(np.column_stack([own, slope, seen]))
     frame = replace(frame_of(n_trials, count, 1), has_deviation=np.ones((n_trials, 2), dtype=bool))
     state = replace(state_of(n_trials, 1, 0.0, rho=0.0, sigma=1e-4), spread=start)
-    part = marginal(all_products(columns, [np.arange(count) == 0] * n_trials), frame, state)
+    part = marginal(crossed(columns), frame, state)
     pressure, damping = estimate_between_trial_sd(part, frame, state, (True, True))
     assert pressure == pytest.approx(0.004, rel=0.4)
     assert damping == pytest.approx(0.02, rel=0.4)
@@ -184,7 +207,7 @@ def test_noise_is_estimated_without_the_bias_of_fitted_parameters() -> None:
         flat = np.column_stack([line, np.ones(count)])
         noise -= flat @ np.linalg.lstsq(flat, noise, rcond=None)[0]
         columns.append(np.column_stack([flat, np.zeros((count, 2)), noise]))
-    cross_products = all_products(columns, [np.arange(count) == 0] * n_trials)
+    cross_products = crossed(columns)
     frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
     found, variance = estimate_noise(cross_products, frame, state)
     # 9000 points: ρ to 0.01, σ² to 2 %. Without counting the line ρ would come out 0.06 too small.
@@ -201,7 +224,7 @@ def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_diffe
     n_trials, count = 40, 12
     sd = np.where(np.arange(n_trials) % 2, louder, 1.0)
     columns = [np.column_stack([np.zeros((count, 4)), s * draw.standard_normal(count)]) for s in sd]
-    cross_products = all_products(columns, [np.arange(count) == 0] * n_trials)
+    cross_products = crossed(columns)
     frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
     _, variance = estimate_noise(cross_products, frame, state, rho=0.0)
     alone = np.array([np.mean(block[:, -1] ** 2) for block in columns])
@@ -221,20 +244,13 @@ def test_collinear_parameters_are_detected() -> None:
     for c in columns:
         c[:, 6] = 2 * c[:, 5]
     solution = Solution(
-        state_of(4, 3, 0.1), frame_of(4, 25, 3), all_products(columns, [np.arange(25) == 0] * 4), (), (False, True),
+        state_of(4, 3, 0.1), frame_of(4, 25, 3), crossed(columns), (), (False, True),
         True, 1,
     )  # fmt: skip
     found = precision(solution)
     assert found.collinear.tolist() == [False, True, True]
     assert np.isinf(found.covariance[1, 1])
     assert np.isfinite(found.covariance[0, 0])
-
-
-def test_blocks_of_a_trial_are_added_to_its_parameters() -> None:
-    frame = frame_of(2, 5, 3)
-    frame = MixedProblem(**{**frame.__dict__, "index": np.array([[0, 2], [1, -1]])})
-    total = sum_matrix_blocks(np.ones((2, 2, 2)), frame)
-    assert total.tolist() == [[1, 0, 1], [0, 1, 0], [1, 0, 1]]
 
 
 def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None:
@@ -246,24 +262,6 @@ def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None
 
 
 # Steps of the fit, compared with exact minima within bounds.
-
-
-def test_a_step_ends_at_the_first_bound_and_continues_along_it() -> None:
-    # ½xᵀHx − gᵀx in the unit square: its minimum (14/3, 7/3) lies outside; on the side x₁ = 1 it is at x₂ = ½.
-    square, slope = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([7.0, 0.0])
-    problem = replace(frame_of(1, 5, 2), lower=np.zeros(2), upper=np.ones(2))
-    step, moving = bounded_solve(square, slope, problem, np.zeros(2))
-    assert step == pytest.approx([1.0, 0.5])
-    assert list(moving) == [False, True]
-
-
-def test_of_two_parameters_that_met_their_bounds_together_one_is_released() -> None:
-    # ½xᵀHx − gᵀx for x ≥ 0, from the corner: its minimum (−1, −2) lies outside; on the side x₂ = 0 it is at 0.8.
-    square, slope = np.array([[1.0, -0.9], [-0.9, 1.0]]), np.array([0.8, -1.1])
-    problem = replace(frame_of(1, 5, 2), lower=np.zeros(2))
-    step, moving = bounded_solve(square, slope, problem, np.zeros(2))
-    assert step == pytest.approx([0.8, 0.0])
-    assert list(moving) == [True, False]
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -310,23 +308,9 @@ def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence() -> 
     for each in columns:
         each[:, -1] += each[:, 5]
     frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
-    cross_products = all_products(columns, [np.arange(20) == 0] * 4)
+    cross_products = crossed(columns)
     assert levenberg_marquardt_step(cross_products, frame, state, 1e6)[2] < CONVERGED_DECREASE
     (step, _, decrease), damping = _next_step(cross_products, frame, state, 1e6, CONVERGED_DECREASE)
     assert decrease > CONVERGED_DECREASE
     assert damping == 0
     assert step == pytest.approx(levenberg_marquardt_step(cross_products, frame, state, 0.0)[0])
-
-
-def test_one_step_solves_a_linear_problem() -> None:
-    columns = columns_of(3, 25, 2, seed=8)
-    truth = np.array([0.3, -0.7])
-    for c in columns:
-        c[:, -1] = c[:, 4:6] @ truth + 0.2 * c[:, 0] - 0.1
-    frame, state = frame_of(3, 25, 2, flat_sd=1e6), state_of(3, 2, 1e-3, sigma=1e-3)
-    step, own, predicted_decrease = levenberg_marquardt_step(
-        all_products(columns, [np.arange(25) == 0] * 3), frame, state, 0.0
-    )
-    assert step == pytest.approx(truth, abs=1e-6)
-    assert own[:, 0] == pytest.approx(0.2, abs=1e-6)
-    assert predicted_decrease > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.inference.fit import predict_prepared
-from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.robust_covariance import recorded_pressures, systematics_of
@@ -28,13 +28,11 @@ from vinetrack.inference.solving import (
     with_fitted_trace_errors,
 )
 
-SEED = 20602
-
 
 @pytest.fixture(scope="module")
 def laboratory(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
     """Twelve trials that empty their chambers, a gauge of 50 Pa noise read some 150 times a second; camera noise, m."""
-    shot = campaign("gauge_slow_depletion", SEED, (12, 12), weighed=False)
+    shot = campaign("gauge_slow_depletion", 20602, (12, 12), weighed=False)
     folder = tmp_path_factory.mktemp("gauge") / "laboratory"
     write_experiment(shot, folder)
     return folder, float(shot.truth["camera"]["noise_m"])  # type: ignore[index]
@@ -95,14 +93,6 @@ def test_estimated_errors_enter_the_likelihood(fit: vt.Fit):
     assert trace_error_penalty(fit.predictor.data) > 1.0
 
 
-@pytest.mark.slow
-def test_the_recorded_pressure_is_kept(fit: vt.Fit):
-    recorded, _ = prepare(fit.pairs)
-    for told, before in zip(map(as_recorded, fit.predictor.data), recorded, strict=True):
-        assert told.trace_error_sizes is None
-        np.testing.assert_allclose(told.trace[1], before.trace[1], rtol=1e-9)
-
-
 def test_the_tests_see_the_pressures_that_were_recorded(fit: vt.Fit):
     state = fit.solution.state
     recorded = Predictor(fit.predictor.layout, list(map(as_recorded, fit.predictor.data)), fit.predictor.host)
@@ -117,48 +107,33 @@ def test_the_tests_see_the_pressures_that_were_recorded(fit: vt.Fit):
 
 def test_left_out_trials_are_predicted_from_the_recorded_pressure(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
     """Pressures corrected by a trial's own motion would predict it too well."""
-    given = []
-
-    def seen(fitted: vt.Fit, data: list, **how: bool) -> list:
-        given.extend(data)
-        return predict_prepared(fitted, data, **how)
-
+    seen = Mock(wraps=predict_prepared)
     monkeypatch.setattr("vinetrack.diagnosis.ladder.predict_prepared", seen)
     left_out(fit)
+    given = [trial_data for call in seen.call_args_list for trial_data in call.args[1]]
     assert len(given) == len(fit.trials)
     assert all(trial_data.trace_error_sizes is None for trial_data in given)
 
 
 def test_another_model_starts_from_the_recorded_pressure(fit: vt.Fit):
     """An effect whose curve the errors had absorbed would not be found otherwise."""
-    begun: list = []
-
-    def seen(_: object, data: list, **_more: object) -> None:
-        begun.append(data)
-        raise InterruptedError
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vinetrack.inference.fit.make_layout", seen)
+    with patch("vinetrack.inference.fit.make_layout", side_effect=InterruptedError) as begun:
         for model in (fit.model + "air_drag", fit.model):
             with pytest.raises(InterruptedError):
                 vt.refit(fit, model)
-    assert all(trial_data.trace_error_sizes is None for trial_data in begun[0])
-    assert begun[1] is fit.predictor.data
+    other, same = (call.args[1] for call in begun.call_args_list)
+    assert all(trial_data.trace_error_sizes is None for trial_data in other)
+    assert same is fit.predictor.data
 
 
 def test_errors_without_influence_on_the_motion_are_zero(fit: vt.Fit):
     state = fit.solution.state
     deaf = replace(fit.solution, state=replace(state, variance=1e8 * state.variance))
-    far = [
-        each
-        if each.trace_errors_Pa is None
-        else replace(each, trace_error_sizes=np.full(each.trace_errors_Pa.shape[1], 3.0))
-        for each in fit.predictor.data
-    ]
+    felt = [each for each in fit.predictor.data if each.trace_errors_Pa is not None]
+    far = [replace(each, trace_error_sizes=np.full(each.trace_errors_Pa.shape[1], 3.0)) for each in felt]
     moved = trace_error_step(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf)
     for back, each in zip(moved, far, strict=True):
-        felt = 0 if each.trace_error_sizes is None else each.trace_error_sizes.size
-        np.testing.assert_allclose(back[:felt], -3.0, atol=0.05)
+        np.testing.assert_allclose(back[: each.trace_error_sizes.size], -3.0, atol=0.05)
 
 
 # Trials with a pressure recorded by a noisy gauge: the remaining error is not taken for missing physics.
@@ -179,13 +154,9 @@ def traced() -> Fit:
 
 
 @pytest.mark.slow
-def test_the_tracks_are_explained_to_their_noise(traced: Fit) -> None:
+def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_the_gauge(traced: Fit) -> None:
     assert traced.chi2_per_dof < 1.15
     assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
-
-
-@pytest.mark.slow
-def test_pressure_deviations_are_limited_by_the_noise_of_the_gauge(traced: Fit) -> None:
     for trial, item in zip(traced.trials, traced.predictor.data, strict=True):
         samples = np.count_nonzero(item.time_s >= trial.release_s)
         assert item.gauge_error == pytest.approx(GAUGE_NOISE_PA / np.sqrt(samples) / trial.trial.pressure_Pa, rel=0.4)
@@ -201,15 +172,10 @@ def test_an_error_of_a_recorded_pressure_affects_its_own_trial_alone(traced: Fit
     ramp = np.linspace(-100.0, 100.0, trace[0].size)
     data = [replace(trial_data, trace_errors_Pa=None, trace_error_sizes=None) for trial_data in predictor.data]
     data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])
-    errors = systematics_of(Predictor(predictor.layout, data, predictor.host), traced.solution, traced.trials)
-    without = systematics_of(
-        Predictor(
-            predictor.layout,
-            [replace(data[3], trace_errors_Pa=None) if i == 3 else each for i, each in enumerate(data)],
-            predictor.host,
-        ),
-        traced.solution,
-        traced.trials,
+    deaf = [replace(trial_data, trace_errors_Pa=None) for trial_data in data]
+    errors, without = (
+        systematics_of(Predictor(predictor.layout, told, predictor.host), traced.solution, traced.trials)
+        for told in (data, deaf)
     )
     assert errors.count == without.count + 1
     moved = [columns[:, :1] for columns in errors.columns]

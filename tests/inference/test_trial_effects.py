@@ -13,11 +13,7 @@ from vinetrack.inference import trial_effects
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.trial_effects import (
-    products_at_releases,
-    residuals_in,
-    trial_costs,
-)
+from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
 from vinetrack.inference.whitening import products, whiten
 
 
@@ -96,13 +92,10 @@ def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motio
 
 
 def test_a_search_converges_if_the_model_is_close_to_the_tracks(only_in_motion: Fit) -> None:
+    """And one whose trajectories overflow costs infinitely much, without a warning."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4, search=True)
     assert found.converged
-
-
-def test_an_overflowing_trajectory_has_infinite_cost_without_a_warning(only_in_motion: Fit) -> None:
-    solution, predictor = only_in_motion.solution, only_in_motion.predictor
     far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
     assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
     assert not np.isfinite(products(np.full((5, 2), 1e200), np.arange(5) == 0)).all()
