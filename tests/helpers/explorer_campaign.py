@@ -60,38 +60,24 @@ def make_results(experiment: Path, results: Path) -> Path:
 
 def write_diagnosis(results: Path) -> Path:
     """Write a `diagnosis.json` with a tie and a next trial."""
-    ranking = [
-        {"effect": "reservoir_depletion", "delta_chi2": 4000.0, "in_answer_set": True, "reason": ""},
-        {"effect": "leak", "delta_chi2": 3995.0, "in_answer_set": True, "reason": ""},
-        {"effect": "air_drag", "delta_chi2": 12.0, "in_answer_set": False, "reason": "excluded"},
-        {"effect": "inlet_loss", "delta_chi2": None, "in_answer_set": False, "reason": "needs inlet_mm"},
-    ]
+    gains = {"reservoir_depletion": 4000.0, "leak": 3995.0, "air_drag": 12.0, "inlet_loss": None}
+    answers = list(gains)[:2]
+    ranking = [{"effect": e, "delta_chi2": g, "in_answer_set": e in answers, "reason": ""} for e, g in gains.items()]
+    matrix = [[1.0, 0.97, 0.2], [0.97, 1.0, -0.75], [0.2, -0.75, None]]
+    trial = {"pressure_kPa": 60.0, "payload_g": 0.0, "diameter_mm": 24.0, "thickness_um": 200.0, "chamber_l": 4.0}
+    advised = {
+        "text": "Grow the 24 mm vine at 60 kPa from a chamber of 4 L.",
+        "trials": [trial | {"replicates": 3, "new_vine": False, "changed": ["chamber_l"]}],
+        "separation_sigma": {"reservoir_depletion | leak": 12.3},
+        "calibration": None,
+    }
     content = {
         "verdict": "ambiguous",
         "explanation": "Either of two effects explains these trials.",
-        "answer_set": ["reservoir_depletion", "leak"],
+        "answer_set": answers,
         "rounds": [{"model": [], "verdict": "ambiguous", "ranking": ranking}],
-        "cosines": {
-            "effects": ["reservoir_depletion", "leak", "air_drag"],
-            "matrix": [[1.0, 0.97, 0.2], [0.97, 1.0, -0.75], [0.2, -0.75, None]],
-        },
-        "next_experiment": {
-            "text": "Grow the 24 mm vine at 60 kPa from a chamber of 4 L.",
-            "trials": [
-                {
-                    "pressure_kPa": 60.0,
-                    "payload_g": 0.0,
-                    "diameter_mm": 24.0,
-                    "thickness_um": 200.0,
-                    "chamber_l": 4.0,
-                    "replicates": 3,
-                    "new_vine": False,
-                    "changed": ["chamber_l"],
-                },
-            ],
-            "separation_sigma": {"reservoir_depletion | leak": 12.3},
-            "calibration": None,
-        },
+        "cosines": {"effects": list(gains)[:3], "matrix": matrix},
+        "next_experiment": advised,
     }
     path = results / "diagnosis.json"
     path.write_text(json.dumps(content), encoding="utf-8")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import http.client
 import json
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from served import served_here
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import list_recordings, parse_yaml, read_table
@@ -31,7 +31,6 @@ from vinetrack.pages.setup_server import (
     draft_from_json,
     draft_problems,
     page_state,
-    start_server,
     write_templates,
 )
 from vinetrack.video.curved_axis import axis_through
@@ -293,13 +292,8 @@ OURS = {"X-Vinetrack": "setup"}
 
 @pytest.fixture
 def server(clips: Path) -> Iterator[SetupServer]:
-    made = start_server(clips, 0)
-    thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
-    thread.start()
-    yield made
-    made.shutdown()
-    made.server_close()
-    thread.join(10)
+    with served_here(clips) as made:
+        yield made
 
 
 def ask(
