@@ -101,7 +101,13 @@ def design_vine(
         burst_share=burst_share,
         burst_stress_Pa=1e6 * burst_stress_MPa,
     )
-    _check_films(room, films, diameter)
+    max_films = 12  # Largest number of films (chosen)
+    if not 0 < len(room.films_m) <= max_films:
+        raise _refusal("thickness_um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}", name=FILMS)
+    thickest_m = max(room.films_m)
+    if thickest_m > room.diameter_m[0] / 4:
+        message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"
+        raise _refusal("diameter_mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with planning_errors(), waiting("looking for the fastest vine"):
         choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     _refuse_standstill(room, choices)
@@ -115,31 +121,16 @@ def design_vine(
 def _choice_entry(choice: Choice) -> dict[str, Any]:
     """Return the fastest vine of one film as JSON content, units in the keys."""
     trial, final = choice.prediction.inputs.trial, choice.prediction.final
+    speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
     return {
         "thickness_um": 1e6 * trial.thickness_m,
         "diameter_mm": 1e3 * trial.diameter_m,
         "length_mm": 1e3 * trial.length_m,
         "pressure_kPa": trial.pressure_Pa / 1e3,
-        "final_speed_m_s": {
-            "y_over_L": final.y_over_L,
-            "median": final.median,
-            "low_90": final.low,
-            "high_90": final.high,
-        },
+        "final_speed_m_s": speed,
         "fastest_in_share_of_draws": choice.odds,
         "limited_by": list(choice.limits),
     }
-
-
-def _check_films(room: Room, films: str, diameter: str) -> None:
-    """Refuse an empty or too long list of films, and films too thick for the smallest diameter."""
-    max_films = 12  # Largest number of films (chosen)
-    if not 0 < len(room.films_m) <= max_films:
-        message = f"names {len(room.films_m)} films"
-        raise _refusal("thickness_um", films, message, f"name 1 to {max_films}", name=FILMS)
-    if max(room.films_m) > room.diameter_m[0] / 4:
-        message = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
-        raise _refusal("diameter_mm", diameter, message, f"begin at {4e3 * max(room.films_m):g} mm or more")
 
 
 def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
@@ -206,9 +197,8 @@ def design_reservoir(
     """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested. Speeds are
     predicted if the wall thickness is given. Returns lines, and JSON content.
     """
-    required_for_reservoir = ("diameter_mm", "length_mm", "pressure_kPa")
     check_figure(figure)
-    basis = read_basis(request, needed=required_for_reservoir)
+    basis = read_basis(request, needed=("diameter_mm", "length_mm", "pressure_kPa"))
     trial = basis.planned.trials[0]
     loss = within_percent / 100
     with planning_errors(), waiting("simulating"):
@@ -244,11 +234,8 @@ def design_reservoir(
 
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
-    description = (
-        describe_trial(trial)
-        if inputs is not None
-        else (f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa")
-    )
+    size = f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa"
+    description = size if inputs is None else describe_trial(trial)
     yield f"{description}: it sweeps {format_volume(swept_m3(trial))}"
     yield f"closed chamber that keeps the gauge pressure within {100 * loss:g} %, by the gas law in absolute pressure"
     yield ""

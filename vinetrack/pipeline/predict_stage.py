@@ -137,7 +137,13 @@ def read_basis(request: PredictionRequest, needed: Sequence[str] = REQUIRED_FOR_
         planned = planned_trial(request.cells, ExperimentSettings(), needed)
     else:
         planned = planned_sheet(request.sheet)
-        _refuse_options_with_sheet(request)
+        message, remedy = "is given in addition to a sheet", "write it in the sheet"
+        problems = [
+            Problem(message=message, column=option(name), value=text, remedy=remedy)
+            for name, text in request.cells.items()
+        ]
+        if problems:
+            raise ExperimentError(problems)
     if request.tail_slack is not None:
         trials = tuple(replace(trial, tail_slack=request.tail_slack) for trial in planned.trials)
         planned = replace(planned, trials=trials)
@@ -157,15 +163,6 @@ def read_basis(request: PredictionRequest, needed: Sequence[str] = REQUIRED_FOR_
         user_effects=user_effects,
     )
     return PredictionBasis(planned, stated, fit, () if chosen is None else chosen.heading)
-
-
-def _refuse_options_with_sheet(request: PredictionRequest) -> None:
-    message, remedy = "is given in addition to a sheet", "write it in the sheet"
-    problems = [
-        Problem(message=message, column=option(name), value=text, remedy=remedy) for name, text in request.cells.items()
-    ]
-    if problems:
-        raise ExperimentError(problems)
 
 
 def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
@@ -224,11 +221,11 @@ def describe_trial(trial: Trial) -> str:
     return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {direction}{rig}"
 
 
-def display_value(value: float, unit: str, digits: int = 3) -> str:
+def display_value(value: float, unit: str) -> str:
     """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
     if math.isinf(value):
         return "never"
-    return number(value * display_unit(unit, PREDICTION_UNITS)[1], digits)
+    return number(value * display_unit(unit, PREDICTION_UNITS)[1])
 
 
 def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
@@ -242,11 +239,11 @@ def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
     return rows
 
 
-def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
+def write_figure(fig: Figure, path: Path) -> None:
     """Write a figure in the format that the suffix names."""
     check_figure(path)
     form = path.suffix.lower().removeprefix(".")
-    write_bytes(path, render(fig, [form], dpi)[form])
+    write_bytes(path, render(fig, [form])[form])
 
 
 def check_figure(path: Path | None) -> None:
