@@ -167,6 +167,7 @@ def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
     assert re.search(r"Δχ² = -", output) is None
     assert "highest pressure" in output
     assert [row["added"] for row in ladder(results)] == ["", "reservoir_depletion", "air_drag"]
+    assert {row["partial"] for row in ladder(results)} == {"False"}
     monkeypatch.setattr(search, "add", lambda *_: added[0])  # the same once more, without the fits
     succeed("add", "air_drag", results)
     assert len(ladder(results)) == 3

@@ -98,7 +98,7 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
     for added, part in list(zip(ladder["added"], partial, strict=True))[1:]:
-        words = str(added).replace("+", " + ").replace("_", " ") + (" (partial)" if part in (True, "True") else "")
+        words = str(added).replace("+", " + ").replace("_", " ") + (" (partial)" if part else "")
         labels.append("+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False)))
     ax.set_xticks(range(len(ladder)), labels)
     ax.grid(axis="x", visible=False)

@@ -546,7 +546,7 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
 
     body = []
     for row in ladder.to_dict("records"):
-        model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") in (True, "True") else "")
+        model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") else "")
         errors = (row[f"{key}_m"] for key in ("rms_in_sample", "rms_left_out", "rms_highest_pressure", "floor"))
         body.append((model, *(f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)))
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))

@@ -388,9 +388,7 @@ def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
 
 def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
     """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it."""
-    if "partial" not in table:
-        return table
-    return table.loc[[value not in (True, "True") for value in table["partial"]]]
+    return table[~table["partial"].astype(bool)] if "partial" in table else table
 
 
 MOST_NAMED = 3  # Parameters or effects named in a sentence, at most (chosen)

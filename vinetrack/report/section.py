@@ -253,7 +253,7 @@ def ladder_table(ladder: pd.DataFrame | None) -> ReportTable:
 
 
 def _step(added: str, partial: object = False) -> str:
-    mark = " (partial)" if partial in (True, "True") else ""
+    mark = " (partial)" if partial else ""
     return f"+ {listed_names(added.split('+'))}{mark}" if added else "initial model"
 
 

@@ -54,7 +54,7 @@ TEXT_COLUMNS = frozenset({
     "quantity", "setting", "as_printed", "mark", "how", "beside", "figure", "departure", "method",
 })  # fmt: skip
 COUNT_COLUMNS = frozenset({"n_frames", "points"})
-TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative"})
+TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative", "partial"})
 
 
 class ResultsError(UserError):
