@@ -57,8 +57,6 @@ PAPER_COLUMNS = (
     *("ours", "ours_low_95", "ours_high_95", "mark", "how", "beside"),
 )
 
-PREFERRED = "both_axes"  # The fit of the damping law that supplies our numbers
-
 
 GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
 
@@ -215,7 +213,7 @@ def _fitted(line: Mapping[str, Any], key: str = "slope") -> dict[str, Any]:
 
 
 def _law_rows(results: ExperimentResults) -> Iterator[Row]:
-    laws = {method: results.damping.get(method) or {} for method in ("log_log", PREFERRED, "paper")}
+    laws = {method: results.damping.get(method) or {} for method in ("log_log", "both_axes", "paper")}
     for row, law in zip(("n_log_log", "n_both_axes", "n_literal"), laws.values(), strict=True):
         interval = _bounds(law.get("n_95_total"))
         yield row_of(row, or_nan(law.get("n")), interval, published_as=published.EXPONENT, mark=results.mark)
@@ -311,7 +309,7 @@ def _close(ours: float, printed: float) -> bool:
 
 
 def _wall_rows(results: ExperimentResults) -> Iterator[Row]:
-    vines = (results.damping.get(PREFERRED) or {}).get("vines") or {}
+    vines = (results.damping.get("both_axes") or {}).get("vines") or {}
     family: Mapping[str, Any] = {}
     for candidate in results.scaling.get("thickness") or ():
         diameters_mm = [vines.get(vine, {}).get("diameter_mm", nan) for vine in candidate["vines"]]

@@ -23,7 +23,6 @@ from vinetrack.report.section import (
     DiagnosisResult,
     ReportFigure,
     ReportSection,
-    ReportTable,
     base64_uri,
     data_uri,
     diagnosis_section,
@@ -39,20 +38,6 @@ if TYPE_CHECKING:
 
 # ------------------------------------------------------------------------------
 # Trials in the report: values, status and reason, strip, motion, data, and calibration.
-
-CALIBRATION_NAMES = {
-    "charuco": "ChArUco board",
-    "checkerboard": "checkerboard",
-    "two_points": "two points and their distance",
-    "mm_per_px": "millimetres per pixel, as given",
-    "sheet": "millimetres per pixel, from the sheet",
-}
-FLAG_WORDS = {
-    "before_release": "before release",
-    "lost": "without the edge",
-    "corrected": "corrected by hand",
-    "after_end": "after the end",
-}
 
 
 @dataclass(frozen=True)
@@ -71,7 +56,8 @@ def count_frames(flags: Iterable[str]) -> str:
     """Return the number of frames, and of those with each flag, as text."""
     flags = list(flags)
     counted = Counter(part for flag in flags for part in split_flags(flag))
-    parts = [f"{count} {FLAG_WORDS.get(flag, flag)}" for flag, count in counted.items()]
+    words = {"lost": "without the edge", "corrected": "corrected by hand", "after_end": "after the end"}
+    parts = [f"{count} {words.get(flag, flag.replace('_', ' '))}" for flag, count in counted.items()]
     return f"{len(flags)} frames" + (f": {', '.join(parts)}" if parts else "")
 
 
@@ -84,10 +70,16 @@ def calibration_table(recordings: Mapping[str, TrackedRecording]) -> list[dict[s
             key = (one["kind"], one["image"], one["n_corners"], one["reprojection_px"], *one["notes"])
             own = (one["mm_per_px"],) if one["kind"] == "sheet" else ()
             groups.setdefault((*key, *own), []).append((name, one))
-    return [_calibration_row(members) for members in groups.values()]
+    return list(map(_calibration_row, groups.values()))
 
 
 def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+    names = {
+        "charuco": "ChArUco board",
+        "two_points": "two points and their distance",
+        "mm_per_px": "millimetres per pixel, as given",
+        "sheet": "millimetres per pixel, from the sheet",
+    }
     first = members[0][1]
     scales = [one["mm_per_px"] for _, one in members]
     spread = number(min(scales), 6)
@@ -96,7 +88,7 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
     errors = [one["scale_rel_sigma"] for _, one in members if is_finite(one["scale_rel_sigma"])]
     has_target = bool(first["n_corners"]) and is_finite(first["reprojection_px"])
     return {
-        "kind": CALIBRATION_NAMES.get(first["kind"], first["kind"]),
+        "kind": names.get(first["kind"], first["kind"]),
         "image": first["image"] or "",
         "mm_per_px": spread,
         "error": f"{number(100 * max(errors), 2)} %" if errors else "unknown",
@@ -220,9 +212,6 @@ def final_errors(diagnosis: Diagnosis) -> str:
 
 def _rms_mm(values_m: pd.Series) -> str:
     return number(1e3 * math.sqrt(float((values_m**2).mean())))
-
-
-__all__ = ["Clip", "ReportContent", "ReportFigure", "ReportSection", "ReportTable", "build_report"]
 
 
 @dataclass(frozen=True)

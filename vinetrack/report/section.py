@@ -47,14 +47,6 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.power import Power
 
 
-_DROPPED = re.compile(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", re.DOTALL)
-_DRAWING_TAG = re.compile(r"<(?!image)[^>]*>")  # Images are placed by matrices, which need all their decimals
-_IDENTIFIER = re.compile(r'\bid="|url\(#|href="#')
-_IMAGE = re.compile(r'data:image/png;base64,([^"]+)')
-_COLOURS = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
-_COLOUR = re.compile("|".join(_COLOURS))
-
-
 def inline_picture(picture: str | bytes, prefix: str, description: str) -> Markup:
     """Return an SVG file or a PNG file as an element of the page, as wide as `--wide` where there is room: then its
     text is as large as that of the page. Blank for an empty file.
@@ -79,14 +71,18 @@ def _inline_svg(svg: str, prefix: str, description: str) -> str:
     if found is None:
         raise ValueError("not an SVG file of a figure")
     width, height = float(found[1]), float(found[2])
+    colours = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
+    any_colour = re.compile("|".join(colours))
 
     def short(tag: re.Match[str]) -> str:
-        return _COLOUR.sub(lambda match: _COLOURS[match[0]], re.sub(r"(\.\d\d)\d+", r"\1", tag[0]))
+        return any_colour.sub(lambda match: colours[match[0]], re.sub(r"(\.\d\d)\d+", r"\1", tag[0]))
 
-    body = _DRAWING_TAG.sub(short, _DROPPED.sub("", found[3]))
-    body = _IDENTIFIER.sub(lambda match: f"{match[0]}{escape(prefix, quote=True)}-", body)
+    body = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", found[3], flags=re.DOTALL)
+    body = re.sub(r"<(?!image)[^>]*>", short, body)  # images are placed by matrices, which need all their decimals
+    own = f"{escape(prefix, quote=True)}-"
+    body = re.sub(r'\bid="|url\(#|href="#', lambda match: match[0] + own, body)
     # WebP quality of the images in a strip, 0 to 100
-    body = _IMAGE.sub(lambda match: _as_webp(base64.b64decode(match[1]), 45), body)
+    body = re.sub(r'data:image/png;base64,([^"]+)', lambda match: _as_webp(base64.b64decode(match[1]), 45), body)
     body = re.sub(r"\s*\n\s*", " ", body)
     label = escape(description, quote=True)
     head = f'viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{label}" style="--wide:{1.33 * width:.0f}px"'
@@ -158,17 +154,6 @@ def data_uri(name: str, text: str) -> str:
 # ------------------------------------------------------------------------------
 # The section of the report on the diagnosis: candidates, upper limits, tied candidates, the next trial, drift.
 
-ABOUT_SIGMA = (
-    "● in the answer set. Δχ² is relative to the noise of the tracks alone; σ also accounts for disagreement between "
-    "trials: for a fitted candidate it is √Δχ² or less."
-)
-
-
-ABOUT_POWER = (
-    "By linear theory, with the noise and scatter of the fit, given all effects of the last model. Power there: at the "
-    "largest plausible size. Mistaken for: the other candidates with the highest score, at the size of 90 % power."
-)
-
 
 @dataclass(frozen=True)
 class DiagnosisResult:
@@ -190,31 +175,23 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         return None
     diagnosis = result.diagnosis
     drifting = [str(row["sentence"]) for row in diagnosis.drift if row.get("sentence") and row.get("significant", True)]
+    rounds, named = [], diagnosis.effects or diagnosis.answer_set
+    for entry in diagnosis.rounds:
+        untestable = [row for row in entry.ranking if row.status == NOT_TESTABLE]
+        blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
+        rounds.append({"table": ranking_table(entry), "blind": blind, "of": entry})
     return {
         "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
         "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
         "sentence": verdict_sentence(diagnosis),
         "meaning": verdict_meaning(diagnosis),
-        "summaries": [
-            result.summaries[name] for name in diagnosis.effects or diagnosis.answer_set if name in result.summaries
-        ],
+        "summaries": [result.summaries[name] for name in named if name in result.summaries],
         "facts": summary_facts(diagnosis, result.ladder),
         "explanation": diagnosis.explanation,
         "ladder": ladder_table(result.ladder),
         "where": [line for line in diagnosis.where if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
-        "rounds": [
-            {
-                "table": ranking_table(entry),
-                "blind": [
-                    f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}"
-                    for row in entry.ranking
-                    if row.status == NOT_TESTABLE
-                ],
-                "of": entry,
-            }
-            for entry in diagnosis.rounds
-        ],
+        "rounds": rounds,
         # Upper limits are valid only if no effect is missing.
         "hidden": upper_limit_table(
             diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), result.units
@@ -273,7 +250,11 @@ def ranking_table(entry: Round) -> ReportTable:
         for row in entry.ranking
         if row.status != NOT_TESTABLE
     ]
-    return ReportTable("", head, rows, frozenset({2, 3}), ABOUT_SIGMA)
+    note = (
+        "● in the answer set. Δχ² is relative to the noise of the tracks alone; σ also accounts for disagreement "
+        "between trials: for a fitted candidate it is √Δχ² or less."
+    )
+    return ReportTable("", head, rows, frozenset({2, 3}), note)
 
 
 def upper_limit_table(ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]]) -> ReportTable:
@@ -303,7 +284,12 @@ def power_entry(power: Power | None) -> dict[str, Any] | None:
         return None
     order = [] if power.wary else sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
     head = ("Effect", "number", *POWER_COLUMNS[2:])
-    table = ReportTable("", head, power_rows(order), frozenset({2, 3, 4, 5}), ABOUT_POWER)
+    note = (
+        "By linear theory, with the noise and scatter of the fit, given all effects of the last model. Power there: at "
+        "the largest plausible size. Mistaken for: the other candidates with the highest score, at the size of 90 % "
+        "power."
+    )
+    table = ReportTable("", head, power_rows(order), frozenset({2, 3, 4, 5}), note)
     return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "table": table}
 
 
@@ -468,20 +454,13 @@ def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[Repor
         "departure from Eq. (2) would cause, simulated for a vine of 280 mm."
     )
     about_speeds = "At 12 cm, over payloads; B of this vine is not printed and is scaled in proportion to the wall."
-    positions, speeds = published.POSITION_RMS_CM, published.FINAL_SPEED_RMS_M_S
+    positions = ("position_rms", published.POSITION_RMS_CM, about_positions)
+    speeds = ("final_speed_rms", published.FINAL_SPEED_RMS_M_S, about_speeds)
     head = ("pressure, kPa", "printed", "here", *CAUSES)
     made = []
-    for title, figure, row, column, factor, printed, note in (
-        ("rms of position, cm", "Fig. 4", "position_rms", "rms_position_m", 100, positions, about_positions),
-        (
-            "rms of final speed, m/s",
-            "Fig. 5",
-            "final_speed_rms",
-            "rms_final_lead_velocity_m_s",
-            1,
-            speeds,
-            about_speeds,
-        ),
+    for title, figure, column, factor, (row, printed, note) in (
+        ("rms of position, cm", "Fig. 4", "rms_position_m", 100, positions),
+        ("rms of final speed, m/s", "Fig. 5", "rms_final_lead_velocity_m_s", 1, speeds),
     ):
         body = []
         for kPa, error in printed.items():
@@ -530,7 +509,6 @@ _ELSEWHERE = "The fast vine, air drag, pressures"
 
 
 def _value(row: Any, column: str = "ours") -> float | None:
-    """The value of a row; None if there is no such row."""
     return None if row is None else float(getattr(row, column))
 
 
