@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from commanded import run, succeed
@@ -76,10 +77,8 @@ def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path, settings:
 def test_a_fault_of_the_program_is_one_sentence_and_its_traceback_is_in_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def break_down(*_: object) -> None:
-        raise RuntimeError("the bottom fell out")
-
-    monkeypatch.setattr("vinetrack.pipeline.trials.gather", break_down)
+    broken = Mock(side_effect=RuntimeError("the bottom fell out"))
+    monkeypatch.setattr("vinetrack.pipeline.trials.gather", broken)
     done = run("damping", experiment(tmp_path / "v"), tmp_path, "--log", tmp_path / "logs" / "d.log")
     assert done.exit_code == 1
     assert "Traceback" not in done.output
@@ -87,10 +86,8 @@ def test_a_fault_of_the_program_is_one_sentence_and_its_traceback_is_in_the_log(
 
 
 def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def break_down(*_: object) -> None:
-        raise ZeroDivisionError("unforeseen")
-
-    monkeypatch.setattr("vinetrack.kinematics.summary.summarise_trial", break_down)
+    broken = Mock(side_effect=ZeroDivisionError("unforeseen"))
+    monkeypatch.setattr("vinetrack.kinematics.summary.summarise_trial", broken)
     folder = experiment(tmp_path / "v")
     done = run("trials", folder, tmp_path / "r", "--log", tmp_path / "t.log")
     assert done.exit_code == 0

@@ -14,8 +14,7 @@ from lsoda_vine import N_TRUE, small_campaign
 import vinetrack as vt
 from vinetrack.core.tables import write_json
 from vinetrack.inference.fit_summary import summary_of
-from vinetrack.pipeline.design_stage import read_list, read_range
-from vinetrack.pipeline.predict_stage import PredictionRequest, read_basis
+from vinetrack.pipeline.predict_stage import PredictionRequest, read_basis, read_list, read_range
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 # `vinetrack predict`: what it says, what it writes, and how it refuses.

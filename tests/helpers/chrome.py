@@ -16,28 +16,16 @@ import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-extensions",
-    "--disable-dev-shm-usage",
-    "--remote-debugging-port=0",
-    "--remote-allow-origins=*",
-    "--hide-scrollbars",
-    "--force-color-profile=srgb",
-)
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--disable-extensions", "--disable-dev-shm-usage",
+    "--remote-debugging-port=0", "--remote-allow-origins=*", "--hide-scrollbars", "--force-color-profile=srgb",
+)  # fmt: skip
 
 
 def find_chrome() -> str | None:
@@ -84,9 +72,7 @@ class Chrome:
     def __enter__(self) -> Chrome:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._socket.close()
         self._process.terminate()
         try:
@@ -127,9 +113,9 @@ class Chrome:
         elif method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
 
-    def size(self, width: int, height: int, *, mobile: bool = False) -> None:
+    def size(self, width: int, height: int) -> None:
         """Size of the window, CSS pixels."""
-        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=mobile)
+        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def open(self, address: str) -> None:
         """Go to a page and wait until it has loaded."""
@@ -146,19 +132,12 @@ class Chrome:
         """Until an expression is true; its value."""
         return until(lambda: self.run(script), what, seconds)
 
-    def mouse(self, kind: str, x: float, y: float, *, held: bool = False, clicks: int = 1) -> None:
+    def mouse(self, kind: str, x: float, y: float, *, held: bool = False) -> None:
         """Move, press or release the left button at a place of the window."""
         names = {"move": "mouseMoved", "press": "mousePressed", "release": "mouseReleased"}
         down = held or kind != "move"
-        self.send(
-            "Input.dispatchMouseEvent",
-            type=names[kind],
-            x=x,
-            y=y,
-            button="left" if down else "none",
-            buttons=1 if down and kind != "release" else 0,
-            clickCount=0 if kind == "move" else clicks,
-        )
+        button = {"button": "left" if down else "none", "buttons": 1 if down and kind != "release" else 0}
+        self.send("Input.dispatchMouseEvent", type=names[kind], x=x, y=y, clickCount=int(kind != "move"), **button)
 
     def click(self, x: float, y: float) -> None:
         """Click at a place of the window."""
@@ -166,16 +145,9 @@ class Chrome:
         self.mouse("press", x, y)
         self.mouse("release", x, y)
 
-    def picture(self, path: Path, *, whole: bool = False) -> None:
-        """Save what is seen, or the whole page, as PNG."""
-        more: dict[str, Any] = {}
-        if whole:
-            size = self.send("Page.getLayoutMetrics")["cssContentSize"]
-            more = {
-                "captureBeyondViewport": True,
-                "clip": {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1},
-            }
-        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png", **more)["data"]))
+    def picture(self, path: Path) -> None:
+        """Save what is seen as PNG."""
+        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
 
 
 async def _connect(address: str) -> WebSocketClientConnection:

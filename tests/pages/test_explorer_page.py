@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -21,6 +22,7 @@ from page_browser import Browser
 from vinetrack.diagnosis.ladder import compare
 from vinetrack.effects import EffectError, remember
 from vinetrack.experiment.settings import read_experiment_settings
+from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.pages import controls
 from vinetrack.pages.campaign import BackgroundFit, Campaign
@@ -157,12 +159,8 @@ def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: Backgroun
 def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
     browser: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vinetrack.inference.fit_data import FitError
-
-    def refuse(*_: object) -> None:
-        raise FitError("Trial a: too hard.")
-
     before = error_of(browser)
+    refuse = Mock(side_effect=FitError("Trial a: too hard."))
     monkeypatch.setattr("vinetrack.pages.page.predict_choice", refuse)
     browser.model(GAMMA).value = 1.1
     browser.turn()
@@ -175,10 +173,8 @@ def test_a_recording_that_cannot_be_decoded_is_named_beside_the_positions(
 ) -> None:
     """Also once the text of the page was updated."""
     (tmp_path / "torn.mp4").write_bytes(b"not a film")
-    nothing = np.zeros(0)
-    view = RecordingView(
-        tmp_path / "torn.mp4", Axis((0.0, 0.0), (50.0, 0.0)), 5.0, nothing, nothing, nothing, nothing, nothing > 0
-    )
+    no = np.zeros(0)
+    view = RecordingView(tmp_path / "torn.mp4", Axis((0.0, 0.0), (50.0, 0.0)), 5.0, no, no, no, no, no > 0)
     monkeypatch.setattr("vinetrack.pages.plots.recording_view", lambda *_: view)
     browser.page.film.show_trial(browser.page.campaign.trials[0].name)
     browser.until(lambda: "tracked" in browser.text("film_caption"), 30)
@@ -333,10 +329,6 @@ def opened(unexplained: Campaign) -> Iterator[tuple[Browser, list[BackgroundFit]
     browser.page.close()
 
 
-def searching(monkeypatch: pytest.MonkeyPatch, search: Callable[..., WrittenProposal]) -> None:
-    monkeypatch.setattr(controls, "propose_effect", search)
-
-
 @pytest.mark.slow
 def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     opened: tuple[Browser, list[BackgroundFit]], unexplained: Campaign, monkeypatch: pytest.MonkeyPatch
@@ -352,7 +344,7 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
         remember(path)
         return WrittenProposal(("A law of the travel does.", f"Written to {path}."), (path,))
 
-    searching(monkeypatch, search)
+    monkeypatch.setattr(controls, "propose_effect", search)
     assert browser.model("propose_panel").visible
     assert f"vinetrack propose {unexplained.folder.as_posix()}" in browser.text("proposal")
     browser.click("propose")
@@ -369,7 +361,10 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     page = Browser(background)
     page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
     assert page.model("tick_spring_line").active
-    assert f"vinetrack add {(folder / 'spring_line.py').as_posix()}" in _fitted_commands(page)
+    page.click("refit")
+    page.until(lambda: page.model("refit").label == "Refit" and not page.page._sizes_changed, 240)
+    page.page._update_text()
+    assert f"vinetrack add {(folder / 'spring_line.py').as_posix()}" in page.text("commands")
     page.click("save")
     assert "Saved." in page.text("saved")
     page.page.close()
@@ -377,14 +372,6 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     assert (settings.model[-1], settings.effects) == ("spring_line", ("spring_line.py",))
     assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
     assert "spring_line" in open_campaign(unexplained.folder, folder).experiment.settings.model
-
-
-def _fitted_commands(page: Browser) -> str:
-    """Commands of the page once the effect that is ticked was fitted."""
-    page.click("refit")
-    page.until(lambda: page.model("refit").label == "Refit" and not page.page._sizes_changed, 240)
-    page.page._update_text()
-    return page.text("commands")
 
 
 def test_a_stopped_or_failed_search_can_be_restarted(
@@ -402,17 +389,14 @@ def test_a_stopped_or_failed_search_can_be_restarted(
             ended.set()
         raise AssertionError
 
-    searching(monkeypatch, endless)
+    monkeypatch.setattr(controls, "propose_effect", endless)
     browser.click("propose")
     assert begun.wait(60)
     browser.click("propose")
     assert ended.wait(60)
 
-    def refused(*_: Any) -> WrittenProposal:
-        raise ResultsError("no law")
-
-    for search in (refused, lambda *_: WrittenProposal(("no law",), ())):
-        searching(monkeypatch, search)
+    for search in (Mock(side_effect=ResultsError("no law")), lambda *_: WrittenProposal(("no law",), ())):
+        monkeypatch.setattr(controls, "propose_effect", search)
         browser.click("propose")
         browser.until(lambda: "no law" in browser.text("proposal"))
         assert browser.model("propose").label == controls.PROPOSE
@@ -422,6 +406,6 @@ def test_a_stopped_or_failed_search_can_be_restarted(
 def test_an_invalid_effect_file_is_reported(unexplained: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
     path = unexplained.experiment.folder / "torn.py"
     path.write_text("def tail_force(", encoding="utf-8")
-    searching(monkeypatch, lambda *_: WrittenProposal((), (path,)))
+    monkeypatch.setattr(controls, "propose_effect", lambda *_: WrittenProposal((), (path,)))
     with pytest.raises(EffectError):
         controls.propose_and_read(unexplained, lambda _: None)

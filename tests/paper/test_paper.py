@@ -137,7 +137,7 @@ def test_a_slack_tail_leaves_the_tip_to_itself_at_7_kpa(departures: pd.DataFrame
 
 
 def test_pressures_fall_from_full_to_what_the_gas_law_leaves() -> None:
-    table = pressure_table(instants=5)
+    table = pressure_table()
     last = table[table["lead_position_m"] == table["lead_position_m"].max()]
     at_7 = last[last["pressure_kPa"] == 7].set_index("departure")["gauge_left"]
     assert at_7["depletion_slow"] == pytest.approx(1 - 0.512, abs=1e-3)

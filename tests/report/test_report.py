@@ -29,13 +29,13 @@ from vinetrack.report.build import (
     ReportContent,
     ReportFigure,
     ReportSection,
-    ReportTable,
     TrackedRecording,
     build_report,
     speed_sparkline,
 )
 from vinetrack.report.section import (
     DiagnosisResult,
+    ReportTable,
     diagnosis_section,
     inline_picture,
     moved_table,

@@ -374,7 +374,9 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
     if isinstance(shown, Power):
         return _with_content(draw_power(shown), "power")
     if isinstance(shown, Comparison):
-        return _draw_figure(_comparison_tables(shown), name or "model_comparison")
+        table = label_conditions(shown.table, _described([compared.trial for compared in shown.trials]))
+        tables = SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
+        return _draw_figure(tables, name or "model_comparison")
     return _draw_figure(_tables_in_memory(shown) if shown.rounds else None, name)
 
 
@@ -392,17 +394,10 @@ def _with_content(drawn: Figure | None, name: str) -> Figure:
     return drawn
 
 
-def _comparison_tables(shown: Comparison) -> SimpleNamespace:
-    table = label_conditions(shown.table, _described([compared.trial for compared in shown.trials]))
-    return SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
-
-
 def _described(trials: Sequence[Trial]) -> pd.DataFrame:
     """Trials as figures name them: with vine, condition and its label."""
-    columns = ("name", "vine", "condition")
-    rows = pd.DataFrame(
-        [[getattr(trial, name) for name in columns] for trial in trials], columns=["trial", *columns[1:]]
-    )
+    named = [(trial.name, trial.vine, trial.condition) for trial in trials]
+    rows = pd.DataFrame(named, columns=["trial", "vine", "condition"])
     return describe_conditions(rows, tuple(trials))
 
 
