@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import typer.main
 import yaml
-from commanded import succeed
+from commanded import run, succeed
 from doc_commands import Shown, pieces, printed
 from own_effect import PAGE as OWN_EFFECT
 from own_effect import block, write_effect
@@ -160,7 +160,7 @@ def test_its_effect_goes_through_every_stage_and_stands_in_the_provenance(experi
 def test_what_the_page_shows_of_the_effect_is_what_is_printed(experiment: Path) -> None:
     shown = next(piece for piece in pieces(OWN_EFFECT.read_text(encoding="utf-8")) if isinstance(piece, Shown))
     assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
-    said = succeed("effects", "spring_line", "--experiment", experiment)
+    said = run("effects", "spring_line", "--experiment", experiment).stdout
     assert said.strip().replace(str(experiment), "my_experiment") == shown.output
 
 

@@ -119,22 +119,6 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) 
 
 
 @pytest.mark.slow
-def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_path: Path) -> None:
-    experiment = tmp_path / "vines"
-    shutil.copytree(campaign.experiment.folder, experiment)
-    page = Browser(BackgroundFit(open_campaign(campaign.folder, experiment)).begin())
-    page.page.background.wait(240)
-    page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
-    page.model("tick_reservoir_depletion").active = True
-    page.click("save")
-    assert "Saved." in page.text("saved")
-    text = (experiment / "experiment.yaml").read_text(encoding="utf-8")
-    assert text.startswith(SETTINGS)
-    assert read_experiment_settings(experiment / "experiment.yaml").model[-1] == "reservoir_depletion"
-    page.page.close()
-
-
-@pytest.mark.slow
 def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: BackgroundFit, tmp_path: Path) -> None:
     folder = tmp_path / "vines"
     shutil.copytree(campaign.folder, folder)

@@ -157,20 +157,13 @@ def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path: P
 # `vinetrack run`: the chain from anywhere, its progress, its last lines, and whose results a folder holds.
 
 
-def test_results_lie_where_snakemake_puts_them_or_under_the_folder_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = experiment(tmp_path / "week" / "vines")
-    monkeypatch.chdir(tmp_path)
-    assert run_paths(folder, None) == RunPaths(folder, tmp_path / make_plan({"experiment": folder}, tmp_path).results)
-    assert run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "vines"
-
-
-def test_the_command_that_renews_results_writes_them_where_they_are(
+def test_results_lie_where_snakemake_puts_them_or_under_the_folder_named_and_are_renewed_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = experiment(tmp_path / "week" / "my vines")
     monkeypatch.chdir(tmp_path)
+    assert run_paths(folder, None) == RunPaths(folder, tmp_path / make_plan({"experiment": folder}, tmp_path).results)
+    assert run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "my vines"
     given = folder.relative_to(tmp_path)
     for base, command in (
         (None, "vinetrack run 'week/my vines'"),
@@ -183,7 +176,7 @@ def test_the_command_that_renews_results_writes_them_where_they_are(
     assert elsewhere == "snakemake --config 'experiment=week/my vines' results=results/other"
 
 
-def test_experiments_of_one_name_never_share_results(tmp_path: Path) -> None:
+def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keeps_its_own(tmp_path: Path) -> None:
     first, second = (experiment(tmp_path / week / "vines") for week in ("monday", "friday"))
     begin_run(tmp_path / "out" / "vines", first).release()
     with pytest.raises(ExperimentError) as refused:
@@ -193,13 +186,7 @@ def test_experiments_of_one_name_never_share_results(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError):
         make_plan({"experiment": str(second), "results": str(tmp_path / "out" / "vines")}, tmp_path)
     assert run_paths(first, tmp_path / "out").experiment == first
-
-
-def test_an_experiment_that_has_moved_keeps_its_results(tmp_path: Path) -> None:
-    first = experiment(tmp_path / "vines")
-    begin_run(tmp_path / "out" / "vines", first).release()
-    moved = first.rename(tmp_path / "else")
-    moved = moved.rename(tmp_path / "new") / "."
+    moved = first.rename(tmp_path / "else") / "."
     assert make_plan({"experiment": str(moved), "results": str(tmp_path / "out" / "vines")}, tmp_path).trials == ("a",)
 
 

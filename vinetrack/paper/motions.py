@@ -115,10 +115,9 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
     rows: list[tuple[object, ...]] = []
     for trial in position_trials():
         plain = follow(trial, NONE, published.DAMPING_B[4])
-        stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))  # until Eq. (2) has grown to 95 %
         for departure in DEPARTURES:
             moved = follow(trial, departure, published.DAMPING_B[4])
-            rms_m = math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
+            rms_m = position_rms_m(plain, moved, trial)
             rows.append(("Fig. 4", trial.pressure_Pa / 1e3, departure.name, rms_m, math.nan, moved.slack_from_s))
     for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
         size = (published.DIAMETER_MM[4], published.FINAL_SPEED_THICKNESS_UM, published.LONGEST_VINE_MM)
@@ -135,6 +134,12 @@ def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
     """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`."""
     time_s = np.arange(0, LASTS_S, 1 / published.CAPTURE_FPS)
     return simulate(departure.model(B), departure.trial(trial), time_s)
+
+
+def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
+    """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %."""
+    stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))
+    return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
 
 
 def motion_table() -> pd.DataFrame:

@@ -237,6 +237,9 @@ def _end_with_parent() -> None:
 # One trial: its track, kinematics, contribution to the tables, and pictures.
 
 
+TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
+
+
 def analyse_trials(job: Job) -> list[str]:
     """Analyse all trials that are used, or only some; write the files of each in `tracks/`, `kinematics/`, `analysed/`
     and `figures/`. Trials with a faulty row of the sheet get empty files. Returns reasons of failed trials.
@@ -291,7 +294,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
     except Exception as error:
         if is_disk_full(error):
             raise  # a full disk is not a fault of this trial
-        reason, fault = f"could not be analysed: {INTERNAL_ERROR}", traceback.format_exc()
+        reason, fault = TRIAL_NOT_ANALYSED, traceback.format_exc()
     row = _bare_row(name, "failed", reason, trial) if summary is None else dict(summary.row) | columns
     _write(results, name, summary, row, view)
     _draw_trial(name, trial, results, settings.figures, kept)

@@ -56,16 +56,12 @@ def find_experiment(folder: Path) -> Path:
     close = difflib.get_close_matches(missing, folders, 1, 0.5)
     experiments = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
     if close:
-        remedy = f"did you mean {_shown(parent / close[0])}?"
+        remedy = f"did you mean {os.path.relpath(parent / close[0])}?"
     elif experiments:
-        remedy = f"existing experiments are {', '.join(_shown(parent / name) for name in experiments)}"
+        remedy = f"existing experiments are {', '.join(os.path.relpath(parent / name) for name in experiments)}"
     else:
-        remedy = f"the nearest existing folder is {_shown(parent)}"
+        remedy = f"the nearest existing folder is {os.path.relpath(parent)}"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
-
-
-def _shown(path: Path) -> str:
-    return os.path.relpath(path)
 
 
 def command_for_results(experiment: Path, results: Path) -> str:
@@ -75,7 +71,7 @@ def command_for_results(experiment: Path, results: Path) -> str:
         return shlex.join(["snakemake", "--config", f"experiment={experiment}", f"results={results}"])
     command = ["vinetrack", "run", str(experiment)]
     usual = where.parent == Path("results").absolute()
-    return shlex.join(command if usual else [*command, "--results", _shown(where.parent)])
+    return shlex.join(command if usual else [*command, "--results", os.path.relpath(where.parent)])
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
