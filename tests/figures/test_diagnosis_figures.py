@@ -11,6 +11,13 @@ from figure_frames import assert_nothing_is_cut_off
 from hand_diagnosis import ladder
 from matplotlib.colors import to_hex
 
+from vinetrack.figures.damping_figures import (
+    draw_paper_damping,
+    draw_paper_position,
+    draw_paper_reservoir,
+    draw_paper_rms,
+    draw_paper_speeds,
+)
 from vinetrack.figures.diagnosis_figures import (
     AFTER,
     BEFORE,
@@ -23,13 +30,6 @@ from vinetrack.figures.diagnosis_figures import (
     draw_missing_force,
     draw_where,
     rms_m,
-)
-from vinetrack.figures.paper_figures import (
-    draw_paper_damping,
-    draw_paper_position,
-    draw_paper_reservoir,
-    draw_paper_rms,
-    draw_paper_speeds,
 )
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION
 

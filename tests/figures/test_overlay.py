@@ -24,7 +24,7 @@ from vinetrack.figures.overlay import (
     subpixel_positions,
 )
 from vinetrack.figures.style import render
-from vinetrack.report.section import inline_picture
+from vinetrack.report.build import inline_picture
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 

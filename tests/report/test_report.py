@@ -25,21 +25,19 @@ from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build as report_trials
 from vinetrack.report.build import (
     Clip,
+    DiagnosisResult,
     ModelResult,
     ReportContent,
     ReportFigure,
     ReportSection,
+    ReportTable,
     TrackedRecording,
     build_report,
-    speed_sparkline,
-)
-from vinetrack.report.section import (
-    DiagnosisResult,
-    ReportTable,
     diagnosis_section,
     inline_picture,
     moved_table,
     paper_section,
+    speed_sparkline,
     upper_limit_table,
 )
 
