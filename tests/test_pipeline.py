@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from commanded import run, succeed
 from lsoda_vine import grown_position, vine_trial
+
+import vinetrack
 
 # A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
 
@@ -38,6 +40,9 @@ TRACK_HEADER = (
 KINEMATICS_HEADER = (
     "time_s,lead_position_m,lead_velocity_m_s,lead_velocity_sigma_m_s,tail_velocity_m_s,lead_acceleration_m_s2"
 )
+
+
+SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
 
 
 def through_snakemake(test: Callable[..., None]) -> Callable[..., None]:
@@ -110,53 +115,14 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess
 
 
 @through_snakemake
-def test_last_line_says_where_the_report_is(campaign: tuple) -> None:
+def test_the_files_are_those_people_rely_on_with_where_they_come_from(campaign: tuple) -> None:
     results, done = campaign
     assert done.stdout.strip().splitlines()[-1] == f"Report: results/{results.name}/report.html"
     assert (results / "report.html").is_file()
+    headers = {"trials.csv": TRIALS_HEADER, "tracks/d12_0.csv": TRACK_HEADER, "kinematics/d12_0.csv": KINEMATICS_HEADER}
+    assert {name: (results / name).read_text().splitlines()[0] for name in headers} == headers
 
-
-@through_snakemake
-def test_headers_are_exactly_those_people_rely_on(campaign: tuple) -> None:
-    results, _ = campaign
-    assert (results / "trials.csv").read_text().splitlines()[0] == TRIALS_HEADER
-    assert (results / "tracks" / "d12_0.csv").read_text().splitlines()[0] == TRACK_HEADER
-    assert (results / "kinematics" / "d12_0.csv").read_text().splitlines()[0] == KINEMATICS_HEADER
-
-
-@through_snakemake
-def test_every_trial_of_the_sheet_is_listed_in_its_order_with_its_status(campaign: tuple) -> None:
-    rows = read_rows(campaign[0] / "trials.csv")
-    good = [f"d{diameter}_{i}" for diameter in B for i in range(len(PRESSURES_KPA))]
-    assert list(rows) == [*good, "torn", "aside"]
-    assert {rows[name]["status"] for name in good} == {"ok"}
-    assert (rows["torn"]["status"], rows["aside"]["status"]) == ("failed", "left_out")
-
-
-@through_snakemake
-def test_steady_speeds_are_those_the_tracks_were_written_with(campaign: tuple) -> None:
-    rows = read_rows(campaign[0] / "trials.csv")
-    for diameter_mm in B:
-        for i, pressure_kPa in enumerate(PRESSURES_KPA):
-            truth = steady_tail_speed(diameter_mm, pressure_kPa)
-            assert float(rows[f"d{diameter_mm}_{i}"]["x_ss_m_s"]) == pytest.approx(truth, rel=0.02)
-
-
-@through_snakemake
-@pytest.mark.parametrize("method", ["log_log", "both_axes"])
-def test_the_damping_law_is_the_one_the_tracks_were_written_with(campaign: tuple, method: str) -> None:
-    fit = json.loads((campaign[0] / "damping.json").read_text())[method]
-    assert fit["refused"] is None
-    assert fit["n"] == pytest.approx(N, abs=0.01)
-    found = {law["diameter_mm"]: law["B"] for law in fit["vines"].values()}
-    assert found == pytest.approx(B, rel=0.02)
-    low, high = fit["n_95"]
-    assert low < fit["n"] < high
-
-
-@through_snakemake
-def test_every_figure_with_content_is_there_as_png_and_svg_and_no_other(campaign: tuple) -> None:
-    figures = campaign[0] / "figures"
+    figures = results / "figures"
     drawn = json.loads((figures / "campaign.json").read_text())["figures"]
     assert {"damping_law", "exponents", "scaling", "overview", "model_comparison", "model_residuals"} <= set(drawn)
     for name in (*drawn, "trial_d12_0", "trial_torn"):
@@ -165,20 +131,28 @@ def test_every_figure_with_content_is_there_as_png_and_svg_and_no_other(campaign
     written = {path.stem for path in figures.glob("*.svg") if not path.stem.startswith(("trial_", "strip_"))}
     assert written == set(drawn)
 
-
-@through_snakemake
-def test_provenance_names_version_settings_and_the_hash_of_every_input(campaign: tuple) -> None:
-    import hashlib
-
-    import vinetrack
-
-    results, _ = campaign
     provenance = json.loads((results / "provenance.json").read_text())
     sheet = results.parents[1] / "my vines (1)" / "trials.csv"
     assert provenance["vinetrack"] == vinetrack.__version__
     assert provenance["settings"]["damping"]["resamples"] == 2000
     assert provenance["inputs"]["trials.csv"] == hashlib.sha256(sheet.read_bytes()).hexdigest()
     assert set(provenance["inputs"]) >= {"tracks/d12_0.csv", "tracks/d24_3.csv", "tracks/torn.csv"}
+
+
+@through_snakemake
+def test_speeds_and_the_damping_law_are_those_the_tracks_were_written_with(campaign: tuple) -> None:
+    rows = read_rows(campaign[0] / "trials.csv")
+    good = [f"d{diameter}_{i}" for diameter in B for i in range(len(PRESSURES_KPA))]
+    assert list(rows) == [*good, "torn", "aside"]
+    assert [rows[name]["status"] for name in rows] == ["ok"] * len(good) + ["failed", "left_out"]
+    truth = [steady_tail_speed(diameter_mm, pressure_kPa) for diameter_mm in B for pressure_kPa in PRESSURES_KPA]
+    assert [float(rows[name]["x_ss_m_s"]) for name in good] == pytest.approx(truth, rel=0.02)
+    for method in ("log_log", "both_axes"):
+        fit = json.loads((campaign[0] / "damping.json").read_text())[method]
+        assert fit["refused"] is None
+        assert fit["n"] == pytest.approx(N, abs=0.01)
+        assert {law["diameter_mm"]: law["B"] for law in fit["vines"].values()} == pytest.approx(B, rel=0.02)
+        assert fit["n_95"][0] < fit["n"] < fit["n_95"][1]
 
 
 @through_snakemake
@@ -224,10 +198,7 @@ def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
 def test_one_trial_gives_everything_but_a_law_and_says_why(tmp_path: Path) -> None:
     folder = tmp_path / "one"
     write_track(folder / "a.csv", 12, 20, 7)
-    (folder / "trials.csv").write_text(
-        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
-        "007,a.csv,12,100,300,20,3,90\n"
-    )
+    (folder / "trials.csv").write_text(SHEET + "007,a.csv,12,100,300,20,3,90\n")
     rows = stages(folder, tmp_path / "results")
     assert float(rows["007"]["x_ss_m_s"]) == pytest.approx(steady_tail_speed(12, 20), rel=0.02)
     law = json.loads((tmp_path / "results" / "damping.json").read_text())["both_axes"]
@@ -239,10 +210,8 @@ def test_one_trial_gives_everything_but_a_law_and_says_why(tmp_path: Path) -> No
 def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_path: Path) -> None:
     folder, results = tmp_path / "v", tmp_path / "results"
     write_track(folder / "a.csv", 12, 20, 7)
-    (folder / "trials.csv").write_text(
-        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
-        "a,a.csv,12,100,300,20,3\nb,a.csv,12,100,300,20,3\nc,a.csv,12,100,300,9999,3\nd,a.csv,12,100,300,9999,3\n"
-    )
+    rows = [f"{name},a.csv,12,100,300,{kPa},3,0\n" for name, kPa in zip("abcd", (20, 20, 9999, 9999), strict=True)]
+    (folder / "trials.csv").write_text(SHEET + "".join(rows))
     for stage, *options in (
         ("trials", "--trials", '["a", "c"]', "--settings", '{"figures": {"formats": ["png"]}}'),
         ("trials", "--trials", '["b", "d"]'),
@@ -263,10 +232,8 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
     folder = tmp_path / "all broken"
     folder.mkdir()
     (folder / "a.csv").write_text("time_s,position_m\n1,1\n")
-    (folder / "trials.csv").write_text(
-        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
-        "a,a.csv,12,100,300,20,3\nb,b.csv,12,100,300,20,3\nc,a.csv,12,100,300,9999,3\n"
-    )
+    rows = ("a,a.csv,12,100,300,20,3,0\n", "b,b.csv,12,100,300,20,3,0\n", "c,a.csv,12,100,300,9999,3,0\n")
+    (folder / "trials.csv").write_text(SHEET + "".join(rows))
     rows = stages(folder, tmp_path / "results")
     assert {row["status"] for row in rows.values()} == {"failed"}
     page = (tmp_path / "results" / "report.html").read_text()
@@ -278,31 +245,13 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
 def test_the_same_experiment_gives_the_same_bytes(tmp_path: Path) -> None:
     folder = tmp_path / "same"
     write_track(folder / "a.csv", 24, 26, 3)
-    (folder / "trials.csv").write_text(
-        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
-        "a,a.csv,24,200,300,26,3,90\n"
-    )
+    (folder / "trials.csv").write_text(SHEET + "a,a.csv,24,200,300,26,3,90\n")
     stages(folder, tmp_path / "first")
     stages(folder, tmp_path / "second")
     files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*") if path.is_file())
     assert len(files) > 12
     for file in files:
         assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "second" / file).read_bytes(), file
-
-
-@through_snakemake
-def test_the_workflow_has_no_lints_but_the_one_about_conda() -> None:
-    done = snakemake(ROOT, "--lint", "--config", "experiment=data/demo")
-    lints = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip().startswith("* ")]
-    assert set(lints) <= {"* Specify a conda environment or container for each rule.:"}
-
-
-@pytest.mark.skipif(shutil.which("snakefmt", path=str(Path(sys.executable).parent)) is None, reason="needs snakefmt")
-def test_the_snakefile_is_formatted() -> None:
-    files = [str(ROOT / "Snakefile"), str(ROOT / "vinetrack" / "pipeline" / "Snakefile")]
-    command = [str(Path(sys.executable).parent / "snakefmt"), "--check", *files]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 # A workflow that is killed goes on with the same command.
@@ -316,16 +265,13 @@ def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None
         sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--workflow-profile",
         str(ROOT / "profiles" / "default"), "--cores", "1", "results/vines/trials.csv", "--config", "experiment=vines",
     ]  # fmt: skip
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    first = subprocess.Popen(
-        command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(ROOT)}}
     end = time.monotonic() + 60
-    while not list((results / "tracks").glob("*.csv")) and time.monotonic() < end:
-        time.sleep(0.05)
-    first.kill()
-    first.wait()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **where) as first:
+        while not list((results / "tracks").glob("*.csv")) and time.monotonic() < end:
+            time.sleep(0.05)
+        first.kill()
     assert not (results / "trials.csv").exists()
-    again = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    again = subprocess.run(command, capture_output=True, text=True, check=False, **where)
     assert again.returncode == 0, again.stdout + again.stderr
     assert (results / "trials.csv").exists()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,12 +47,11 @@ BAD = ("part", "beheaded", "letter", "gone")
 
 @dataclass(frozen=True)
 class Filmed:
-    """Results folder, the rows of its trials.csv, what was filmed, and what Snakemake printed."""
+    """Results folder, the rows of its trials.csv, and what was filmed."""
 
     results: Path
     rows: dict[str, dict[str, str]]
     truth: dict[str, Truth]
-    said: subprocess.CompletedProcess[str]
 
 
 def write_sheet(folder: Path, pressures_kPa: dict[str, int], settings: str) -> None:
@@ -101,7 +99,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
     done = snakemake(workdir, "--cores", "2", "--config", "experiment=vines", *few)
     assert done.returncode == 0, done.stdout + done.stderr
     results = workdir / "results" / "vines"
-    return Filmed(results, read_rows(results / "trials.csv"), truth, done)
+    return Filmed(results, read_rows(results / "trials.csv"), truth)
 
 
 def errors_px(results: Path, name: str, truth: Truth) -> np.ndarray:
@@ -131,15 +129,13 @@ def spread_px(found: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_a_good_recording_is_tracked_within_a_third_of_a_pixel(filmed: Filmed, name: str) -> None:
+def test_a_good_recording_is_tracked_within_a_third_of_a_pixel_and_a_thousandth_of_scale(
+    filmed: Filmed, name: str
+) -> None:
     assert filmed.rows[name]["status"] in ("ok", "warning")
     found = errors_px(filmed.results, name, filmed.truth[name])
     assert spread_px(found) < 0.35
     assert (np.abs(found[:, 0]) < 6 * found[:, 1]).all()
-
-
-@pytest.mark.parametrize("name", GOOD)
-def test_the_board_gives_the_scale_of_the_axis_within_a_thousandth(filmed: Filmed, name: str) -> None:
     track = pd.read_csv(filmed.results / "tracks" / f"{name}.csv")
     stated_m = np.hypot(track["lead_position_sigma_m"], track["lead_position_systematic_m"]).to_numpy()
     sure = np.isfinite(track["lead_position_m"].to_numpy()) & (stated_m < 0.5 * PLAIN.m_per_px)
@@ -149,18 +145,11 @@ def test_the_board_gives_the_scale_of_the_axis_within_a_thousandth(filmed: Filme
     assert 0 < float(filmed.rows[name]["scale_rel_sigma"]) < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("beheaded", "beheaded.mp4: cut short: the index that is written last is missing"),
-        ("letter", "letter.mp4: not a video"),
-        ("gone", "gone.mp4: there is no such file"),
-    ],
-)
-def test_a_recording_that_cannot_be_read_fails_with_its_sentence(filmed: Filmed, name: str, words: str) -> None:
+@pytest.mark.parametrize("name", ["beheaded", "letter", "gone"])
+def test_a_recording_that_cannot_be_read_fails_with_its_sentence(filmed: Filmed, name: str) -> None:
     assert filmed.rows[name]["status"] == "failed"
-    assert words in filmed.rows[name]["reason"]
-    assert words in (filmed.results / "report.html").read_text(encoding="utf-8")
+    assert filmed.rows[name]["reason"].startswith(f"{name}.mp4: ")
+    assert filmed.rows[name]["reason"] in (filmed.results / "report.html").read_text(encoding="utf-8")
     assert len((filmed.results / "tracks" / f"{name}.csv").read_text().splitlines()) == 1
 
 
@@ -172,7 +161,7 @@ def test_a_recording_without_its_end_gives_what_is_there_and_says_so(filmed: Fil
     assert spread_px(errors_px(filmed.results, "part", whole)) < 0.35
 
 
-def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> None:
+def test_the_report_shows_strips_calibration_and_a_clip_of_every_condition(filmed: Filmed) -> None:
     page = (filmed.results / "report.html").read_text(encoding="utf-8")
     for name in (*GOOD, "part"):
         assert f'aria-label="Strip of {name} with its tracked edge"' in page
@@ -180,14 +169,9 @@ def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> Non
     axis = json.loads((filmed.results / "analysed" / f"{next(iter(GOOD))}.json").read_text())["axis"]
     assert np.hypot(*np.subtract(axis["to_px"], axis["from_px"])) > 100
     assert "ChArUco board" in page
-    assert filmed.said.stdout.strip().splitlines()[-1] == "Report: results/vines/report.html"
-
-
-def test_a_recording_of_every_condition_has_a_clip_and_one_plays_in_the_report(filmed: Filmed) -> None:
     tracked = {name: row["condition"] for name, row in filmed.rows.items() if row["status"] in ("ok", "warning")}
     clips = [path.stem for path in (filmed.results / "overlays").glob("*.mp4")]
     assert sorted(tracked[name] for name in clips) == sorted(set(tracked.values()))
-    page = (filmed.results / "report.html").read_text(encoding="utf-8")
     assert page.count('src="data:video/mp4;base64,') == 1
     assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
 
@@ -209,13 +193,6 @@ def plainly_filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trut
     return folder, film_all(folder, {"p36": 36}, PLAIN)["p36"]
 
 
-def measured(folder: Path, results: Path, trial: str) -> dict[str, str]:
-    """Two stages by their own commands, in this process; the row of the one trial."""
-    for stage in ("trials", "damping"):
-        succeed(stage, folder, results)
-    return read_rows(results / "trials.csv")[trial]
-
-
 @pytest.mark.parametrize(
     ("settings", "rel_sigma"),
     [
@@ -230,7 +207,9 @@ def test_a_scale_that_is_given_serves_as_well(
 ) -> None:
     folder, truth = plainly_filmed
     write_sheet(folder, {"p36": 36}, settings)
-    row = measured(folder, tmp_path, "p36")
+    for stage in ("trials", "damping"):
+        succeed(stage, folder, tmp_path)
+    row = read_rows(tmp_path / "trials.csv")["p36"]
     assert float(row["mm_per_px"]) == pytest.approx(0.24, rel=1e-9)
     assert float(row["scale_rel_sigma"]) == pytest.approx(rel_sigma, rel=1e-9, nan_ok=True)
     assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35

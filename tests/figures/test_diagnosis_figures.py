@@ -8,8 +8,16 @@ import numpy as np
 import pandas as pd
 import pytest
 from figure_frames import assert_nothing_is_cut_off
+from hand_diagnosis import ladder
 from matplotlib.colors import to_hex
 
+from vinetrack.figures.damping_figures import (
+    draw_paper_damping,
+    draw_paper_position,
+    draw_paper_reservoir,
+    draw_paper_rms,
+    draw_paper_speeds,
+)
 from vinetrack.figures.diagnosis_figures import (
     AFTER,
     BEFORE,
@@ -23,54 +31,26 @@ from vinetrack.figures.diagnosis_figures import (
     draw_where,
     rms_m,
 )
-from vinetrack.figures.paper_figures import (
-    draw_paper_damping,
-    draw_paper_position,
-    draw_paper_reservoir,
-    draw_paper_rms,
-    draw_paper_speeds,
-)
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION
 
 # Figures of a diagnosis, from tables written by hand: positions, colours and text.
 
 
-def steps(*added: str, floor_m: float = 1e-3) -> pd.DataFrame:
-    n = len(added)
-    return pd.DataFrame(
-        {
-            "model": "m",
-            "added": added,
-            "rms_in_sample_m": 9e-3 / 4.0 ** np.arange(n),
-            "rms_left_out_m": 10e-3 / 4.0 ** np.arange(n),
-            "rms_highest_pressure_m": 11e-3 / 4.0 ** np.arange(n),
-            "floor_m": floor_m,
-            "excess_left_out_m": 0.0,
-        }
-    )
-
-
 def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
-    (ax,) = draw_ladder(steps("", "reservoir_depletion")).axes
+    (ax,) = draw_ladder(ladder("", "reservoir_depletion")).axes
     assert ax.get_yscale() == "log"
     assert "(mm)" in ax.get_ylabel()
     curves = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
-    assert np.array(curves) == pytest.approx(np.array([[9, 2.25], [10, 2.5], [11, 2.75]]))
+    assert np.array(curves) == pytest.approx(np.array([[9, 1.8], [10, 2], [11, 2.2]]))
     assert [label.get_text() for label in ax.get_xticklabels()] == ["initial\nmodel", "+ reservoir\ndepletion"]
 
 
 def prediction(name: str, before_m: float, after_m: float) -> pd.DataFrame:
     time_s = np.arange(-10, 100) * 1e-3
     moved_m = np.maximum(time_s, 0)
-    return pd.DataFrame(
-        {
-            "trial": name,
-            "time_s": time_s,
-            "lead_position_m": moved_m,
-            "model_before_m": moved_m - before_m * (time_s >= 0),
-            "model_after_m": moved_m - after_m * (time_s >= 0),
-        }
-    )
+    table = pd.DataFrame({"trial": name, "time_s": time_s, "lead_position_m": moved_m})
+    models = {"model_before_m": before_m, "model_after_m": after_m}
+    return table.assign(**{model: moved_m - off_m * (time_s >= 0) for model, off_m in models.items()})
 
 
 def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
@@ -188,31 +168,12 @@ def test_without_content_there_is_no_figure() -> None:
 NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
 
 
-def curve() -> pd.DataFrame:
-    rows = [
-        NOTHING | {"lead_position_m": y, "force_N": -y, "sigma_N": 0.02, "trials": int(y < 0.2), "condition": name}
-        for name in ("", "a", "b")
-        for y in np.linspace(0, 0.25, 26)
-    ]
-    return pd.DataFrame(rows)
-
-
-def surface() -> pd.DataFrame:
-    point = NOTHING | {"sigma_N": 0.02}
-    grid = [
-        point | {"lead_position_m": y, "tail_velocity_m_s": v, "force_N": -y * v, "trials": int(v < 6), "condition": ""}
-        for y in np.linspace(0, 0.25, 20)
-        for v in np.linspace(0, 8, 20)
-    ]
-    along = [
-        point | {"lead_position_m": y, "tail_velocity_m_s": 4.0, "force_N": -4 * y, "trials": 1, "condition": "a"}
-        for y in np.linspace(0, 0.25, 20)
-    ]
-    return pd.DataFrame([*grid, *along])
+Y, V = np.linspace(0, 0.25, 26), np.linspace(0, 8, 20)
 
 
 def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been() -> None:
-    (ax,) = draw_learned_force(curve()).axes
+    curve = pd.DataFrame({**NOTHING, "lead_position_m": Y, "force_N": -Y, "sigma_N": 0.02, "trials": Y < 0.2})
+    (ax,) = draw_learned_force(pd.concat([curve.assign(condition=name) for name in ("", "a", "b")])).axes
     assert ax.get_xlabel() == "growth y (mm)"
     line = next(line for line in ax.lines if line.get_label() == "learned force")
     assert line.get_xdata().max() == pytest.approx(190.0)
@@ -221,7 +182,11 @@ def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been
 
 
 def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
-    force, error, *bars = draw_learned_force(surface()).axes
+    y, v = (grid.ravel() for grid in np.meshgrid(Y, V, indexing="ij"))
+    places = {**NOTHING, "lead_position_m": y, "tail_velocity_m_s": v, "sigma_N": 0.02}
+    surface = pd.DataFrame({**places, "force_N": -y * v, "trials": v < 6, "condition": ""})
+    along = surface[v == V[10]].assign(condition="a")
+    force, error, *bars = draw_learned_force(pd.concat([surface, along])).axes
     assert (force.get_xlabel(), force.get_ylabel()) == ("growth y (mm)", "tail speed ẋ (m/s)")
     assert [bar.get_ylabel() for bar in bars] == ["missing force (N)", "its standard error (N)"]
     # The one condition's motion, over either map.
@@ -236,13 +201,14 @@ PRINTED_CM = {7: 1.90, 14: 0.29, 28: 0.31}
 
 
 def motions() -> pd.DataFrame:
-    parts = []
-    for pressure_kPa in PRINTED_CM:
-        for k, name in enumerate(("eq2", *NAMES)):
-            time_s = np.linspace(0, (1 + 0.3 * k) / pressure_kPa, 30)
-            position_m = 0.28 * time_s / time_s[-1] * (1 - 0.05 * k)
-            columns = {"pressure_kPa": float(pressure_kPa), "departure": name}
-            parts.append(pd.DataFrame({"time_s": time_s, "lead_position_m": position_m} | columns))
+    way = np.linspace(0, 1, 30)
+    parts = [
+        pd.DataFrame({"time_s": way * (1 + 0.3 * k) / kPa, "lead_position_m": 0.28 * way * (1 - 0.05 * k)}).assign(
+            pressure_kPa=float(kPa), departure=name
+        )
+        for kPa in PRINTED_CM
+        for k, name in enumerate(("eq2", *NAMES))
+    ]
     return pd.concat(parts, ignore_index=True)
 
 
@@ -264,16 +230,15 @@ def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points() -> None:
 
 
 def points() -> pd.DataFrame:
-    rows = []
-    for scale, B in ((1, 0.57), (4, 6.44)):
-        for speed in (0.5, 1.0, 2.0, 4.0):
-            force = B * speed**0.37
-            rows.append(
-                (f"v{scale}", 6.0 * scale, 50.0 * scale, speed, force, 1.1 * speed, 0.99 * force, True, speed > 0.6)
-            )
-    rows.append(("other", 30.0, 50.0, 1.0, 1.0, 1.0, 1.0, True, True))
-    columns = ["vine", "diameter_mm", "thickness_um", "x_ss_m_s", "force_N", "x_ss_paper_m_s", "force_paper_N"]
-    return pd.DataFrame(rows, columns=[*columns, "eligible", "used"])
+    rows = [
+        (f"v{scale}", 6.0 * scale, 50.0 * scale, speed, B * speed**0.37)
+        for scale, B in ((1, 0.57), (4, 6.44))
+        for speed in (0.5, 1.0, 2.0, 4.0)
+    ]
+    columns = ["vine", "diameter_mm", "thickness_um", "x_ss_m_s", "force_N"]
+    table = pd.DataFrame([*rows, ("other", 30.0, 50.0, 1.0, 1.0)], columns=columns)
+    paper = {"x_ss_paper_m_s": 1.1 * table["x_ss_m_s"], "force_paper_N": 0.99 * table["force_N"]}
+    return table.assign(**paper, eligible=True, used=table["x_ss_m_s"] > 0.6)
 
 
 def damping() -> dict:
@@ -287,16 +252,6 @@ def test_printed_lines_have_the_printed_slope() -> None:
     assert len(dashed) == 2
     x, y = (np.log(values) for values in dashed[0].get_data())
     assert np.polyfit(x, y, 1) == pytest.approx([0.37, np.log(0.57)])
-
-
-def pressures() -> pd.DataFrame:
-    y = np.linspace(0, 0.28, 5)
-    parts = []
-    for pressure_kPa in (7.0, 28.0):
-        for name, loss in (("depletion_slow", 0.15), ("depletion_fast", 0.21)):
-            columns = {"pressure_kPa": pressure_kPa, "departure": name}
-            parts.append(pd.DataFrame({"lead_position_m": y, "gauge_left": 1 - loss * y / 0.28} | columns))
-    return pd.concat(parts, ignore_index=True)
 
 
 def departures() -> pd.DataFrame:
@@ -342,8 +297,14 @@ def test_final_speeds_stand_beside_eq2_where_payloads_differ() -> None:
 
 @pytest.mark.slow
 def test_nothing_is_cut_off() -> None:
-    assert_nothing_is_cut_off(draw_paper_position(motions(), means(), ERRORS))
-    assert_nothing_is_cut_off(draw_paper_damping(points(), damping()))
-    assert_nothing_is_cut_off(draw_paper_reservoir(pressures()))
-    assert_nothing_is_cut_off(draw_paper_rms(paper(), departures()))
-    assert_nothing_is_cut_off(draw_paper_speeds(speeds(), speeds()))
+    y = np.linspace(0, 0.28, 5)
+    left = [pd.DataFrame({"lead_position_m": y, "gauge_left": 1 - y / 2, "pressure_kPa": kPa}) for kPa in (7.0, 28.0)]
+    pressures = [one.assign(departure=name) for one in left for name in ("depletion_slow", "depletion_fast")]
+    for figure in (
+        draw_paper_position(motions(), means(), ERRORS),
+        draw_paper_damping(points(), damping()),
+        draw_paper_reservoir(pd.concat(pressures, ignore_index=True)),
+        draw_paper_rms(paper(), departures()),
+        draw_paper_speeds(speeds(), speeds()),
+    ):
+        assert_nothing_is_cut_off(figure)

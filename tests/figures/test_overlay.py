@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.text import Text
-from plain_scene import Plan, plain_scene
 
-from vinetrack.core.records import Correction, Track, Trial, hand_corrected
+from vinetrack.core.records import Track
 from vinetrack.figures.overlay import (
     AFTER,
     BEFORE,
@@ -25,23 +24,15 @@ from vinetrack.figures.overlay import (
     subpixel_positions,
 )
 from vinetrack.figures.style import render
-from vinetrack.report.section import inline_picture
+from vinetrack.report.build import inline_picture
 from vinetrack.video.axis import Axis
-from vinetrack.video.frames import Frames, Recording
-from vinetrack.video.track import Tracking, track_frames
+from vinetrack.video.track import Tracking
 
 # Frames of a clip: every edge at its position and in its colour, with scale, time and names.
 
 
-SIZE = (640, 200)
-
-
 def rgb(colour: str) -> np.ndarray:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
-
-
-def view(axis: Axis | None = None, width_px: int = 640) -> ClipView:
-    return ClipView("a", axis or Axis((20.0, 100.0), (620.0, 100.0)), 40.0, SIZE, 0.25, 30.0, width_px)
 
 
 def edges(tracked: float = 200.0, before: float = 300.0, after: float = 210.0) -> list[Edge]:
@@ -52,46 +43,31 @@ def edges(tracked: float = 200.0, before: float = 300.0, after: float = 210.0) -
     ]
 
 
-def columns_of(picture: np.ndarray, colour: str, height: int = SIZE[1]) -> np.ndarray:
-    """Columns of the picture, without the bar above it, in which a colour stands."""
-    return np.flatnonzero((picture[-height:] == rgb(colour)).all(axis=2).any(axis=0))
-
-
-def grey() -> np.ndarray:
-    return np.full(SIZE[::-1], 90, np.uint8)
-
-
-def test_each_edge_stands_where_it_is_along_the_axis() -> None:
-    picture = compose(view(), grey(), 1, 12.0, edges())
+@pytest.mark.parametrize(
+    ("axis", "size", "width_px"),
+    [
+        (Axis((20.0, 100.0), (620.0, 100.0)), (640, 200), 640),
+        (Axis((20.0, 100.0), (620.0, 100.0)), (640, 200), 960),
+        (Axis((100.0, 20.0), (100.0, 620.0)), (200, 640), 200),
+    ],
+    ids=["along", "larger", "down"],
+)
+def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_length_it_names(
+    axis: Axis, size: tuple[int, int], width_px: int
+) -> None:
+    view, grey = ClipView("a", axis, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
+    zoom = width_px / size[0]
+    unseen, picture = (compose(view, grey, frame, 12.0, edges())[-round(zoom * size[1]) :] for frame in (0, 1))
+    assert picture.shape[1] == width_px
+    across = 0 if axis.from_px[1] == axis.to_px[1] else 1
     for colour, place in ((TRACKED, 220), (BEFORE, 320), (AFTER, 230)):
-        assert np.mean(columns_of(picture, colour)) == pytest.approx(place, abs=1)
-
-
-def test_an_edge_that_was_not_seen_is_not_drawn() -> None:
-    picture = compose(view(), grey(), 0, 0.0, edges())
-    assert not columns_of(picture, TRACKED).size
-    assert columns_of(picture, BEFORE).size
-
-
-def test_places_scale_with_the_size_of_the_clip() -> None:
-    picture = compose(view(width_px=960), grey(), 1, 0.0, edges())
-    assert picture.shape[1] == 960
-    assert np.mean(columns_of(picture, BEFORE, 300)) == pytest.approx(320.5 * 1.5 - 0.5, abs=1)
-
-
-def test_an_axis_down_the_picture_has_its_edges_across_it() -> None:
-    down = ClipView("a", Axis((100.0, 10.0), (100.0, 190.0)), 40.0, (200, 200), 0.25, 30.0, 200)
-    picture = compose(down, np.full((200, 200), 90, np.uint8), 1, 0.0, edges(90, 140, 60))
-    rows = np.flatnonzero((picture[-200:] == rgb(TRACKED)).all(axis=2).any(axis=1))
-    assert np.mean(rows) == pytest.approx(100, abs=1)
-
-
-def test_the_scale_bar_has_the_length_it_names() -> None:
-    picture = compose(view(), grey(), 1, 0.0, [])
-    white = (picture[-SIZE[1] :] == 255).all(axis=2)
-    longest = max(int(row.sum()) for row in white)
-    # A sixth of 640 px is 26.7 mm; the round length below it is 20 mm, or 80 px.
-    assert longest == pytest.approx(80, abs=2)
+        seen = np.flatnonzero((picture == rgb(colour)).all(axis=2).any(axis=across))
+        assert np.mean(seen) == pytest.approx((place + 0.5) * zoom - 0.5, abs=1)
+    assert not (unseen == rgb(TRACKED)).all(axis=2).any()
+    assert (unseen == rgb(BEFORE)).all(axis=2).any()
+    if size[0] == 640:
+        # A sixth of 640 px is 26.7 mm; the round length below it is 20 mm, or 80 px.
+        assert max(int(row.sum()) for row in (picture == 255).all(axis=2)) == pytest.approx(80 * zoom, abs=2)
 
 
 def test_grey_levels_are_stretched_and_clipped() -> None:
@@ -105,9 +81,9 @@ N = 40
 
 
 def tracking(n_along: int = 300, height: int = 60) -> Tracking:
-    """An edge at 10 px a frame from frame 10 on; frame 20 is lost, frame 30 doubtful."""
+    """An edge at 7 px a frame from frame 10 on; frame 20 is lost, 25 moved by hand, 26 retimed, 30 doubtful."""
     flag = np.array(["before_release"] * 10 + [""] * 30, dtype="<U64")
-    flag[20], flag[30] = "lost", "doubtful;gap"
+    flag[20], flag[25], flag[26], flag[30] = "lost", "corrected", "gap;retimed", "doubtful;gap"
     edge = np.maximum(np.arange(N) - 10, 0) * 7.0 + 20
     edge[20] = np.nan
     kymograph = np.where(np.arange(n_along)[None] < np.nan_to_num(edge)[:, None], 40, 180).astype(np.float32)
@@ -119,11 +95,11 @@ def tracking(n_along: int = 300, height: int = 60) -> Tracking:
 
 def test_the_edge_and_flagged_frames_are_counted_apart() -> None:
     kymograph = draw_strip("a", tracking(), 1e-3).axes[0]
-    labels = [line.get_label() for line in kymograph.lines]
-    assert labels == ["leading edge, N = 38", "flagged, N = 2"]
-    crosses = kymograph.lines[1]
-    assert crosses.get_xdata().tolist() == [160.0]
-    assert crosses.get_ydata() == pytest.approx([30.0])
+    shown = {line.get_label(): line for line in kymograph.lines if not line.get_label().startswith("_")}
+    assert list(shown) == ["leading edge, N = 36", "flagged, N = 3", "corrected by hand, N = 1"]
+    for label, px, ms in (("flagged, N = 3", [132, 160], [26, 30]), ("corrected by hand, N = 1", [125], [25])):
+        assert shown[label].get_xdata().tolist() == px
+        assert shown[label].get_ydata() == pytest.approx(ms)
 
 
 def test_each_frame_shows_the_edge_across_the_axis_where_it_was() -> None:
@@ -180,33 +156,3 @@ def test_the_histogram_holds_every_edge_and_says_what_it_shows(amplitude_px: flo
     said = " ".join(text.get_text() for text in figure.findobj(Text)).replace("\n", " ")
     assert f"px, {words}" in said
     assert "N = 600 frames" in said
-
-
-# Points corrected by hand are marked in the figures that show points.
-
-
-@pytest.fixture(scope="module")
-def tracking_points() -> Tracking:
-    from pathlib import Path
-
-    luma = plain_scene(
-        Plan(width=480, height=160, from_px=(20, 80), start_px=40, end_px=400, speed=14, radius=20)
-    ).frames
-    recording = Recording(Path("a.mp4"), "container", 480, 160, 8, len(luma))
-    frames = Frames(recording, luma, np.arange(len(luma)), np.zeros(len(luma), dtype=bool))
-    given = (Correction(20, "move", 150.0), Correction(22, "confirm"))
-    return track_frames(frames, Trial(name="a", capture_fps=1000.0, m_per_px=2.5e-4, corrections=given), 1000.0)
-
-
-def words(tracking_points: Tracking) -> str:
-    figure = draw_strip("a", tracking_points, 2.5e-4)
-    return " ".join(text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text")))
-
-
-def test_the_strip_says_how_many_points_were_corrected(tracking_points: Tracking) -> None:
-    assert "corrected by hand, N = 2" in words(tracking_points)
-
-
-def test_a_corrected_time_does_not_count_as_a_point_corrected_by_hand() -> None:
-    flags = ["corrected", "gap;retimed", "", "rejected;corrected", "corrected;gap;retimed"]
-    assert list(hand_corrected(flags)) == [True, False, False, True, True]

@@ -22,21 +22,10 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-extensions",
-    "--disable-dev-shm-usage",
-    "--remote-debugging-port=0",
-    "--remote-allow-origins=*",
-    "--hide-scrollbars",
-    "--force-color-profile=srgb",
-)
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--disable-extensions", "--disable-dev-shm-usage",
+    "--remote-debugging-port=0", "--remote-allow-origins=*", "--hide-scrollbars", "--force-color-profile=srgb",
+)  # fmt: skip
 
 
 def find_chrome() -> str | None:
@@ -138,19 +127,12 @@ class Chrome:
         """Until an expression is true; its value."""
         return until(lambda: self.run(script), what, seconds)
 
-    def mouse(self, kind: str, x: float, y: float, *, held: bool = False, clicks: int = 1) -> None:
+    def mouse(self, kind: str, x: float, y: float, *, held: bool = False) -> None:
         """Move, press or release the left button at a place of the window."""
         names = {"move": "mouseMoved", "press": "mousePressed", "release": "mouseReleased"}
         down = held or kind != "move"
-        self.send(
-            "Input.dispatchMouseEvent",
-            type=names[kind],
-            x=x,
-            y=y,
-            button="left" if down else "none",
-            buttons=1 if down and kind != "release" else 0,
-            clickCount=0 if kind == "move" else clicks,
-        )
+        button = {"button": "left" if down else "none", "buttons": 1 if down and kind != "release" else 0}
+        self.send("Input.dispatchMouseEvent", type=names[kind], x=x, y=y, clickCount=int(kind != "move"), **button)
 
     def click(self, x: float, y: float) -> None:
         """Click at a place of the window."""

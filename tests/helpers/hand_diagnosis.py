@@ -13,55 +13,35 @@ VERDICTS = ("missing", "ambiguous", "artefact", "adequate", "unexplained")
 
 def number(parameter: str, symbol: str, value: float, sigma: float | None, unit: str = "1", vine: str = "") -> dict:
     low, high = (None, None) if sigma is None else (value - 2 * sigma, value + 2 * sigma)
-    return {"parameter": parameter, "vine": vine, "symbol": symbol, "unit": unit, "value": value, "sigma": sigma} | {
-        "low_95": low,
-        "high_95": high,
-        "interval": "linear",
-        "bound": None,
-    }
+    found = {"value": value, "sigma": sigma, "low_95": low, "high_95": high, "interval": "linear", "bound": None}
+    return {"parameter": parameter, "vine": vine, "symbol": symbol, "unit": unit, **found}
 
 
 def candidate(effect: str, delta_chi2: float | None, **changes: Any) -> dict[str, Any]:
     """A row of a ranking; physical, refitted, plausible and not in the answer unless said otherwise."""
-    row = {
-        "effect": effect,
-        "kind": "physical",
-        "status": "refitted",
-        "delta_chi2": delta_chi2,
-        "sigma": None if delta_chi2 is None else math.sqrt(delta_chi2),
-        "numbers": [number(f"{effect}.k", "k", 2.0, 0.1, "Pa")],
-        "plausible": True,
-        "in_answer_set": False,
-        "reason": "",
-        "largest": {},
-    }
-    return row | changes
+    row = {"effect": effect, "kind": "physical", "status": "refitted", "plausible": True, "in_answer_set": False}
+    gain = {"delta_chi2": delta_chi2, "sigma": None if delta_chi2 is None else math.sqrt(delta_chi2)}
+    found = {"numbers": [number(f"{effect}.k", "k", 2.0, 0.1, "Pa")], "reason": "", "largest": {}}
+    return row | gain | found | changes
 
 
 IMPLAUSIBLE = {"code": "implausible_size", "symbol": "1/τ", "value": 9.0, "unit": "1/s", "low": 0.0, "high": 3.0}
 
 
 def ranking(*answers: str, kind: str = "physical") -> list[dict[str, Any]]:
-    rows = [candidate(name, 400.0 - i, in_answer_set=True, kind=kind) for i, name in enumerate(answers)]
-    rows += [
+    blank = {"code": "column_blank", "column": "payload_g"}
+    return [
+        *(candidate(name, 400.0 - i, in_answer_set=True, kind=kind) for i, name in enumerate(answers)),
         candidate("leak", 350.0, plausible=False, reason_code=IMPLAUSIBLE),
         candidate("time_base", 25.0, kind="measurement", status="screened", numbers=[], largest={"tau": 3e-3}),
-        candidate(
-            "payload_drag",
-            None,
-            status="not testable here",
-            numbers=[],
-            reason_code={"code": "column_blank", "column": "payload_g"},
-        ),
+        candidate("payload_drag", None, status="not testable here", numbers=[], reason_code=blank),
     ]
-    return rows
 
 
 def one_round(verdict: str, *answers: str, model: list[str] | None = None, kind: str = "physical") -> dict[str, Any]:
     effects = [*answers, "leak", "time_base"]
-    matrix = [
-        [1.0 if i == j else 0.97 if {i, j} == {0, 1} else 0.2 for j in range(len(effects))] for i in range(len(effects))
-    ]
+    n = len(effects)
+    matrix = [[1.0 if i == j else 0.97 if {i, j} == {0, 1} else 0.2 for j in range(n)] for i in range(n)]
     return {
         "model": model or BASE,
         "verdict": verdict,
@@ -109,12 +89,8 @@ def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
 
 def refused(reason: str = "fewer than two trials move") -> dict[str, Any]:
     empty: dict[str, Any] = {"effects": [], "answer_set": [], "rounds": [], "parameters": [], "model": BASE}
-    return empty | {
-        "verdict": None,
-        "final_verdict": None,
-        "refused": reason,
-        "explanation": f"No diagnosis could be made: {reason}",
-    }
+    said = {"refused": reason, "explanation": f"No diagnosis could be made: {reason}"}
+    return empty | said | {"verdict": None, "final_verdict": None}
 
 
 def missing_force() -> dict[str, Any]:

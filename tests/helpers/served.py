@@ -8,11 +8,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from chrome import Chrome, end, until
+
+from vinetrack.pages.setup_server import SetupServer, start_server
 
 PROGRAM = "from vinetrack.cli.main import main; main()"
 
@@ -62,6 +65,20 @@ class Served:
         self._reader.join(10)
         if self.process.stdout is not None:
             self.process.stdout.close()
+
+
+@contextmanager
+def served_here(clips: Path) -> Iterator[SetupServer]:
+    """The set-up page of a folder, served by this process."""
+    server = start_server(clips, 0)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(10)
 
 
 class Visitor:

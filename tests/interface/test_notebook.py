@@ -14,29 +14,16 @@ pytestmark = pytest.mark.slow
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "python.ipynb"
 
 
-@pytest.fixture(scope="module")
-def shown() -> list[dict[str, Any]]:
-    return [one for outputs in run(NOTEBOOK) for one in outputs]
-
-
-@pytest.fixture(scope="module")
-def stored() -> list[dict[str, Any]]:
-    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
-    return [one for cell in cells for one in cell.get("outputs", [])]
-
-
 def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
     return [sorted(one.get("data", one)) for one in outputs]
 
 
-def test_every_cell_runs_and_shows_what_kind_of_thing_is_stored(
-    shown: list[dict[str, Any]], stored: list[dict[str, Any]]
-) -> None:
+def test_every_cell_runs_and_shows_what_is_stored() -> None:
+    shown = [one for outputs in run(NOTEBOOK) for one in outputs]
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    stored = [one for cell in cells for one in cell.get("outputs", [])]
     assert kinds(shown) == kinds(stored)
     assert sum("image/png" in kind for kind in kinds(shown)) == 3
-
-
-def test_objects_and_words_are_those_stored(shown: list[dict[str, Any]], stored: list[dict[str, Any]]) -> None:
     texts = [["".join(one["data"]["text/plain"]) for one in each if "data" in one] for each in (shown, stored)]
     objects = [[text for text in each if text.startswith(("Fit(", "Diagnosis("))] for each in texts]
     assert objects[0] == objects[1]

@@ -16,6 +16,7 @@ from vinetrack.core.units import number
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.interface.loaded import LoadedResults
 from vinetrack.narrative.verdict_text import estimate_text, summary_facts
+from vinetrack.pages.page import open_campaign
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +33,8 @@ def diagnosis(loaded: LoadedResults) -> Diagnosis:
 @pytest.fixture(scope="module")
 def report(small_run: Path) -> str:
     """The words of the page."""
-    page = re.sub(
-        r"<(script|style|svg)\b.*?</\1>", " ", (small_run / "report.html").read_text("utf-8"), flags=re.DOTALL
-    )
+    page = (small_run / "report.html").read_text("utf-8")
+    page = re.sub(r"<(script|style|svg)\b.*?</\1>", " ", page, flags=re.DOTALL)
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", page)).split())
 
 
@@ -96,8 +96,6 @@ def test_the_worst_condition_is_one(loaded: LoadedResults, diagnosis: Diagnosis,
 
 
 def test_the_explorer_starts_from_the_same_numbers_and_floors(small_run: Path, loaded: LoadedResults) -> None:
-    from vinetrack.pages.page import open_campaign
-
     campaign = open_campaign(small_run)
     assert dict(campaign.numbers) == {entry.name: entry.value for entry in loaded.fit.numbers}
     compared = loaded.tables["comparison"].set_index("condition")

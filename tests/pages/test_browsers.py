@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,11 +11,10 @@ import numpy as np
 import pytest
 from chrome import Chrome, find_chrome
 from explorer_campaign import film_of, make_experiment, make_results
-from served import Served, Visitor
+from served import Served, Visitor, served_here
 
 from vinetrack.core.tables import read_table, read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.pages.setup_server import start_server
 from vinetrack.video.curved_axis import CurvedAxis, axis_from_entry
 
 # The page in a real browser: load, select, drag, tick, refit, watch the error fall, step through frames, save.
@@ -47,6 +45,9 @@ def visitor(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
         opened = Visitor(chrome, served.address)
         yield opened
         assert chrome.complaints == []
+        asked = {request for request in chrome.requests if not request.startswith("data:")}
+        assert asked
+        assert all(request.startswith(("http://127.0.0.1:", "ws://127.0.0.1:")) for request in asked)
 
 
 def errors(visitor: Visitor) -> np.ndarray:
@@ -55,12 +56,6 @@ def errors(visitor: Visitor) -> np.ndarray:
 
 def floors(visitor: Visitor) -> np.ndarray:
     return np.array(visitor.value("error_bars", "data.floor"), dtype=float)
-
-
-def test_the_page_makes_no_requests_to_other_machines(visitor: Visitor) -> None:
-    asked = {request for request in visitor.chrome.requests if not request.startswith("data:")}
-    assert asked
-    assert all(request.startswith(("http://127.0.0.1:", "ws://127.0.0.1:")) for request in asked)
 
 
 def test_dragging_a_slider_moves_the_curves_continuously(visitor: Visitor) -> None:
@@ -121,6 +116,7 @@ def test_page_and_figures_follow_a_dark_screen(visitor: Visitor) -> None:
 
 
 SHARED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
+HANDLE = "document.querySelector('[data-handle^=%s]')"
 NAME = "a.getAttribute('aria-label') || a.labels?.[0]?.textContent || a.textContent.slice(0, 40) || a.tagName"
 
 
@@ -154,8 +150,23 @@ class Person:
         )
         return left + (x_px + 0.5) / 480 * width, top + (y_px + 0.5) / 160 * height
 
-    def text(self, element: str) -> str:
-        return str(self.chrome.run(f"document.querySelector({element!r}).textContent"))
+    def drag(self, handle: str, x_px: float, y_px: float) -> None:
+        """Drag a handle over the picture, under a lens, to a pixel of it."""
+        self.at(0, 0)
+        x, y = self.chrome.run(
+            f"(() => {{ const r = {HANDLE % handle}.getBoundingClientRect();"
+            " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+        )
+        self.chrome.mouse("move", x, y)
+        self.chrome.mouse("press", x, y)
+        target = self.at(x_px, y_px)
+        self.chrome.mouse("move", *target, held=True)
+        assert self.chrome.run("document.querySelector('.lens') !== null")
+        self.chrome.mouse("release", *target)
+
+    def save(self, said: str = "Written") -> None:
+        self.press("#save")
+        self.chrome.wait(f"document.querySelector('#status').textContent.includes({said!r})", "the save")
 
 
 @contextmanager
@@ -168,16 +179,8 @@ def at_the_page(address: str, folder: Path) -> Iterator[Person]:
 @pytest.fixture
 def person(clips: Path, tmp_path: Path) -> Iterator[Person]:
     """A page served by this process, so that the server is not restarted for every test."""
-    server = start_server(clips, 0)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
-    thread.start()
-    try:
-        with at_the_page(server.address, tmp_path) as made:
-            yield made
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join(10)
+    with served_here(clips) as server, at_the_page(server.address, tmp_path) as made:
+        yield made
 
 
 @pytest.fixture
@@ -186,30 +189,24 @@ def person_who_typed_the_command(clips: Path, tmp_path: Path) -> Iterator[Person
         yield made
 
 
-def _fill_in(person: Person, length_mm: str) -> None:
-    """Four shared values, two ruler marks and the length between them."""
+def test_a_folder_of_clips_becomes_an_experiment(person_who_typed_the_command: Person, clips: Path) -> None:
+    """The whole way: four shared values, two ruler marks, one length, a check, a track, and a save."""
+    person = person_who_typed_the_command
     for column, value in SHARED.items():
         person.fill(column, "shared", value)
     person.press("input[name=tool][value=scale]")
     for x_px in (15.0, 465.0):
         person.chrome.click(*person.at(x_px, 150))
     person.chrome.wait("document.activeElement.id === 'length'", "the field of the length")
-    for digit in length_mm:
+    for digit in "168.75":
         person.chrome.send("Input.insertText", text=digit)
     person.chrome.wait("document.querySelector('#headline').textContent.includes('complete')", "the complete sheet")
-
-
-def test_a_folder_of_clips_becomes_an_experiment(person_who_typed_the_command: Person, clips: Path) -> None:
-    """The whole way: four shared values, two ruler marks, one length, a check, a track, and a save."""
-    person = person_who_typed_the_command
-    _fill_in(person, "168.75")
     person.press("#check")
     person.chrome.wait("document.querySelector('#headline').textContent.includes('ready to run')", "the check", 60)
     person.press("#track")
     person.chrome.wait("document.querySelector('.strip img') !== null", "the strip", 120)
-    assert "growth" in person.text("#tracked")
-    person.press("#save")
-    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    assert person.chrome.run("document.querySelector('#tracked').textContent.includes('growth')")
+    person.save()
     settings = read_experiment_settings(clips / "experiment.yaml")
     assert settings.calibration is not None
     assert settings.calibration.kind == "two_points"
@@ -220,41 +217,21 @@ def test_a_folder_of_clips_becomes_an_experiment(person_who_typed_the_command: P
 
 
 def test_the_axis_is_dragged_and_moved_by_the_keyboard(person: Person, clips: Path) -> None:
-    person.at(0, 0)
-    x, y = person.chrome.run(
-        "(() => { const r = document.querySelector('[data-handle^=End]').getBoundingClientRect();"
-        " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
-    )
-    person.chrome.mouse("move", x, y)
-    person.chrome.mouse("press", x, y)
-    target = person.at(440, 90)
-    person.chrome.mouse("move", *target, held=True)
-    assert person.chrome.run("document.querySelector('.lens') !== null")
-    person.chrome.mouse("release", *target)
+    person.drag("End", 440, 90)
     person.chrome.wait("document.activeElement.dataset.handle?.startsWith('End')", "the focus on the handle")
     person.key("ArrowDown", 40)
-    person.press("#save")
-    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    person.save()
     axis = read_yaml(clips / "experiment.yaml").content["axis"]
     assert axis["to_px"] == pytest.approx([440, 91], abs=1.0)
 
 
 def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_the_one_tracked_along(
-    person: Person, clips: Path, tmp_path: Path
+    person: Person, clips: Path
 ) -> None:
     person.press("#add-bend")
-    bend = "document.querySelector('[data-handle^=Bend]')"
-    assert person.chrome.run(f"document.activeElement === {bend}")
-    x, y = person.chrome.run(
-        f"(() => {{ const r = {bend}.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"
-    )
-    person.chrome.mouse("move", x, y)
-    person.chrome.mouse("press", x, y)
-    target = person.at(250, 120)
-    person.chrome.mouse("move", *target, held=True)
-    person.chrome.mouse("release", *target)
-    person.press("#save")
-    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    assert person.chrome.run(f"document.activeElement === {HANDLE % 'Bend'}")
+    person.drag("Bend", 250, 120)
+    person.save()
     given = axis_from_entry(read_yaml(clips / "experiment.yaml").content["axis"])
     assert isinstance(given, CurvedAxis)
     assert given.via_px == (pytest.approx((250, 120), abs=1.0),)
@@ -263,10 +240,9 @@ def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_the_one_tracked_
     along, across = given.along_and_across(places)
     assert np.abs(across).max() < 0.1
     assert np.diff(along).min() > 0
-    person.chrome.picture(tmp_path / "bend.png")
-    person.chrome.run(f"{bend}.focus()")
+    person.chrome.run(f"{HANDLE % 'Bend'}.focus()")
     person.key("Delete", 46)
-    assert person.chrome.run(f"{bend} === null")
+    assert person.chrome.run(f"{HANDLE % 'Bend'} === null")
     assert person.chrome.run("document.querySelector('#over polyline.axis-line') === null")
     assert person.chrome.run("document.activeElement.dataset.handle") == "Start of the growth axis"
 
@@ -282,19 +258,18 @@ def test_a_frame_is_corrected_and_the_file_contains_the_correction(person: Perso
         person.chrome.run(show % frame)
         person.press(button)
     person.press("[aria-label='Previous frame']")
-    edge = "document.querySelector('[data-handle^=Leading]')"
+    edge = HANDLE % "Leading"
     person.chrome.wait(f"{edge} !== null && document.querySelector('#frame').value === '21'", "the edge in the picture")
     person.chrome.run(f"{edge}.focus()")
     person.key("ArrowRight", 39)
     assert person.chrome.run("document.querySelector('.strip .by-hand').getAttribute('d').split('M').length") == 2
-    person.press("#save")
-    person.chrome.wait("document.querySelector('#status').textContent.includes('corrections.csv')", "the save")
+    person.save("corrections.csv")
     rows = read_table(clips / "corrections.csv").rows
     assert [(row["trial"], row["frame"], row["action"]) for row in rows] == [
         ("d15_24kPa_1", "20", "drop"),
         ("d15_24kPa_1", "21", "move"),
     ]
-    person.chrome.run("document.querySelector('[data-handle^=End]').focus()")
+    person.chrome.run(f"{HANDLE % 'End'}.focus()")
     person.key("ArrowDown", 40)
     warning = "document.querySelector('#moved-points')?.textContent"
     person.chrome.wait(f"{warning}?.includes('to the former axis')", "the warning of moved points")
@@ -309,14 +284,8 @@ def test_every_control_is_reached_by_tab_and_has_a_name(person: Person) -> None:
         person.key("Tab", 9)
         seen.add(person.chrome.run(f"(() => {{ const a = document.activeElement; return {NAME}; }})()"))
     joined = " | ".join(map(str, seen))
-    for words in (
-        "Save",
-        "capture fps, all trials",
-        "pressure, d15_24kPa_1",
-        "Start of the growth axis",
-        "Track this one",
-    ):
-        assert words in joined
+    named = ("Save", "capture fps, all trials", "pressure, d15_24kPa_1", "Start of the growth axis", "Track this one")
+    assert all(words in joined for words in named)
     assert "INPUT" not in seen
 
 

@@ -10,36 +10,28 @@ import threading
 import time
 import urllib.request
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 import pandas as pd
 import pytest
+from commanded import run
 from explorer_campaign import DEMO, SMALL, make_experiment, make_results, write_bars
 from served import Served
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
-from typer.testing import CliRunner
 
-from vinetrack.cli.main import app
-from vinetrack.core.problems import UserError
 from vinetrack.effects import Parameter
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.pages.campaign import (
-    BackgroundFit,
     Campaign,
     Fitted,
     Job,
     choice_in_use,
     commands,
-    first_fit,
-    fit_choice,
-    likelihood_change_text,
-    overall_m,
     predict_choice,
     slider_range,
 )
@@ -50,9 +42,6 @@ from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.video.axis import Axis
 
 # What a choice predicts, and the lines, labels and commands that follow from it.
-
-
-GAMMA = "reservoir_depletion.gamma"
 
 
 @pytest.mark.slow
@@ -69,13 +58,6 @@ def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> N
         assert seen.data.imprecise_rest is not None
         assert predicted.origin_m == seen.origin_m
     assert prediction.errors_m == pytest.approx(table["rms_position_m"].to_dict(), rel=1e-6)
-
-
-def test_an_effect_of_no_size_changes_nothing(campaign: Campaign) -> None:
-    start = choice_in_use(campaign)
-    none = predict_choice(campaign, start.with_effect("air_drag").with_sizes({"air_drag.C_D": 0.0}))
-    for bare, with_it in zip(predict_choice(campaign, start).trials, none.trials, strict=True):
-        np.testing.assert_allclose(with_it.predicted_position_m, bare.predicted_position_m, atol=1e-9)
 
 
 def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_path: Path) -> None:
@@ -129,56 +111,12 @@ def test_the_page_shows_the_command_that_reproduces_it(campaign: Campaign) -> No
     assert commands(replace(campaign, in_use=(*campaign.in_use, "leak")), start, fitted=True) == []
 
 
-# Background fits: the missing effect is found, progress reported, a fit cancelled, errors given in a sentence.
-
-
-@pytest.fixture(scope="module")
-def first(campaign: Campaign) -> Fitted:
-    return first_fit(campaign, choice_in_use(campaign))
-
-
-def test_the_first_fit_is_that_of_the_workflow(campaign: Campaign, first: Fitted) -> None:
-    for name, value in campaign.numbers.items():
-        assert first.choice.numbers[name] == pytest.approx(value, rel=0.02)
-
-
-@pytest.mark.slow
-def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campaign: Campaign, first: Fitted) -> None:
-    steps: list[Step] = []
-    choice = first.choice.with_effect("reservoir_depletion")
-    found = fit_choice(campaign, first.fit, choice, steps.append)
-    assert steps
-    assert found.choice.numbers[GAMMA] == pytest.approx(1.4, abs=0.05)
-    number = found.number(GAMMA)
-    assert number is not None
-    assert number.low <= 1.4
-    after, before = (overall_m(one.prediction.errors_m, campaign.conditions) for one in (found, first))
-    floor = overall_m(campaign.floors_m, campaign.conditions)
-    assert after < 0.5 * before
-    assert after < 1.3 * floor
-    assert likelihood_change_text(first.fit, found.fit).endswith("for 1 parameter more.")
-    assert "fell" in likelihood_change_text(first.fit, found.fit)
-    back = fit_choice(campaign, found.fit, found.choice.with_effect("reservoir_depletion", False))
-    assert "rose" in likelihood_change_text(found.fit, back.fit)
-    assert overall_m(back.prediction.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
-
-
-@pytest.mark.slow
-def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted) -> None:
-    steps: list[Step] = []
-    ends: list[tuple[Fitted | None, str]] = []
-    job = Job(partial(fit_choice, campaign, first.fit, first.choice), steps.append, lambda *end: ends.append(end))
-    job.wait(60)
-    assert steps
-    ((fitted, reason),) = ends
-    assert fitted is not None
-    assert fitted.fit.model.names == first.fit.model.names
-    assert reason == ""
+# Background fits and recordings.
 
 
 def test_a_cancelled_job_calls_no_callback() -> None:
     steps: list[Step] = []
-    ends: list[tuple[Fitted | None, str]] = []
+    ends: list[tuple[object, str]] = []
     started = threading.Event()
 
     def endless(watch: Watch) -> Fitted:
@@ -197,46 +135,17 @@ def test_a_cancelled_job_calls_no_callback() -> None:
     assert not ends
 
 
-@pytest.mark.slow
-def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:
-    background = BackgroundFit(campaign)
-    news: list[bool] = []
-
-    def hear() -> None:
-        news.append(background.fitted is not None)
-
-    background.listeners.append(hear)
-    background.begin().wait(120)
-    assert background.failure == ""
-    assert not background.running
-    assert background.prediction is not None
-    assert background.fitted is not None
-    assert background.step is not None
-    assert len(news) > 2
-    assert news[-1]
-
-
 # A recording in the explorer: positions of edges in its picture, and the message for a trial without one.
 
 
-def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) -> Path:
-    """A bar whose right end moves by 8 px per frame."""
-    return write_bars(path, 20 + 8.0 * np.arange(count), width, height)
-
-
 def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
+    """A bar whose right end moves by 8 px per frame."""
     told: list[tuple[int, float]] = []
-    film = decode(write_clip(tmp_path / "a.mp4"), told.append)
+    film = decode(write_bars(tmp_path / "a.mp4", 20 + 8.0 * np.arange(30), 320, 96), told.append)
     assert (len(film.frames), film.scale) == (30, 1.0)
     assert told == [(1, 1 / 30), (11, 11 / 30), (21, 21 / 30)]
     assert film.picture(10).shape == (96, 320)
     assert abs(int(np.argmax(film.picture(10)[48] < 120)) - 100) <= 1
-
-
-def test_a_file_that_is_not_a_recording_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "a.mp4").write_bytes(b"not a film")
-    with pytest.raises(UserError, match=r"a\.mp4"):
-        decode(tmp_path / "a.mp4", lambda _: None)
 
 
 def view(angle: float = 0.0) -> RecordingView:
@@ -254,21 +163,13 @@ def view(angle: float = 0.0) -> RecordingView:
     )
 
 
-def test_positions_of_the_model_are_mapped_to_pixels_by_the_track() -> None:
+def test_edges_stand_across_the_axis_where_the_track_and_the_shake_put_them() -> None:
     one = view()
     along = one.along_px(np.array([0.0, 0.0125, 0.1, -0.01]))
     np.testing.assert_allclose(along, [10.0, 22.5, 110.0, 0.0], atol=1e-9)
-
-
-def test_an_edge_is_drawn_across_the_axis() -> None:
-    assert view().across(20.0, 4) == ((120.0, 120.0), (60.0, 40.0))
-    (xs, ys) = view(angle=np.pi / 2).across(20.0, 4)
-    np.testing.assert_allclose(xs, (90.0, 110.0))
-    np.testing.assert_allclose(ys, (70.0, 70.0))
-
-
-def test_an_edge_follows_a_shaken_picture() -> None:
-    assert view().across(20.0, 3) == view().across(22.0, 4)
+    assert one.across(20.0, 4) == ((120.0, 120.0), (60.0, 40.0))
+    assert one.across(20.0, 3) == one.across(22.0, 4)
+    np.testing.assert_allclose(view(angle=np.pi / 2).across(20.0, 4), ((90.0, 110.0), (70.0, 70.0)))
 
 
 def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campaign, tmp_path: Path) -> None:
@@ -276,7 +177,7 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
     results = Results(tmp_path)
     trial = replace(seen.data.trial, video=tmp_path / "gone.mp4", track=None)
     assert "no longer exists" in str(recording_view(results, trial))
-    trial = replace(trial, video=write_clip(tmp_path / "a.mp4", count=2))
+    trial = replace(trial, video=write_bars(tmp_path / "a.mp4", np.full(2, 20)))
     assert "does not exist" in str(recording_view(results, trial))
     results.track(trial.name).parent.mkdir()
     results.analysed(trial.name).parent.mkdir()
@@ -304,18 +205,13 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
 # The command: refusals, and a local server that Ctrl-C ends.
 
 
-def refused(*arguments: object) -> str:
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
-    assert done.exit_code == 1
-    assert "Traceback" not in done.output
-    return done.output
-
-
 def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign, tmp_path: Path) -> None:
     shutil.copytree(campaign.folder, tmp_path / "results")
     (tmp_path / "results" / "provenance.json").write_text(json.dumps({"experiment": str(tmp_path / "vines")}))
-    refused("explore", tmp_path / "nowhere")
-    assert "--experiment" in refused("explore", tmp_path / "results")
+    for folder, said in (("nowhere", ""), ("results", "--experiment")):
+        done = run("explore", tmp_path / folder)
+        assert done.exit_code == 1
+        assert said in done.output
     assert open_campaign(tmp_path / "results", campaign.experiment.folder).conditions == campaign.conditions
 
 

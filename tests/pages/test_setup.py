@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import http.client
 import json
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from served import served_here
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import list_recordings, parse_yaml, read_table
@@ -25,14 +25,12 @@ from vinetrack.pages.draft_files import (
     read_block,
     shared_values,
     with_shared,
-    write_draft,
 )
 from vinetrack.pages.setup_server import (
     SetupServer,
     draft_from_json,
     draft_problems,
     page_state,
-    start_server,
     write_templates,
 )
 from vinetrack.video.curved_axis import axis_through
@@ -113,9 +111,7 @@ def test_a_folder_of_recordings_gets_both_files_with_blanks(folder: Path) -> Non
     assert table.rows[0]["pressure_kPa"] == ""
     assert (folder / "experiment.yaml").read_text() == first_settings()
     assert any("capture_fps" in line and "calibration" in line for line in lines if line.startswith("To fill in"))
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "a.mp4", "d12_30kPa_1.mp4", "experiment.yaml", "trials.csv",
-    ]  # fmt: skip
+    assert {path.name for path in folder.iterdir()} == {"a.mp4", "d12_30kPa_1.mp4", "experiment.yaml", "trials.csv"}
 
 
 def test_a_sheet_that_is_there_keeps_every_cell_and_gains_a_row(folder: Path) -> None:
@@ -127,26 +123,7 @@ def test_a_sheet_that_is_there_keeps_every_cell_and_gains_a_row(folder: Path) ->
     assert "old;a.mp4;24,5;keep me" in text
     assert "d12_30kPa_1;d12_30kPa_1.mp4;30" in text
     assert (folder / "experiment.yaml").read_text() == SETTINGS
-
-
-def test_a_scale_of_all_recordings_is_not_asked_for_again(folder: Path) -> None:
-    (folder / "experiment.yaml").write_text(f"{SETTINGS}mm_per_px: 0.3\n")
-    lines: list[str] = []
-    write_templates(folder, lines.append)
-    (blanks,) = [line for line in lines if line.startswith("To fill in")]
-    assert "capture_fps" in blanks
-    assert "calibration" not in blanks
-
-
-def test_files_that_changed_since_are_left_alone(folder: Path) -> None:
-    draft = open_draft(folder)
-    (folder / "trials.csv").write_text(SHEET)
-    with pytest.raises(ExperimentError):
-        write_draft(folder, draft)
-    assert (folder / "trials.csv").read_text() == SHEET
-
-
-def test_cells_without_a_column_are_refused_not_lost(folder: Path) -> None:
+    # Cells without a column would be lost.
     (folder / "trials.csv").write_text("trial,video\nold,a.mp4,stray\n")
     with pytest.raises(ExperimentError):
         open_draft(folder)
@@ -208,17 +185,10 @@ def test_a_header_names_columns_and_units_and_rows_are_matched_by_their_clips(
     assert notes(text, 1, at_column) == 0
 
 
-def test_blanks_separate_cells_without_blanks() -> None:
+def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_they_are_pasted() -> None:
     assert changed("name pressure_psi payload_g\nlate 5.3 5\nd15_24kPa_1 3.5 0\nd15_30kPa_1 4.5 20") == EXPECTED
-
-
-def test_without_a_header_columns_follow_the_one_pasted_into_and_rows_their_names() -> None:
-    text = "late\t36\t5\nd15_24kPa_1\t24\t0\n"
     expected = {(2, "pressure_kPa"): "36", (2, "payload_g"): "5", (0, "pressure_kPa"): "24", (0, "payload_g"): "0"}
-    assert changed(text, 0, "pressure_kPa") == expected
-
-
-def test_a_block_of_numbers_alone_goes_where_it_is_pasted() -> None:
+    assert changed("late\t36\t5\nd15_24kPa_1\t24\t0\n", 0, "pressure_kPa") == expected
     assert changed("24\t0\n30\t20", 1, "pressure_kPa") == {
         (1, "pressure_kPa"): "24", (1, "payload_g"): "0", (2, "pressure_kPa"): "30", (2, "payload_g"): "20",
     }  # fmt: skip
@@ -260,52 +230,44 @@ def sent(folder: Path, **more: Any) -> dict[str, Any]:
     return {key: state[key] for key in ("sheet", "shared", "calibration", "axis", "stamp")} | more
 
 
-def fields(folder: Path, **more: Any) -> set[tuple[str, str, str]]:
-    draft = draft_from_json(folder, sent(folder, **more))
-    return {(one["field"], one["trial"], one["column"]) for one in draft_problems(folder, draft)["problems"]}
+FILLED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
+
+
+def problems(folder: Path, **more: Any) -> list[dict[str, Any]]:
+    return draft_problems(folder, draft_from_json(folder, sent(folder, **more)))["problems"]
 
 
 def test_a_new_folder_is_unsaved_and_filled_in_from_names(clips: Path) -> None:
     state = page_state(clips)
     assert state["unsaved"]
     assert [row["pressure_kPa"] for row in state["sheet"]["rows"]] == ["24", "30"]
-    assert state["known"]["pressure_kPa"]["units"][0] == "kPa"
 
 
-def test_a_wrong_cell_is_named_by_its_trial_and_its_column_in_the_unit_of_the_sheet(clips: Path) -> None:
+def test_problems_name_their_field_in_the_unit_of_the_sheet_and_blanks_are_told_from_what_is_wrong(clips: Path) -> None:
+    scale = {"kind": "two_points", "from_px": [10, 150], "to_px": [460, 150], "length_mm": 337.5}
+    whole = problems(clips, shared=FILLED, calibration=scale)
+    assert [one for one in whole if one["severity"] == "error"] == []
+    assert (
+        parse_yaml(draft_from_json(clips, sent(clips, calibration=scale)).settings, "").content["calibration"] == scale
+    )
+
     sheet = page_state(clips)["sheet"]
-    sheet["columns"] = [name if name != "pressure_kPa" else "pressure_psi" for name in sheet["columns"]]
-    for row in sheet["rows"]:
-        row["pressure_psi"] = "four"
-    shared = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
-    found = fields(clips, sheet=sheet, shared=shared)
-    assert ("cell", "d15_24kPa_1", "pressure_psi") in found
+    columns = ["pressure_psi" if name == "pressure_kPa" else name for name in sheet["columns"]]
+    rows = [row | {"pressure_psi": "four"} for row in sheet["rows"]]
+    found = problems(clips, sheet=sheet | {"columns": columns, "rows": rows}, shared=FILLED)
+    assert ("cell", "d15_24kPa_1", "pressure_psi") in {(one["field"], one["trial"], one["column"]) for one in found}
 
-
-def test_what_is_not_filled_in_yet_is_told_from_what_is_wrong(clips: Path) -> None:
-    sheet = page_state(clips)["sheet"]
     rows = [{"trial": f"t{k}", "pressure_kPa": f"{20 + k}", "yield_pressure_kPa": "x"} for k in range(12)]
     sheet |= {"columns": [*sheet["columns"], "yield_pressure_kPa"], "rows": rows}
-    draft = draft_from_json(clips, sent(clips, sheet=sheet, shared={"capture_fps": "1000"}))
     codes: dict[str, set[str]] = {}
-    for one in draft_problems(clips, draft)["problems"]:
+    for one in problems(clips, sheet=sheet, shared={"capture_fps": "1000"}):
         codes.setdefault(one["column"], set()).add(one["code"])
     assert codes["length_mm"] <= {"missing", "blank"}
     assert not codes["yield_pressure_kPa"] & {"missing", "blank"}
 
 
-def test_a_whole_draft_has_no_errors(clips: Path) -> None:
-    shared = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
-    scale = {"kind": "two_points", "from_px": [10, 150], "to_px": [460, 150], "length_mm": 337.5}
-    draft = draft_from_json(clips, sent(clips, shared=shared, calibration=scale))
-    found = draft_problems(clips, draft)["problems"]
-    assert [one for one in found if one["severity"] == "error"] == []
-    assert parse_yaml(draft.settings, "").content["calibration"] == scale
-
-
-@pytest.mark.parametrize("text", ["trial,video,note\nold,d15 24kPa 1.mp4,of Monday\n"])
-def test_a_sheet_that_is_there_is_shown_with_its_unknown_columns(clips: Path, text: str) -> None:
-    (clips / "trials.csv").write_text(text)
+def test_a_sheet_that_is_there_is_shown_with_its_unknown_columns(clips: Path) -> None:
+    (clips / "trials.csv").write_text("trial,video,note\nold,d15 24kPa 1.mp4,of Monday\n")
     state = page_state(clips)
     assert state["kept"] == ["trial", "video", "note"]
     assert state["sheet"]["rows"][0] == {"trial": "old", "video": "d15 24kPa 1.mp4", "note": "of Monday"}
@@ -320,23 +282,17 @@ OURS = {"X-Vinetrack": "setup"}
 
 @pytest.fixture
 def server(clips: Path) -> Iterator[SetupServer]:
-    made = start_server(clips, 0)
-    thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
-    thread.start()
-    yield made
-    made.shutdown()
-    made.server_close()
-    thread.join(10)
+    with served_here(clips) as made:
+        yield made
 
 
 def ask(
-    server: SetupServer, path: str, body: Any = None, headers: dict[str, str] | None = None
+    server: SetupServer, path: str, body: Any = None, headers: dict[str, str] = OURS, secret: str | None = None
 ) -> tuple[int, bytes, str]:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)
     data = None if body is None else json.dumps(body)
-    connection.request(
-        "GET" if body is None else "POST", server.secret + path, data, headers or (OURS if body is not None else {})
-    )
+    method = "GET" if body is None else "POST"
+    connection.request(method, (server.secret if secret is None else secret) + path, data, headers)
     answer = connection.getresponse()
     made = answer.status, answer.read(), answer.getheader("Content-Type") or ""
     connection.close()
@@ -411,14 +367,9 @@ def test_requests_from_other_pages_are_refused(server: SetupServer, clips: Path,
 
 
 @pytest.mark.parametrize("path", ["/", "/setup.js", "/api/state", "/api/frame?recording=a.mp4&frame=0"])
-def test_no_route_is_served_under_another_name(server: SetupServer, path: str) -> None:
-    assert ask(server, path, headers={"Host": f"evil.example:{server.server_port}"})[0] == 403
-
-
-def test_nothing_is_served_without_the_secret_of_the_address(server: SetupServer) -> None:
+def test_nothing_is_served_under_another_name_or_without_the_secret_of_the_address(
+    server: SetupServer, path: str
+) -> None:
     assert len(server.secret) > 20
-    assert ask(server, "/api/state")[0] == 200
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
-    connection.request("GET", "/api/state")
-    assert connection.getresponse().status == 403
-    connection.close()
+    assert ask(server, path, headers={"Host": f"evil.example:{server.server_port}"})[0] == 403
+    assert ask(server, path, secret="")[0] == 403

@@ -40,10 +40,8 @@ def small_part(folder: Path, published: str) -> Path:
 def beside(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Results folder, and what the command said."""
     folder = tmp_path_factory.mktemp("paper")
-    experiment, results = (
-        small_part(folder / "part", "published: simulated\ncandidates: [air_drag]\n"),
-        folder / "results",
-    )
+    experiment = small_part(folder / "part", "published: simulated\ncandidates: [air_drag]\n")
+    results = folder / "results"
     settings = ("--settings", '{"damping": {"resamples": 100}, "figures": {"formats": ["svg"], "dpi": 60}}')
     for stage in ("trials", "damping", "model", "paper"):
         said = succeed(stage, experiment, results, *settings)
@@ -51,15 +49,10 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 @pytest.mark.slow
-def test_the_table_has_its_columns_and_the_command_counts_it(beside: tuple[Path, str]) -> None:
+def test_the_table_has_its_columns_and_every_table_and_figure_is_there(beside: tuple[Path, str]) -> None:
     results, said = beside
     assert (results / "paper.csv").read_text(encoding="utf-8").splitlines()[0] == HEADER
     assert "not checkable" in said
-
-
-@pytest.mark.slow
-def test_every_table_and_figure_is_there(beside: tuple[Path, str]) -> None:
-    results, _ = beside
     for name in PAPER_TABLES:
         assert len(pd.read_csv(results / f"{name}.csv")) > 0, name
     for name in figures_of("paper"):
@@ -77,13 +70,8 @@ def test_what_was_grown_is_answered_and_what_was_not_is_blank(beside: tuple[Path
     assert math.isnan(rows.loc["fast_vine_measured", "ours"])
     assert "9.52" in rows.loc["position_rms_7kPa", "beside"]  # what departures would cause needs no trial
     assert math.isnan(rows.loc["efficiency_power_of_wall", "ours"])
-
-
-@pytest.mark.slow
-def test_positions_are_compared_in_centimetres(beside: tuple[Path, str]) -> None:
     positions = pd.read_csv(beside[0] / "paper_positions.csv")
     assert positions["pressure_kPa"].tolist() == [28.0]
-    rows = pd.read_csv(beside[0] / "paper.csv").set_index("row")
     assert rows.loc["position_rms_28kPa", "ours"] == pytest.approx(100 * positions["rms_mean_m"].iloc[0])
 
 

@@ -79,10 +79,8 @@ def test_a_diagnosis_comes_back_as_it_was_written(verdict: str) -> None:
     written = json.loads(json.dumps(Diagnosis.from_json(diagnosis(verdict)).to_json(), default=float))
     again = json.loads(json.dumps(Diagnosis.from_json(written).to_json(), default=float))
     assert json.dumps(again) == json.dumps(written)
-    told = diagnosis(verdict)
-    assert {key: again[key] for key in ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")} == {
-        key: told[key] for key in ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")
-    }
+    kept = ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")
+    assert {key: again[key] for key in kept} == {key: diagnosis(verdict)[key] for key in kept}
 
 
 def test_a_refused_diagnosis_says_why_and_has_no_verdict(tmp_path: Path) -> None:
@@ -151,17 +149,12 @@ def test_predictions_count_from_release_and_origin(tmp_path: Path, compared: boo
     assert one["lead_position_m"].iloc[-1] == pytest.approx(0.2)
 
 
-def test_the_worst_condition_is_the_one_the_first_model_misses_most(tmp_path: Path) -> None:
+def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(tmp_path: Path) -> None:
     found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
     assert found is not None
     assert found.worst == "12 mm, 24 kPa"
     assert set(found.before_after["trial"]) == {"a", "b"}
     assert worst_condition(found.before_after.iloc[:0]) == ""
-
-
-def test_misfits_are_averaged_along_the_growth_before_and_after(tmp_path: Path) -> None:
-    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
-    assert found is not None
     slow = found.where[found.where["condition"] == "slow"]
     middle = (slow["growth_from"] + slow["growth_to"]) / 2
     assert slow["misfit_before_m"].to_numpy() == pytest.approx(0.02 * middle.to_numpy(), abs=3e-4)
@@ -202,10 +195,7 @@ def test_without_a_verdict_there_is_nothing_to_draw(tmp_path: Path, content: dic
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path: Path) -> None:
     results = folder(tmp_path / "r", diagnosis())
-    trajectories = {
-        "slow": pd.read_csv(results.trajectories("slow")),
-        "fast": pd.read_csv(results.trajectories("fast")),
-    }
+    trajectories = {name: pd.read_csv(results.trajectories(name)) for name in ("slow", "fast")}
     joined = with_final_model(trajectories, read_diagnosis_tables(results, conditions()))
     difference = joined["slow"]["model_after_m"] - joined["slow"]["lead_position_m"]
     assert float(np.abs(difference).max()) < 1e-12
@@ -228,46 +218,32 @@ def test_ties_stand_in_the_order_of_the_ranking() -> None:
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.
 
 
-def results(folder: Path, verdicts: tuple[str, ...], effects: tuple[str, ...] = (), final: bool = False) -> Path:
-    """A folder with a fit, a diagnosis of these verdicts, and the fit that it ended with."""
-    where = Results(folder)
-    write_json(where.fit, {"model": ["base"]})
+@pytest.mark.parametrize(
+    ("verdicts", "final", "model"),
+    [
+        (("adequate",), False, ["base"]),
+        (("missing", "adequate"), True, ["base", "air_drag"]),
+        (("missing", "adequate"), False, None),
+        *(((*verdicts,), True, None) for verdicts in (["artefact"], ["unexplained"], ["ambiguous"])),
+        (("missing", "unexplained"), True, None),
+    ],
+)
+def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted_one(
+    tmp_path: Path, verdicts: tuple[str, ...], final: bool, model: list[str] | None
+) -> None:
+    results, added = Results(tmp_path), ["air_drag"] if verdicts[0] == "missing" else []
+    write_json(results.fit, {"model": ["base"]})
     if final:
-        write_json(where.final_fit, {"model": ["base", *effects]})
-    if verdicts:
-        rounds = [
-            {"model": ["base"], "verdict": v, "answer_set": [], "explanation": f"it is {v}", "ranking": []}
-            for v in verdicts
-        ]
-        content = {
-            "verdict": verdicts[0], "final_verdict": verdicts[-1], "effects": list(effects), "answer_set": [],
-            "explanation": f"it is {verdicts[0]}", "rounds": rounds, "parameters": [], "where": [], "drift": [],
-            "next_experiment": None, "missing_force": None, "notes": [], "refused": None,
-        }  # fmt: skip
-        write_json(where.diagnosis, content)
-    return folder
-
-
-def test_an_adequate_model_is_used_as_it_is(tmp_path: Path) -> None:
-    chosen = choose_fit(results(tmp_path, ("adequate",)))
-    assert (chosen.content["model"], chosen.heading) == (["base"], ())
-
-
-def test_the_model_that_the_diagnosis_ended_with_is_used_and_named(tmp_path: Path) -> None:
-    chosen = choose_fit(results(tmp_path, ("missing", "adequate"), ("air_drag",), final=True))
-    assert chosen.content["model"] == ["base", "air_drag"]
-    assert "air_drag added" in chosen.heading[0]
-
-
-@pytest.mark.parametrize("verdicts", [("artefact",), ("unexplained",), ("ambiguous",), ("missing", "unexplained")])
-def test_a_refuted_model_is_refused_with_the_reason(tmp_path: Path, verdicts: tuple[str, ...]) -> None:
-    with pytest.raises(ResultsError):
-        choose_fit(results(tmp_path, verdicts))
-
-
-def test_a_last_model_that_is_not_stored_is_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(ResultsError):
-        choose_fit(results(tmp_path, ("missing", "adequate"), ("air_drag",)))
+        write_json(results.final_fit, {"model": ["base", *added]})
+    content = diagnosis(verdicts[0], effects=added, final_verdict=verdicts[-1])
+    write_json(results.diagnosis, content)
+    if model is None:
+        with pytest.raises(ResultsError):
+            choose_fit(tmp_path)
+    else:
+        chosen = choose_fit(tmp_path)
+        assert chosen.content["model"] == model
+        assert ("air_drag added" in " ".join(chosen.heading)) == bool(added)
 
 
 # What recordings and speeds contradict in the sheet stands beside the verdict, for it passes for physics.
@@ -287,52 +263,39 @@ def steady(trial: Trial) -> Track:
     return plain_track(np.arange(40) / 1000, np.arange(40) / 1000 * tail_m_s / 2)
 
 
-def written(folder: Path, *contradictions: tuple[str, dict[str, str]]) -> Results:
-    for name in "ab":
-        noted = [entry for trial, entry in contradictions if trial == name]
-        write_json(Results(folder).analysed(name), {"row": {}, "contradictions": noted})
-    return Results(folder)
-
-
-def test_right_trials_contradict_nothing(tmp_path: Path) -> None:
-    pairs = [(replace(VINE, name=name), steady(VINE)) for name in "ab"]
-    results = written(tmp_path)
-    assert sheet_contradictions(results, pairs) == {}
-    made = Diagnosis.from_json(diagnosis("missing"))
-    assert with_contradictions(made, results, pairs) == made
-
-
 def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tmp_path: Path) -> None:
+    results, made = Results(tmp_path), Diagnosis.from_json(diagnosis("missing"))
+    right = [(replace(VINE, name=name), steady(VINE)) for name in "ab"]
+    for name in "ab":
+        write_json(results.analysed(name), {"row": {}, "contradictions": []})
+    assert sheet_contradictions(results, right) == {}
+    assert with_contradictions(made, results, right) == made
+
     typed = replace(VINE, pressure_Pa=VINE.pressure_Pa / PSI, yield_pressure_Pa=VINE.yield_pressure_Pa / PSI)
     pairs = [(replace(typed, name=name), steady(VINE)) for name in "ab"]
     narrow = {"column": "diameter_mm", "reason": "diameter_mm '12' differs: the tube is 9.6 mm wide, a factor 1.25"}
-    results = written(tmp_path, ("a", narrow), ("b", narrow))
+    for name in "ab":
+        write_json(results.analysed(name), {"row": {}, "contradictions": [narrow]})
     seen = sheet_contradictions(results, pairs)
     assert list(seen) == ["diameter_mm", "pressure_kPa"]
     assert seen["diameter_mm"] == f"a: {narrow['reason']} (and 1 more trial)"
     assert "looks like psi, not kPa" in seen["pressure_kPa"]
-    told = with_contradictions(Diagnosis.from_json(diagnosis("missing")), results, pairs)
-    assert set(seen.values()) <= set(told.notes)
+    assert set(seen.values()) <= set(with_contradictions(made, results, pairs).notes)
 
 
 # Which file of a figure the page shows, for every choice of `figures.formats`.
 
 
 @pytest.mark.parametrize(
-    ("formats", "shown"), [(("png", "svg"), "<svg/>"), (("svg",), "<svg/>"), (("png",), b"png"), (("pdf",), b"")]
+    ("formats", "limit", "shown"),
+    [(("png", "svg"), 9, "<svg/>"), (("png", "svg"), 5, b"png"), (("svg",), 9, "<svg/>"), (("pdf",), 9, b"")],
 )
-def test_a_figure_is_shown_from_the_files_there_are(tmp_path: Path, formats: tuple[str, ...], shown: object) -> None:
+def test_a_figure_is_shown_from_the_files_there_are_and_a_large_svg_gives_way_to_its_png(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formats: tuple[str, ...], limit: int, shown: object
+) -> None:
     path = partial(Results(tmp_path).figure, "ladder")
     path(".svg").parent.mkdir()
     for form in formats:
         path(f".{form}").write_text({"svg": "<svg/>"}.get(form, form))
+    monkeypatch.setattr(report_stage, "MAX_SVG_BYTES", limit)
     assert report_stage._picture(path) == shown
-
-
-def test_a_large_svg_gives_way_to_its_png(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = partial(Results(tmp_path).figure, "ladder")
-    path(".svg").parent.mkdir()
-    path(".svg").write_text("<svg/>")
-    path(".png").write_bytes(b"png")
-    monkeypatch.setattr(report_stage, "MAX_SVG_BYTES", 5)
-    assert report_stage._picture(path) == b"png"

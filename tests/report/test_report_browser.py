@@ -14,8 +14,7 @@ from test_report import curves, page, trials, windows
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
 from vinetrack.figures.style import render
-from vinetrack.report.build import Clip, ReportFigure, TrackedRecording
-from vinetrack.report.section import DiagnosisResult
+from vinetrack.report.build import Clip, DiagnosisResult, ReportFigure, TrackedRecording
 from vinetrack.video.write import write_clip
 
 pytest.importorskip("tornado", reason="the browser is driven through bokeh's server, which is not installed")

@@ -195,21 +195,7 @@ def _effects(name: str | None, experiment: Path | None, figure: Path | None) -> 
 
 YIELD_MEANING = "Yield pressure; a scaling prior if not given."
 
-# Columns of the sheet that are options of each command
-PREDICTED = (
-    "diameter_mm",
-    "thickness_um",
-    "length_mm",
-    "film_density_kg_m3",
-    "yield_pressure_kPa",
-    "yield_pressure_sigma_kPa",
-    "pressure_kPa",
-    "pressure_sigma_kPa",
-    "payload_g",
-    "growth_angle_deg",
-    "chamber_l",
-    "inlet_mm",
-)
+# Columns of the sheet that are options
 OF_A_RIG = ("film_density_kg_m3", "yield_pressure_kPa", "pressure_kPa", "payload_g", "growth_angle_deg", "inlet_mm")
 
 
@@ -221,7 +207,14 @@ def _request(options: dict[str, Any], **more: Any) -> PredictionRequest:
     return PredictionRequest(**{name: options.pop(name) for name in names}, **more)
 
 
-@command(columns=PREDICTED, yield_pressure_kPa=YIELD_MEANING)
+@command(
+    columns=(
+        *("diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3"),
+        *("yield_pressure_kPa", "yield_pressure_sigma_kPa", "pressure_kPa", "pressure_sigma_kPa"),
+        *("payload_g", "growth_angle_deg", "chamber_l", "inlet_mm"),
+    ),
+    yield_pressure_kPa=YIELD_MEANING,
+)
 def _predict(sheet: Path | None, json: Path | None, options: dict[str, Any]) -> Answer:
     """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
     from vinetrack.pipeline.predict_stage import predict_conditions
@@ -237,7 +230,7 @@ def _predict(sheet: Path | None, json: Path | None, options: dict[str, Any]) -> 
 )
 def _vine(options: dict[str, Any]) -> Answer:
     """Find the fastest vine within limits of burst stress, diameter and length, for a choice of films."""
-    from vinetrack.pipeline.design_stage import design_vine
+    from vinetrack.pipeline.predict_stage import design_vine
 
     request = _request(options)
     return design_vine(request, **options)
@@ -251,7 +244,7 @@ def _vine(options: dict[str, Any]) -> Answer:
 )
 def _reservoir(options: dict[str, Any]) -> Answer:
     """Find the chamber that limits the loss of gauge pressure, by the gas law in absolute pressure."""
-    from vinetrack.pipeline.design_stage import design_reservoir
+    from vinetrack.pipeline.predict_stage import design_reservoir
 
     request = _request(options)
     return design_reservoir(request, **options)

@@ -38,16 +38,6 @@ def json_to_terminal(json_file: Path | None) -> bool:
     return json_file == STANDARD_OUTPUT
 
 
-def print_result(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
-    """Print lines, and write `content` as JSON to a file; or print it instead of the lines."""
-    from vinetrack.core.tables import write_json
-
-    for line in () if json_to_terminal(json_file) else lines:
-        _say(line)
-    if json_file is not None and content is not None:
-        write_json(json_file, content)
-
-
 def _say(line: str, err: bool = False) -> None:
     from vinetrack.core.terminal import severity_first
 
@@ -120,21 +110,17 @@ def _log_to(path: Path | None) -> None:
     )
 
 
-# Columns about the vine itself; all others are about the rig
-_VINE_COLUMNS = frozenset(
-    {"diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3", "yield_pressure_kPa", "yield_pressure_sigma_kPa"}
-)
-
 # Type of an option by its kind; text for all other kinds
 _TYPES: dict[str, Any] = {"number": float, "count": int, "path": Path, "flag": bool, "texts": list[str]}
 
 # What a command returns: lines, the same content for a program, and whether it found a fault, by default not
 Answer = tuple[Iterable[str], Any] | tuple[Iterable[str], Any, bool]
 _Command = Callable[..., Answer | None]
-_Decorator = Callable[[_Command], Callable[..., None]]
 
 
-def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) -> _Decorator:
+def command(
+    lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str
+) -> Callable[[_Command], Callable[..., None]]:
     """Give a function the arguments and options that the table states for its name (or `lines_of`), report its errors
     in sentences, and print the lines that it returns, or the content beside them as JSON.
 
@@ -160,8 +146,13 @@ def command(lines_of: str = "", columns: tuple[str, ...] = (), **meanings: str) 
                         named["options"] = {**options, "cells": cells} if columns else options
                     answer = function(**named)
                 if answer is not None:
+                    from vinetrack.core.tables import write_json
+
                     lines, content, *failed = answer
-                    print_result(lines, content, json_file)
+                    for text in () if json_to_terminal(json_file) else lines:
+                        _say(text)
+                    if json_file is not None and content is not None:
+                        write_json(json_file, content)
                     if any(failed):
                         raise typer.Exit(1)
 
@@ -204,11 +195,12 @@ def _parameter(line: Mapping[str, str]) -> inspect.Parameter:
 def _column_parameter(column: Column, meaning: str) -> inspect.Parameter:
     """Return the parameter from which Typer makes the option of a column."""
     unset = "" if column.default in ("", "unknown") or column.default.startswith("required") else f" ({column.default})"
+    of_vine = ("diameter_", "thickness_", "length_", "film_density_", "yield_pressure_")
     info = typer.Option(
         option(column.name),
         help=meaning or f"{column.meaning.rstrip('.')}{unset}.",
         metavar=column.scale.metavar if column.scale else "NUMBER",
-        rich_help_panel="The vine" if column.name in _VINE_COLUMNS else "The rig",
+        rich_help_panel="The vine" if column.name.startswith(of_vine) else "The rig",
         show_default=False,
     )
     return _keyword(column.name, str | None, info, None)

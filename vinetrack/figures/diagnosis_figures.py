@@ -87,7 +87,14 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         ax.set_ylim(min(0.72 * known.min(), middle / 2), max(1.35 * known.max(), middle * 2))
     else:
         ax.set_ylim(0.1, 1.0)
-    _draw_floor(ax, floor_mm[np.isfinite(floor_mm) & (floor_mm > 0)])
+    known_floor_mm = floor_mm[np.isfinite(floor_mm) & (floor_mm > 0)]
+    if known_floor_mm.size:
+        floor = float(known_floor_mm[-1])  # an error in the shaded range says nothing about the model
+        ax.axhspan(ax.get_ylim()[0], floor, color=MUTED, alpha=0.16, lw=0, zorder=0)
+        ax.axhline(floor, color=MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
+        frame = (("axes fraction", "data"), "offset points")
+        words = f"replicate scatter: {number(floor)} mm"
+        ax.annotate(words, (0.015, floor), (0, -4), *frame, color=MUTED, va="top", fontsize=9)
     handles = []
     for key, (name, colour, marker, line) in _ERRORS.items():
         style: dict[str, Any] = {"marker": marker, "color": colour, "ls": line}
@@ -98,7 +105,7 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
     for added, part in list(zip(ladder["added"], partial, strict=True))[1:]:
-        words = str(added).replace("+", " + ").replace("_", " ") + (" (partial)" if part in (True, "True") else "")
+        words = str(added).replace("+", " + ").replace("_", " ") + (" (partial)" if part else "")
         labels.append("+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False)))
     ax.set_xticks(range(len(ladder)), labels)
     ax.grid(axis="x", visible=False)
@@ -106,18 +113,6 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.02, 1.0)}
     ax.legend(handles=handles, fontsize=9, labelspacing=0.25, labelcolor=INK, **place)
     return fig
-
-
-def _draw_floor(ax: Axes, floor_mm: np.ndarray) -> None:
-    """Replicate scatter: an error in the shaded range says nothing about the model."""
-    if not floor_mm.size:
-        return
-    floor = float(floor_mm[-1])
-    ax.axhspan(ax.get_ylim()[0], floor, color=MUTED, alpha=0.16, lw=0, zorder=0)
-    ax.axhline(floor, color=MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
-    words = f"replicate scatter: {number(floor)} mm"
-    frame = (("axes fraction", "data"), "offset points")
-    ax.annotate(words, (0.015, floor), (0, -4), *frame, color=MUTED, va="top", fontsize=9)
 
 
 def _write_values(ax: Axes, errors_mm: dict[str, np.ndarray]) -> None:
@@ -296,15 +291,6 @@ def draw_cosines(cosines: pd.DataFrame) -> Figure | None:
     return fig
 
 
-# Conditions that a parameter may drift with: name, unit, and factor from SI
-_CONDITIONS = {
-    "pressure_Pa": ("pressure", "kPa", 1e-3),
-    "payload_kg": ("payload", "g", 1e3),
-    "growth_angle_rad": ("growth angle", "°", 180 / math.pi),
-    "chamber_m3": ("chamber", "l", 1e3),
-    "inlet_m": ("inlet", "mm", 1e3),
-}
-
 # Colour, line and offset of the models in the figure of drifts
 _MODELS = {"before": (BEFORE, DASHED, -0.06), "after": (AFTER, "-", 0.06)}
 
@@ -340,7 +326,14 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
 
 
 def _draw_drift_panel(ax: Axes, groups: pd.DataFrame, against: str, markers: dict[str, str]) -> None:
-    name, unit, factor = _CONDITIONS.get(against, (against.replace("_", " "), "", 1.0))
+    # Conditions that a parameter may drift with: name, unit, and factor from SI
+    name, unit, factor = {
+        "pressure_Pa": ("pressure", "kPa", 1e-3),
+        "payload_kg": ("payload", "g", 1e3),
+        "growth_angle_rad": ("growth angle", "°", 180 / math.pi),
+        "chamber_m3": ("chamber", "l", 1e3),
+        "inlet_m": ("inlet", "mm", 1e3),
+    }.get(against, (against.replace("_", " "), "", 1.0))
     names = list(dict.fromkeys(groups["vine"]))
     by_vine = against == "vine"
     for model, (colour, line, offset) in _MODELS.items():
@@ -510,8 +503,7 @@ def _draw_curve(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variable: str
         column(along, variable, factor),
         f"range of the trials, N = {along['condition'].nunique()} conditions",
     )
-    low = np.full(places.size, 0.02)
-    ax.plot(places, low, "|", color=MUTED, ms=6, transform=ax.get_xaxis_transform(), label=label)
+    ax.plot(places, np.full(places.size, 0.02), "|", color=MUTED, ms=6, transform=ax.get_xaxis_transform(), label=label)
     ax.set(xlabel=words, ylabel="missing force (N)")
     ax.margins(x=0.01)
 
@@ -602,7 +594,11 @@ def assemble_tables(
     import pandas as pd
 
     labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
-    worst = worst_condition(trials)
+    worst, rounds = worst_condition(trials), []
+    for i, ranked in enumerate(diagnosis.rounds):
+        added = [name for name in ranked.model if name not in diagnosis.rounds[0].model]
+        heading = f"Which is missing with {listed_names(added)} added?"
+        rounds.append((heading if i else "Which effect is missing from the initial model?", ranking_table(ranked)))
     return DiagnosisTables(
         ladder=pd.DataFrame() if diagnosis.ladder is None else diagnosis.ladder,
         trials=trials,
@@ -611,7 +607,7 @@ def assemble_tables(
         cosines=cosine_cells(diagnosis.rounds[0]),
         drift=drifting,
         missing_force=force,
-        rounds=[(round_heading(i, diagnosis.rounds), ranking_table(one)) for i, one in enumerate(diagnosis.rounds)],
+        rounds=rounds,
         worst=labels.get(worst, worst),
         added=listed_names(diagnosis.effects),
         learned_force=pd.DataFrame() if learned is None else learned,
@@ -696,14 +692,6 @@ def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Da
             name = {"condition": condition, "condition_label": label, "n_trials": n_trials}
             rows.append(name | {"growth_from": low / whole_m, "growth_to": high / whole_m} | misfit)
     return pd.DataFrame(rows)
-
-
-def round_heading(index: int, rounds: Sequence[Round]) -> str:
-    """Return the heading of a round of the diagnosis, as a question."""
-    if index == 0:
-        return "Which effect is missing from the initial model?"
-    added = [name for name in rounds[index].model if name not in rounds[0].model]
-    return f"Which is missing with {listed_names(added)} added?"
 
 
 def ranking_table(ranked: Round) -> pd.DataFrame:

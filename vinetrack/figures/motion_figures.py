@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,13 +54,6 @@ MAX_CONDITION_PANELS = 60  # Chosen: in rows of nine they are 1.2 in wide, the n
 # more, every vine has one on a shared logarithmic axis, with trials coloured by pressure.
 
 
-@dataclass(frozen=True)
-class _Curve:
-    time_s: np.ndarray
-    growth_mm: np.ndarray
-    speed_m_s: np.ndarray
-
-
 @figure("overview", "damping", "All trials at a glance", data="trials.csv")
 def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure | None:
     """Speed of the leading edge against growth, replicates superposed. Thick: the steady window of the gated rule."""
@@ -71,7 +63,10 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     if not tables:
         return None
     n_points = min(max(12_000 // len(tables), 15), 150)  # 12,000 points in all keep the SVG below a megabyte
-    curves = {name: _curve(thinned(table, n_points)) for name, table in tables.items()}
+    curves = {}
+    for name, table in tables.items():
+        part = thinned(table, n_points)
+        curves[name] = part.assign(growth_mm=1e3 * (part["lead_position_m"] - part["lead_position_m"].min()))
     by_condition = shown["condition"].nunique() <= MAX_CONDITION_PANELS
     if by_condition:
         order = {name: i for i, name in enumerate(dict.fromkeys(shown["vine"]))}
@@ -92,7 +87,7 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
             _limit_speed(ax, [curves[name] for name in part["trial"] if name in curves])
     for ax in axes[-n_columns:]:
         ax.tick_params(labelbottom=True)
-    axes[0].set_xlim(0, 1.02 * max(float(np.nanmax(curve.growth_mm)) for curve in curves.values()))
+    axes[0].set_xlim(0, 1.02 * max(float(curve["growth_mm"].max()) for curve in curves.values()))
     if not by_condition:
         _limit_speed(axes[0], list(curves.values()), logarithmic=True)
     what = "one panel per condition, each with its own speed axis" if by_condition else "one panel per vine"
@@ -102,11 +97,6 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     title += f"; the first {max_panels} panels" if len(panels) == max_panels else ""
     page_labels(fig, "growth (mm)", "leading-edge speed (m/s)", title)
     return fig
-
-
-def _curve(table: pd.DataFrame) -> _Curve:
-    position_mm = column(table, "lead_position_m", 1e3)
-    return _Curve(column(table, "time_s"), position_mm - np.nanmin(position_mm), column(table, "lead_velocity_m_s"))
 
 
 def _colours(fig: Figure, trials: pd.DataFrame, by_condition: bool) -> dict[str, Any]:
@@ -125,16 +115,22 @@ def _colours(fig: Figure, trials: pd.DataFrame, by_condition: bool) -> dict[str,
 
 
 def _draw_panel(
-    ax: Axes, label: str, trials: pd.DataFrame, curves: Mapping[str, _Curve], colours: Mapping[str, Any], font: float
+    ax: Axes,
+    label: str,
+    trials: pd.DataFrame,
+    curves: Mapping[str, pd.DataFrame],
+    colours: Mapping[str, Any],
+    font: float,
 ) -> None:
     for row in rows(trials):
         if row.trial not in curves:
             continue
         curve, colour = curves[row.trial], colours[row.trial]
-        ax.plot(curve.growth_mm, curve.speed_m_s, color=colour, lw=0.8, alpha=0.5)
-        steady = (curve.time_s >= row.steady_from_s) & (curve.time_s <= row.steady_to_s)
-        if steady.sum() > 1:
-            ax.plot(curve.growth_mm[steady], curve.speed_m_s[steady], color=colour, lw=2.2, solid_capstyle="butt")
+        ax.plot(curve["growth_mm"], curve["lead_velocity_m_s"], color=colour, lw=0.8, alpha=0.5)
+        steady = curve[(curve["time_s"] >= row.steady_from_s) & (curve["time_s"] <= row.steady_to_s)]
+        if len(steady) > 1:
+            at = steady["growth_mm"], steady["lead_velocity_m_s"]
+            ax.plot(*at, color=colour, lw=2.2, solid_capstyle="butt")
     small_title(ax, textwrap.shorten(label, 30, placeholder="…") if font > 8 else label, fontsize=font, pad=3)
     corner_text(ax, 0.98, 0.05, f"N = {len(trials)}", ha="right", fontsize=font - 1)
     if n_failed := int((trials["status"] == "failed").sum()):
@@ -143,16 +139,17 @@ def _draw_panel(
     ax.locator_params(nbins=4)
 
 
-def _limit_speed(ax: Axes, curves: Sequence[_Curve], logarithmic: bool = False) -> None:
+def _limit_speed(ax: Axes, curves: Sequence[pd.DataFrame], logarithmic: bool = False) -> None:
     """Set limits that are robust to outliers: the fastest per cent of points may lie outside the panel."""
     if not curves:
         ax.set_yticks([])
         return
-    speed_m_s = np.concatenate([curve.speed_m_s for curve in curves])
+    speeds_m_s = [column(curve, "lead_velocity_m_s") for curve in curves]
+    speed_m_s = np.concatenate(speeds_m_s)
     moving_m_s = speed_m_s[speed_m_s > 0]
     top = float(np.percentile(moving_m_s, 99)) if moving_m_s.size else 1.0
     if logarithmic and moving_m_s.size:
-        medians = [float(np.nanmedian(curve.speed_m_s)) for curve in curves]
+        medians = [float(np.nanmedian(of_curve)) for of_curve in speeds_m_s]
         ax.set_yscale("log")
         ax.set_ylim(0.5 * min(median for median in medians if median > 0), 1.5 * top)
         plain_log_ticks(ax, "y")

@@ -281,9 +281,16 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
         pen.line([tuple(place) for place in view.at(np.arange(0.0, view.axis.length_px, 3.0))], fill=_GREY, width=1)
     models = [edge for edge in edges[1:] if not edge.by_hand]
     seen = [edge for i, edge in enumerate(edges) if i == 0 or edge.by_hand]
-    # The edges of the models before and after are drawn to other distances from the axis, in radii of the tube.
+    # Edges that were seen cross the tube; those of the models before and after stand on both sides of it, up to other
+    # distances from the axis, in radii of the tube.
+    thick = max(round(view.picture_px[0] / 320), 3)
     for edge, reach in (*zip(models, (2.0, 1.4), strict=False), *((edge, 0.0) for edge in seen)):
-        _draw_edge(pen, view, edge, frame, reach)
+        along = float(edge.along_px[frame])
+        spans = ((0.85, reach), (-0.85, -reach)) if reach else ((-1.0, 1.0),)
+        for span in spans if math.isfinite(along) else ():
+            line = [tuple(view.at(np.array(along), across * 0.5 * view.tube_px)) for across in span]
+            pen.line(line, fill="black", width=thick + 2)
+            pen.line(line, fill=edge.colour, width=thick)
     _scale_bar(pen, view)
     whole = Image.new("RGB", (width, height + bar_px), _BAR)
     whole.paste(_legend(view, tuple((edge.name, edge.colour) for edge in edges), bar_px), (0, 0))
@@ -299,19 +306,6 @@ def _font(size_px: int, bold: bool = False) -> FreeTypeFont:
 
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size_px)
-
-
-def _draw_edge(pen: ImageDraw, view: ClipView, edge: Edge, frame: int, reach: float) -> None:
-    """Draw an edge across the tube if `reach` is 0, else on both sides of it up to `reach` radii."""
-    along = float(edge.along_px[frame])
-    if not math.isfinite(along):
-        return
-    spans = ((0.85, reach), (-0.85, -reach)) if reach else ((-1.0, 1.0),)
-    thick = max(round(view.picture_px[0] / 320), 3)
-    for span in spans:
-        line = [tuple(view.at(np.array(along), across * 0.5 * view.tube_px)) for across in span]
-        pen.line(line, fill="black", width=thick + 2)
-        pen.line(line, fill=edge.colour, width=thick)
 
 
 def _scale_bar(pen: ImageDraw, view: ClipView) -> None:

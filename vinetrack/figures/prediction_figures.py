@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from vinetrack.diagnosis.power import EffectPower, Power
+    from vinetrack.diagnosis.power import Power
     from vinetrack.planning.prediction import Choice, VinePrediction
 
 _LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis
@@ -120,7 +120,14 @@ def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str
     if len(drawn) == 1:
         _draw_shares(axes[1, 1], drawn[0])
     else:
-        _list_conditions(axes[1, 1], titles)
+        ax = axes[1, 1]  # the condition of each colour, instead of the bars
+        ax.set_axis_off()
+        for k, (colour, title) in enumerate(zip(VINE_COLOURS, titles, strict=False)):
+            y = 0.97 - 0.155 * k
+            ax.plot([0.0, 0.07], [y - 0.025] * 2, color=colour, lw=3, transform=ax.transAxes, clip_on=False)
+            ax.text(0.1, y, textwrap.fill(title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
+        if (n_more := len(titles) - len(VINE_COLOURS)) > 0:
+            ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=MUTED)
     title = titles[0] if len(drawn) == 1 else f"{len(titles)} conditions"
     fig.text(0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * width_in, 12))
     words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
@@ -192,17 +199,6 @@ def _draw_shares(ax: Axes, prediction: VinePrediction) -> None:
     ax.set_title("Uncertainty budget", fontsize=10.5)
 
 
-def _list_conditions(ax: Axes, titles: Sequence[str]) -> None:
-    """List the condition of each colour, instead of the bars."""
-    ax.set_axis_off()
-    for k, (colour, title) in enumerate(zip(VINE_COLOURS, titles, strict=False)):
-        y = 0.97 - 0.155 * k
-        ax.plot([0.0, 0.07], [y - 0.025] * 2, color=colour, lw=3, transform=ax.transAxes, clip_on=False)
-        ax.text(0.1, y, textwrap.fill(title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
-    if (n_more := len(titles) - len(VINE_COLOURS)) > 0:
-        ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=MUTED)
-
-
 @look()
 def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     """Draw position and speed of the leading edge with and without one effect, and the difference."""
@@ -270,7 +266,15 @@ def draw_power(power: Power) -> Figure | None:
     names_on_axis(ax, "y", [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
     for row in range(1, n):
         ax.axhline(row - 0.5, color=GRID, linewidth=0.7)
-    _list_sizes(sizes, entries)
+    # Sizes in the unit of each effect; grey beyond the plausible range
+    sizes.set_axis_off()
+    sizes.set(xlim=(0, 1), ylim=(n - 0.5, -0.5))
+    for x, words in ((0.0, "50 %\npower"), (0.35, "90 %\npower"), (0.7, "largest\nplausible")):
+        sizes.text(x, -0.65, words, va="bottom", fontsize=9, color=INK)
+    for row, one in enumerate(entries):
+        for x, value in ((0.0, one.size_at(0.5)), (0.35, one.size_at(0.9)), (0.7, one.largest)):
+            beyond = x == 0.7 or abs(value - one.zero) > abs(one.largest - one.zero)
+            sizes.text(x, row, size_text(one, value), va="center", fontsize=9, color=MUTED if beyond else INK)
     bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
     bar.set_label("power: probability of detection (%)")
     bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])
@@ -278,17 +282,3 @@ def draw_power(power: Power) -> Figure | None:
     trials = f"{power.n_trials} trial{'s' if power.n_trials != 1 else ''}"
     ax.set_title(f"What {trials} can detect", loc="left", pad=26)
     return fig
-
-
-def _list_sizes(ax: Axes, entries: list[EffectPower]) -> None:
-    """Write sizes next to the rows of the map, in the unit of each effect; grey beyond the plausible range."""
-    ax.set_axis_off()
-    ax.set(xlim=(0, 1), ylim=(len(entries) - 0.5, -0.5))
-    for x, words in ((0.0, "50 %\npower"), (0.35, "90 %\npower"), (0.7, "largest\nplausible")):
-        ax.text(x, -0.65, words, va="bottom", fontsize=9, color=INK)
-    for row, one in enumerate(entries):
-        plausible = abs(one.largest - one.zero)
-        for x, value in ((0.0, one.size_at(0.5)), (0.35, one.size_at(0.9))):
-            colour = MUTED if abs(value - one.zero) > plausible else INK
-            ax.text(x, row, size_text(one, value), va="center", fontsize=9, color=colour)
-        ax.text(0.7, row, size_text(one, one.largest), va="center", fontsize=9, color=MUTED)

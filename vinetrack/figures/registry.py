@@ -79,7 +79,6 @@ def all_figures() -> dict[str, RegisteredFigure]:
         diagnosis_figures,
         motion_figures,
         overlay,
-        paper_figures,
     )
 
     return dict(_registered)

@@ -1,4 +1,6 @@
-"""A results folder in memory, `vt.load("results/demo")`; data frames as trials with tracks; figures by name."""
+"""The Python interface: a results folder in memory, `vt.load("results/demo")`; data frames as trials with tracks;
+figures by name; and `vt.fit`, `vt.diagnose`, `vt.power` and `vt.compare` for trials from any source.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -17,7 +20,9 @@ from vinetrack.core.notebook import html_table, plot
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import PROVENANCE
+from vinetrack.diagnosis.diagnose import diagnose as diagnose_pairs
 from vinetrack.diagnosis.ladder import Comparison
+from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
@@ -34,7 +39,8 @@ from vinetrack.experiment.sheet import (
 )
 from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.figures.registry import FigureTables, campaign_figures, describe_conditions, draw, label_conditions
-from vinetrack.inference.fit_data import Pairs
+from vinetrack.inference.fit import fit as fit_pairs
+from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results import folder_layout
@@ -132,7 +138,6 @@ class LoadedResults:
 
     def _model(self, fit: FitSummary) -> Model:
         from vinetrack.effects import catalogue
-        from vinetrack.interface.calls import named_model
 
         own = not set(fit.names) <= set(catalogue())
         model = make_model(fit.names, named_model(self.experiment).user_effects if own else {})
@@ -368,13 +373,13 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
     if isinstance(shown, LoadedResults):
         return _results_figure(shown, name, trial)
     if isinstance(shown, Fit):
-        from vinetrack.interface.calls import compare
-
         shown = compare(shown)
     if isinstance(shown, Power):
         return _with_content(draw_power(shown), "power")
     if isinstance(shown, Comparison):
-        return _draw_figure(_comparison_tables(shown), name or "model_comparison")
+        table = label_conditions(shown.table, _described([compared.trial for compared in shown.trials]))
+        tables = SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
+        return _draw_figure(tables, name or "model_comparison")
     return _draw_figure(_tables_in_memory(shown) if shown.rounds else None, name)
 
 
@@ -392,17 +397,10 @@ def _with_content(drawn: Figure | None, name: str) -> Figure:
     return drawn
 
 
-def _comparison_tables(shown: Comparison) -> SimpleNamespace:
-    table = label_conditions(shown.table, _described([compared.trial for compared in shown.trials]))
-    return SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
-
-
 def _described(trials: Sequence[Trial]) -> pd.DataFrame:
     """Trials as figures name them: with vine, condition and its label."""
-    columns = ("name", "vine", "condition")
-    rows = pd.DataFrame(
-        [[getattr(trial, name) for name in columns] for trial in trials], columns=["trial", *columns[1:]]
-    )
+    named = [(trial.name, trial.vine, trial.condition) for trial in trials]
+    rows = pd.DataFrame(named, columns=["trial", "vine", "condition"])
     return describe_conditions(rows, tuple(trials))
 
 
@@ -440,3 +438,193 @@ def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
         raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
     stated = next((row for row in trials if row.name == trial), None)
     return _with_content(draw_trial(tables.results, stated, trial), name)
+
+
+# ------------------------------------------------------------------------------
+# Fits, diagnoses, power and comparisons of trials from any source.
+
+
+def fit(model: Model, source: Source, **options: Any) -> Fit:
+    """Fit a model to the trajectories of all trials.
+
+    Parameters
+    ----------
+    model : a sum of effects.
+    source : loaded results, a results folder, an experiment or its folder, a frame of tracks (see
+        `tracks_from_frame`), or pairs of trial and track.
+    options : options of `vinetrack.inference.fit.fit`, such as `fixed`, `free`, `start` and `tracks`.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit, or the model cannot be simulated.
+    ExperimentError, ResultsError
+        If the source cannot be read.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> fit
+    Fit(pressure_drive + gravity + eversion_damping + yield_pressure; 8 trials)
+    >>> fit.table()["unit"].tolist()
+    ['N·(s/m)ⁿ', '1', 'Pa']
+    """
+    if "tracks" in options:
+        return fit_pairs(model, source, **options)  # type: ignore[arg-type]
+    given = read_source(source)
+    fitted = fit_pairs(model, given.pairs, **options)
+    return replace(fitted, left_out={**given.left_out, **fitted.left_out})
+
+
+def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
+    """Diagnose what a model lacks: verdict, candidates with sizes, errors before and after, next experiment.
+
+    Parameters
+    ----------
+    source : a fit, whose model is diagnosed, or any source of trials as in `fit`; the model is then that of the
+        experiment, else the base model.
+    options : options of `vinetrack.diagnosis.diagnose.diagnose`, such as `model`, `candidates`, `ladder` and `advice`.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit.
+    ExperimentError, ResultsError
+        If the source cannot be read.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> diagnosis = vt.diagnose(vt.example_tracks(), ladder=False, advice=False)
+    >>> diagnosis
+    Diagnosis(missing: reservoir_depletion)
+    >>> diagnosis.candidates().loc[0, ["effect", "status"]].tolist()
+    ['reservoir_depletion', 'refitted']
+    """
+    if isinstance(source, Fit) or "tracks" in options:
+        return diagnose_pairs(source, **options)  # type: ignore[arg-type]
+    given = read_source(source)
+    if given.experiment is None:
+        return diagnose_pairs(given.pairs, **options)
+    return diagnose_pairs(given.experiment, tracks=given.tracks, **options)
+
+
+def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
+    """Calculate the power of trials: detectable sizes of all effects, confusions between them, false-alarm rate.
+
+    Parameters
+    ----------
+    source : a fit; or a results folder, an experiment's folder, a sheet without recordings, loaded results, a frame of
+        tracks, or pairs of trial and track.
+    *effects : names, or `name=size` in the unit of the parameter; all by default.
+    **options
+        Options of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
+        `spread_B` (relative), `capture_fps`, `B`, `n`; `simulate`, `jobs`, `first_seed` for complete diagnoses
+        of simulated campaigns; `reach`, the probability with which further trials shall detect `name=size`;
+        `recommend`, whether to search for the trials that would reveal most.
+
+    Returns
+    -------
+    Power
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit.
+    ExperimentError, ResultsError
+        If the source cannot be read, or there is no such effect.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> power = vt.power(vt.example_tracks(), "leak")
+    >>> round(power["leak"].probability_at(1.0), 2)
+    1.0
+    """
+    from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
+
+    if isinstance(source, LoadedResults | Experiment):
+        source = source.folder
+    if isinstance(source, str | Path):
+        return power_of_target(PowerRequest(Path(source), effects, **options))
+    given = source if isinstance(source, Fit) else read_source(source).pairs
+    return power_of_target(PowerRequest(Path("trials"), effects, **options), given)
+
+
+def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) -> Comparison:
+    """Compare a fitted model with the trials, condition by condition, and with the scatter of replicates.
+
+    Parameters
+    ----------
+    fitted : a fit; or any source of trials, to which the model of the experiment (else the base model) is first fitted.
+    source : the trials to compare with, as in `fit`; None for those that the model was fitted to.
+    options : options of `vinetrack.diagnosis.ladder.compare`, such as `final_at_fraction` and `tracks`.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    FitError
+        If the model cannot be simulated.
+    ExperimentError, ResultsError
+        If the source cannot be read.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> comparison = vt.compare(vt.fit(vt.base_model(), vt.example_tracks(), profile=False))
+    >>> list(comparison.table.columns)[:3]
+    ['model', 'condition', 'rms_position_m']
+    """
+    if not isinstance(fitted, Fit):
+        given = read_source(fitted)
+        fit_of_source = fit_pairs(named_model(given.experiment), given.pairs)
+        return compare_pairs(fit_of_source, given.pairs, kinematics=given.kinematics, **options)
+    if "tracks" in options:
+        return compare_pairs(fitted, source, **options)  # type: ignore[arg-type]
+    if source is None:
+        if not fitted.pairs:
+            raise FitError("The fit does not contain its tracks: pass the trials to compare with.")
+        return compare_pairs(fitted, fitted.pairs, **options)
+    given = read_source(source)
+    return compare_pairs(fitted, given.pairs, **{"kinematics": given.kinematics, **options})
+
+
+def named_model(experiment: Experiment | None) -> Model:
+    """Return the model that an experiment names, including the user's own effects; without one, the base model."""
+    from vinetrack.effects import own_effects
+
+    if experiment is None:
+        return make_model()
+    settings = experiment.settings
+    return make_model(settings.model, own_effects([experiment.folder / path for path in settings.effects]))
+
+
+def example_tracks() -> pd.DataFrame:
+    """Return eight trials of one vine from the virtual laboratory, supplied by a chamber of 2 L that depletes.
+
+    Returns
+    -------
+    DataFrame
+        A frame of tracks as `fit`, `diagnose` and `compare` take it: `trial, time_s, lead_position_m` and columns of
+        the trial sheet.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.example_tracks()["trial"].nunique()
+    8
+    """
+    with (files("vinetrack.interface") / "example_tracks.csv").open(encoding="utf-8") as file:
+        return pd.read_csv(file)

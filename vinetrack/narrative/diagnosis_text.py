@@ -247,12 +247,14 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         return [f"{what}: no further trial within `limits` can be made and filmed."]
     count = len(plan.trials)
     lines = [f"To detect {what} with {percent(plan.target)} power ({percent(plan.before)} with the trials so far):"]
+    # Columns of the rig that a further trial may change, as printed
+    rig = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
     rows = []
     for cells, group in groupby(plan.trials, key=lambda trial: sheet_cells(trial.trial)):
         alike = list(group)
         added, kPa, grams = alike[0], cells.get("pressure_kPa", math.nan), cells.get("payload_g", 0.0)
         new = ["a new vine"] if added.new_vine else []
-        new += [f"{COLUMN_WORDS.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
+        new += [f"{rig.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
         power = percent(alike[-1].probability)
         rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", power))
     if rows and plan.after > plan.before:
@@ -279,10 +281,6 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3]]
         lines.append(f"With them it would be mistaken for {joined(names)} of campaigns (at the size of 90 % power).")
     return lines
-
-
-# Columns of the rig that a further trial may change, as printed
-COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
 
 
 # ------------------------------------------------------------------------------
@@ -378,12 +376,14 @@ def measure_first_text(faults: Sequence[str], measurement: Remark) -> str:
 def informative_text(plan: InformativeTrials) -> str:
     """Return recommended trials in words, and the detectable sizes that they lower most."""
     before = {entry.effect: entry for entry in plan.now.effects}
-    gains = [
-        (before[entry.effect], entry, _gain(before[entry.effect], entry))
-        for entry in plan.then.effects
-        # whose size detected with 90 % power is no larger than the largest plausible one
-        if entry.effect in before and abs(entry.size_at(0.9) - entry.zero) <= abs(entry.largest - entry.zero)
-    ]
+    gains = []
+    for then in plan.then.effects:
+        now, size = before.get(then.effect), abs(then.size_at(0.9) - then.zero)
+        # Where the size detected with 90 % power is no larger than the largest plausible one: the factor by which it
+        # falls; 0 where either is unknown
+        if now is not None and size <= abs(then.largest - then.zero):
+            at_first = abs(now.size_at(0.9) - now.zero)
+            gains.append((now, then, at_first / size if math.isfinite(at_first) and size > 0 else 0.0))
     # 1.1: factor by which a detectable size must fall to be stated (chosen)
     gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > 1.1][:MOST_NAMED]
     lower = [
@@ -396,16 +396,8 @@ def informative_text(plan: InformativeTrials) -> str:
     return f"Make {made}. These trials are expected to reveal most of what could be missing.{sizes}"
 
 
-def _gain(now: EffectPower, then: EffectPower) -> float:
-    """Factor by which the size detected with 90 % power falls; 0 where either is unknown."""
-    sizes = [abs(entry.size_at(0.9) - entry.zero) for entry in (now, then)]
-    return sizes[0] / sizes[1] if math.isfinite(sizes[0]) and sizes[1] > 0 else 0.0
-
-
 # ------------------------------------------------------------------------------
 # The damping law of an experiment in sentences and tables, for terminal and report, and how it was determined.
-
-_STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
 
 # The two fits of the damping law, by their keys in `damping.json`
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
@@ -419,7 +411,7 @@ def damping_headline(damping: Mapping[str, Any]) -> str:
     """Return the main result in one sentence."""
     fit = damping.get(PREFERRED) or {}
     if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
-        return f"No damping law: {_sentence(fit.get('refused') or 'no trial gave a steady speed')}"
+        return f"No damping law: {(fit.get('refused') or 'no trial gave a steady speed').removesuffix('.')}."
     vines = fit["vines"]
     n_trials = sum(law["n_trials"] for law in vines.values())
     n = with_interval(fit["n"], fit.get("n_95"))
@@ -434,17 +426,14 @@ def damping_headline(damping: Mapping[str, Any]) -> str:
 
 def status_tally(trials: pd.DataFrame) -> str:
     """Return the number of trials of each status, as a sentence."""
+    words = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
     counts = trials["status"].value_counts()
-    parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in _STATUS_WORDS if counts.get(status, 0)]
+    parts = [f"{counts[status]} {words[status]}" for status in words if counts.get(status, 0)]
     return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
 
 
 def _count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def _sentence(text: str) -> str:
-    return text if text.endswith(".") else text + "."
 
 
 _HEADLINES = {
@@ -454,11 +443,6 @@ _HEADLINES = {
     ARTEFACT: "a fault of the measurement, not missing physics",
     UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
 }
-# What a user does next where no effect of the catalogue explains the misfit
-GO_ON = (
-    "Next: look at the figures of the missing force in the report, and run `vinetrack propose` on the results folder. "
-    "It looks for a law that describes the missing force and writes the law as an effect file of your own."
-)
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
@@ -487,7 +471,12 @@ def to_go_on(diagnosis: Diagnosis) -> str:
     """Return what to do next where no effect of the catalogue explains the trials; blank elsewhere."""
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         return ""
-    return ODD_MEANING if diagnosis.odd_trials else GO_ON
+    if diagnosis.odd_trials:
+        return ODD_MEANING
+    return (
+        "Next: look at the figures of the missing force in the report, and run `vinetrack propose` on the results "
+        "folder. It looks for a law that describes the missing force and writes the law as an effect file of your own."
+    )
 
 
 def verdict_line(diagnosis: Diagnosis) -> str:
@@ -546,7 +535,7 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
 
     body = []
     for row in ladder.to_dict("records"):
-        model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") in (True, "True") else "")
+        model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") else "")
         errors = (row[f"{key}_m"] for key in ("rms_in_sample", "rms_left_out", "rms_highest_pressure", "floor"))
         body.append((model, *(f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)))
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))

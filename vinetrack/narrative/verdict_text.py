@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
-    from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.remarks import Remark
     from vinetrack.diagnosis.replicates import OddTrial
     from vinetrack.diagnosis.result import Candidate, Diagnosis
@@ -47,15 +46,6 @@ if TYPE_CHECKING:
 
 # ------------------------------------------------------------------------------
 # Differences between trials in words: which trials differ, by how much, and how to confirm it.
-
-# What to do about each difference between trials
-REMEDIES = {
-    N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
-    ORDER_DRIFT: "Repeat six trials in random order, number all trials in the column `order`, and read the gauge at "
-    "each",
-    SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
-    DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
-}
 
 
 def trials_differ(names: Sequence[str]) -> bool:
@@ -101,7 +91,14 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
     names = [result.names[-1] for result in answers or step.answer_set if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""
-    text = "".join(f" {REMEDIES[name]}." for name in names)
+    remedies = {
+        N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
+        ORDER_DRIFT: "Repeat six trials in random order, number all trials in the column `order`, and read the gauge "
+        "at each",
+        SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
+        DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
+    }
+    text = "".join(f" {remedies[name]}." for name in names)
     if ORDER_DRIFT not in names and SPECIMEN not in names:
         return text
     _, stated = trial_order(trials)
@@ -131,37 +128,10 @@ def _range(numbers: Sequence[Number], factor: float, unit: str) -> str:
 #
 # Report, figures, notebooks and explorer use these sentences; `diagnosis_text` prints a whole diagnosis.
 
-# What each verdict means
-MEANINGS = {
-    MISSING: "An effect is missing from the model. It was identified, added, and the model fitted again.",
-    AMBIGUOUS: "An effect is missing, and these trials cannot tell which of several: nothing was added. "
-    "The next experiment below says how to separate them.",
-    ARTEFACT: "A fault of the measurement, not missing physics, explains the misfit: nothing was added. "
-    "Correct the measurement first.",
-    ADEQUATE: "Every candidate was tested, and none improves the fit significantly. "
-    "Upper limits on the size of each are listed below.",
-    UNEXPLAINED: "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
-    "The missing force is drawn below; `vinetrack propose` looks for a law that describes it.",
-}
-
-TRIALS_DIFFER = (
-    "A difference between trials, not missing physics, explains the misfit: nothing was added. The explanation below "
-    "says what to do."
-)
-
 ODD_MEANING = (
     "The row of a trial in the sheet contradicts its motion. The verdict in full covers the other trials. Correct its "
     "row, or leave it out with `use: no`, and run again."
 )
-
-# The verdict on the model with all added effects
-THEREAFTER = {
-    MISSING: "A further effect is still missing.",
-    AMBIGUOUS: "A further effect is missing, and these trials cannot tell which.",
-    ARTEFACT: "The remaining misfit is explained by a fault of the measurement.",
-    ADEQUATE: "With it, no further effect can be detected.",
-    UNEXPLAINED: "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
-}
 
 
 @dataclass(frozen=True)
@@ -210,11 +180,32 @@ def verdict_meaning(diagnosis: Diagnosis) -> str:
     """Return what the verdict means, and the verdict on the model with all added effects."""
     if diagnosis.odd_trials:
         return ODD_MEANING
-    text = MEANINGS.get(diagnosis.verdict, diagnosis.refused)
+    meanings = {
+        MISSING: "An effect is missing from the model. It was identified, added, and the model fitted again.",
+        AMBIGUOUS: "An effect is missing, and these trials cannot tell which of several: nothing was added. "
+        "The next experiment below says how to separate them.",
+        ARTEFACT: "A fault of the measurement, not missing physics, explains the misfit: nothing was added. "
+        "Correct the measurement first.",
+        ADEQUATE: "Every candidate was tested, and none improves the fit significantly. "
+        "Upper limits on the size of each are listed below.",
+        UNEXPLAINED: "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
+        "The missing force is drawn below; `vinetrack propose` looks for a law that describes it.",
+    }
+    text = meanings.get(diagnosis.verdict, diagnosis.refused)
     if diagnosis.verdict == ARTEFACT and trials_differ(list(diagnosis.answer_set)):
-        text = TRIALS_DIFFER
+        text = (
+            "A difference between trials, not missing physics, explains the misfit: nothing was added. The explanation "
+            "below says what to do."
+        )
+    thereafter = {
+        MISSING: "A further effect is still missing.",
+        AMBIGUOUS: "A further effect is missing, and these trials cannot tell which.",
+        ARTEFACT: "The remaining misfit is explained by a fault of the measurement.",
+        ADEQUATE: "With it, no further effect can be detected.",
+        UNEXPLAINED: "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
+    }
     added = diagnosis.effects
-    final = THEREAFTER.get(diagnosis.final_verdict, "") if added else ""
+    final = thereafter.get(diagnosis.final_verdict, "") if added else ""
     return f"{text} {final.replace('With it,', 'With them,') if len(added) > 1 else final}".strip()
 
 
@@ -388,9 +379,7 @@ def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
 
 def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
     """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it."""
-    if "partial" not in table:
-        return table
-    return table.loc[[value not in (True, "True") for value in table["partial"]]]
+    return table[~table["partial"].astype(bool)] if "partial" in table else table
 
 
 MOST_NAMED = 3  # Parameters or effects named in a sentence, at most (chosen)
@@ -457,12 +446,17 @@ def _difference_between_trials(step: SelectionStep, model: str, trials: str) -> 
 
 
 def _measurement_fault(step: SelectionStep, model: str, trials: str) -> str:
-    answers = step.answer_set
+    answers, (fault, *others) = step.answer_set, step.answer_set[0].names
+    # Effects fitted beside a fault may describe more of the same fault.
+    beside = (
+        f" {joined(others)} {'explains' if len(others) == 1 else 'explain'} what {fault} leaves, which may be more of "
+        "the same fault: repeat the diagnosis once it is corrected."
+    )
     return (
         f"A fault of the measurement, not missing physics: {joined(list(step.answer_names), 'or')} explains the misfit "
         f"of {model} to {trials} ({_hypotheses(answers)}). It is not added to the model: find the fault and measure "
         f"again, or correct the sheet.{_slips(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
-        f"{_with_the_fault(step)}{_other_effects_beside_the_fault(answers[0].names)}"
+        f"{_with_the_fault(step)}{beside if others else ''}"
     )
 
 
@@ -473,30 +467,14 @@ def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
     )
     for name, why in step.rejected:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
-    return text + _partial_in_words(step)
-
-
-def _other_effects_beside_the_fault(names: Sequence[str]) -> str:
-    """Warn that effects fitted beside a fault may describe more of the same fault; blank where there are none."""
-    if len(names) < 2:
-        return ""
-    explains = "explains" if len(names) == 2 else "explain"
-    return (
-        f" {joined(names[1:])} {explains} what {names[0]} leaves, which may be more of the same fault: repeat the "
-        "diagnosis once it is corrected."
-    )
-
-
-def _partial_in_words(step: SelectionStep) -> str:
-    """Describe the effects that reduce an unexplained misfit, and by how much; blank where none do."""
     if not step.partial:
-        return ""
+        return text
     last = step.partial[-1]
     added = joined([f"{each.names[-1]} (Δχ² = {each.delta_chi2:.0f} in all)" for each in step.partial], "then")
     before, after = step.tests.fit.chi2_per_dof, last.fit.chi2_per_dof
     return (
-        f" Part of the misfit is explained by adding {added}: χ² per degree of freedom falls from {before:.1f} to "
-        f"{after:.1f}, with {sizes_in_words(last.numbers)}. Because a significant misfit remains, these steps are "
+        f"{text} Part of the misfit is explained by adding {added}: χ² per degree of freedom falls from {before:.1f} "
+        f"to {after:.1f}, with {sizes_in_words(last.numbers)}. Because a significant misfit remains, these steps are "
         "partial: none is shown to be missing."
     )
 
@@ -640,8 +618,14 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
         thresholds = [tests.family.threshold(name) for name in names]
         best = int((tests.one_sided_z - thresholds).argmax())
         stricter = " (the level once an effect was added)" if tests.level < FALSE_ALARM_LEVEL_FIRST_ROUND else ""
+        # Those that the ranking does not call not testable
+        count = sum(
+            effect.name not in tests.sensitivities.silent
+            and (tests.upper_limits(effect)[1] or tests.best_z(effect.name)[0] >= tests.family.threshold(effect.name))
+            for effect in tests.effects
+        )
         text += (
-            f" The most significant of {_count_testable(tests)} candidates, {names[best]}, reaches "
+            f" The most significant of {count} candidates, {names[best]}, reaches "
             f"{tests.one_sided_z[best]:.1f} σ; its threshold is {thresholds[best]:.1f} σ. Where nothing is missing, "
             f"chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns{stricter}."
         )
@@ -650,26 +634,12 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
         # check (chosen)
         if kind == "measurement" and tests.one_sided_z[best] >= 3.0:
             text += f" It is a fault of the measurement that is soon checked: see `vinetrack effects {names[best]}`."
-    return f"{text}{_unstated(step)}"
-
-
-def _unstated(step: SelectionStep) -> str:
-    """Describe a difference between trials that follows an order the sheet does not state; blank without one."""
     if not step.unstated_differences:
-        return ""
-    best = max(step.unstated_differences, key=lambda result: result.delta_chi2)
+        return text
+    unstated = max(step.unstated_differences, key=lambda result: result.delta_chi2)
     return (
-        f" However, the trials seem to differ, which biases the fitted numbers: {difference_in_words(best)}"
-        f" (Δχ² = {best.delta_chi2:.0f}).{remedies_in_words(step, [best])}"
-    )
-
-
-def _count_testable(tests: MisfitTests) -> int:
-    """Number of effects that these trials can test: those that the ranking does not call not testable."""
-    return sum(
-        effect.name not in tests.sensitivities.silent
-        and (tests.upper_limits(effect)[1] or tests.best_z(effect.name)[0] >= tests.family.threshold(effect.name))
-        for effect in tests.effects
+        f"{text} However, the trials seem to differ, which biases the fitted numbers: {difference_in_words(unstated)}"
+        f" (Δχ² = {unstated.delta_chi2:.0f}).{remedies_in_words(step, [unstated])}"
     )
 
 

@@ -8,7 +8,7 @@ import math
 import shlex
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -128,9 +128,8 @@ class Campaign:
     @cached_property
     def labels(self) -> Mapping[str, str]:
         """A short name of every condition: those of its settings that vary."""
-        return condition_labels(
-            {name: self.trials[self.indices_of_condition(name)[0]].data.trial for name in self.conditions}
-        )
+        first = {aligned.condition: aligned.data.trial for aligned in reversed(self.trials)}
+        return condition_labels({name: first[name] for name in self.conditions})
 
     @cached_property
     def host(self) -> Model:
@@ -166,7 +165,19 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         table = read_result(results.comparison).astype({"condition": str, "replicate_floor_m": float})
         floors_m = dict(zip(table["condition"], table["replicate_floor_m"], strict=True))
     compared = {name: read_result(results.trajectories(name)) for name in floors_m}
-    effects = {**catalogue(), **user_effects}
+    bands = {}
+    for condition, table in compared.items():
+        # The replicates at the times of the longest trial of each condition, where they are known
+        longest = table.groupby("trial")["time_s"].max().idxmax()
+        columns = ["time_s", "replicates_mean_m", "replicates_sigma_m"]
+        rows = table.loc[table["trial"] == longest, columns].to_numpy(dtype=float)
+        bands[condition] = rows[np.isfinite(rows[:, 1:]).all(axis=1)].T
+    effects, unusable = {**catalogue(), **user_effects}, {}
+    for effect in effects.values():
+        try:
+            check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))
+        except EffectError:
+            unusable[effect.name] = f"needs {' and '.join(effect.needs)} in the sheet"
     return Campaign(
         name=folder.name,
         folder=folder,
@@ -175,14 +186,14 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         kinematics=kinematics,
         trials=tuple(_align_trials(data, compared)),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
-        bands=_bands(compared),
+        bands=bands,
         floors_m=floors_m,
         numbers={entry.name: entry.value for entry in fitted.numbers},
         log_likelihood=fitted.log_likelihood,
         refused=fitted.refused,
         effects=effects,
         in_use=fitted.names if fitted.names and set(fitted.names) <= set(effects) else tuple(experiment.settings.model),
-        unusable=_unusable(effects.values(), data),
+        unusable=unusable,
     )
 
 
@@ -203,27 +214,6 @@ def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
     return trials
 
 
-def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, Floats]:
-    """The replicates at the times of the longest trial of each condition, where they are known."""
-    bands = {}
-    for condition, table in compared.items():
-        longest = table.groupby("trial")["time_s"].max().idxmax()
-        columns = ["time_s", "replicates_mean_m", "replicates_sigma_m"]
-        rows = table.loc[table["trial"] == longest, columns].to_numpy(dtype=float)
-        bands[condition] = rows[np.isfinite(rows[:, 1:]).all(axis=1)].T
-    return bands
-
-
-def _unusable(effects: Iterable[Effect], data: Sequence[FitTrial]) -> dict[str, str]:
-    reasons = {}
-    for effect in effects:
-        try:
-            check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))
-        except EffectError:
-            reasons[effect.name] = f"needs {' and '.join(effect.needs)} in the sheet"
-    return reasons
-
-
 def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
     """Return a label for each condition, from the settings in which the trials of the experiment differ."""
     written = {name: _settings(trial) for name, trial in conditions.items()}
@@ -238,10 +228,8 @@ def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
         before = [other for other in kept if other in sizes] if key in sizes else []
         if told_apart([*before, key]) > told_apart(before):
             kept.append(key)
-    labels = {
-        name: ", ".join(settings[key] for key in kept or ["pressure"] if settings.get(key)) or name
-        for name, settings in written.items()
-    }
+    told = kept or ["pressure"]
+    labels = {name: ", ".join(of[key] for key in told if of.get(key)) or name for name, of in written.items()}
     named = list(labels.values())
     # Conditions that differ in another setting get their name appended.
     return {name: label if named.count(label) == 1 else f"{label} ({name})" for name, label in labels.items()}
@@ -296,18 +284,6 @@ def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[st
         for condition in campaign.conditions
     }
     return Prediction(tuple(predicted), errors_m, campaign.floors_m if floors_m is None else floors_m)
-
-
-def predict_fit(campaign: Campaign, fitted: Fit) -> Prediction:
-    """Predict every trial by a fit, exactly as `vinetrack compare` does."""
-    comparison = compare(fitted, campaign.pairs, kinematics=campaign.kinematics)
-    by_name = {trial.name: trial for trial in comparison.trials}
-    table = comparison.table.set_index("condition")
-    errors_m, floors_m = (
-        dict(zip(campaign.conditions, map(float, table.loc[list(campaign.conditions), column]), strict=True))
-        for column in ("rms_position_m", "replicate_floor_m")
-    )
-    return Prediction(tuple(by_name[trial.name] for trial in campaign.trials), errors_m, floors_m)
 
 
 def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
@@ -420,8 +396,6 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> Model:
 
 log = logging.getLogger(__name__)
 
-FAULT = "A fault of the program, not of your data: run vinetrack explore with --log FILE for the traceback."
-
 CLEARLY_WORSE = 0.5  # Decrease in ln L (chosen)
 
 
@@ -480,8 +454,17 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
 
 
 def _evaluated(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: float) -> Fitted:
+    """A fit with what it predicts of every trial, exactly as `vinetrack compare` does."""
     fitted_choice = choice.with_sizes({number.name: number.value for number in result.numbers})
-    return Fitted(fitted_choice, result, predict_fit(campaign, result), seconds)
+    comparison = compare(result, campaign.pairs, kinematics=campaign.kinematics)
+    by_name = {trial.name: trial for trial in comparison.trials}
+    table = comparison.table.set_index("condition")
+    errors_m, floors_m = (
+        dict(zip(campaign.conditions, map(float, table.loc[list(campaign.conditions), column]), strict=True))
+        for column in ("rms_position_m", "replicate_floor_m")
+    )
+    prediction = Prediction(tuple(by_name[trial.name] for trial in campaign.trials), errors_m, floors_m)
+    return Fitted(fitted_choice, result, prediction, seconds)
 
 
 def likelihood_change_text(before: Fit, after: Fit) -> str:
@@ -547,7 +530,9 @@ class Job(Generic[Progress, Outcome]):
             reason = str(error)
         except Exception:
             log.exception("a job of the explorer")
-            reason = FAULT
+            reason = (
+                "A fault of the program, not of your data: run vinetrack explore with --log FILE for the traceback."
+            )
         if self._cancelled.is_set():
             return
         if self._soon is None:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 from bokeh.models import (
@@ -38,7 +39,6 @@ from vinetrack.pages.campaign import (
 )
 from vinetrack.pages.plots import (
     button,
-    escaped,
     html_div,
     panel,
     progress_bar,
@@ -96,11 +96,11 @@ class SizeSlider:
         unit, factor = self.size.shown
         low, high, value = (factor * x for x in (number.low, number.high, number.value))
         if math.isfinite(number.bound):
-            text = f"<b>{factor * number.bound:.4g}</b> {escaped(unit)}, at its bound"
+            text = f"<b>{factor * number.bound:.4g}</b> {escape(unit)}, at its bound"
         else:
             error = f" ± {factor * number.sigma:.2g}" if math.isfinite(number.sigma) else ""
             ends = f" (its {number.ends_at} bound)" if number.ends_at else ""
-            text = f"<b>{value:.4g}{error}</b> {escaped(unit)} · 95 %: {low:.4g} to {high:.4g}{ends}"
+            text = f"<b>{value:.4g}{error}</b> {escape(unit)} · 95 %: {low:.4g} to {high:.4g}{ends}"
         self.fitted.update(text=f"<small>fitted: {text}</small>", visible=True)
 
 
@@ -149,7 +149,7 @@ class EffectPanel:
                 SizeSlider(size, choice.numbers[size.name], bool(unusable), partial(self._on_size, name))
                 for size in sizes_of(campaign, effect)
             ]
-            about = html_div(f"<small>{escaped(unusable or effect.formula)}</small>")
+            about = html_div(f"<small>{escape(unusable or effect.formula)}</small>")
             parts = [part for one in self.sliders[name] for part in (one.slider, one.fitted)]
             rows[name] = stacked(self.ticks[name], about, *parts, margin=(0, 0, 4, 0))
         in_use = [name for name in rows if name in choice]
@@ -201,7 +201,7 @@ class TrialSelector:
         self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", visible=False)
         tools = side_by_side(
             button("all", "choose_all", self._all, css_classes=["small"]),
-            button("none", "choose_none", self._none, css_classes=["small"]),
+            button("none", "choose_none", lambda: self._conditions.update(active=[]), css_classes=["small"]),
             _opens(self._trials, "single trials …", "small", name="single_trials"),
             css=":host { gap: 4px; }",
         )
@@ -218,9 +218,6 @@ class TrialSelector:
     def _all(self) -> None:
         self._trials.active = list(range(len(self.campaign.trials)))
         self._conditions.active = list(range(len(self.campaign.conditions)))
-
-    def _none(self) -> None:
-        self._conditions.active = []
 
     def toggle(self, condition: str) -> None:
         """Select this condition alone; if it is alone already, select all."""
@@ -315,12 +312,12 @@ class ProposalPanel:
         if self._job is None:
             return
         if outcome is None:
-            self._ended(f'<p class="bad">{escaped(reason)}</p>')
+            self._ended(f'<p class="bad">{escape(reason)}</p>')
             return
         written = outcome[0]
         self._outcome = outcome[1:] if written.files else None
         self.open.visible = self._outcome is not None and self._reopen is not None
-        self._ended("".join(f"<p>{escaped(line)}</p>" for line in written.lines))
+        self._ended("".join(f"<p>{escape(line)}</p>" for line in written.lines))
 
     def _ended(self, text: str) -> None:
         self._job, self.button.label = None, PROPOSE

@@ -67,15 +67,14 @@ def in_unit_of(column: str, name: str, cell: str, decimal: str = ".") -> str:
 # ------------------------------------------------------------------------------
 # Editing of the trial sheet: cells as text, with those of an existing sheet preserved.
 
-# Columns of a new sheet: the names, and what differs between trials in most campaigns
-FIRST_COLUMNS = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
-
 
 def read_sheet(folder: Path) -> Table:
     """Read the sheet of a folder; without rows if there is none."""
     path = folder / SHEET
     if not path.exists():
-        return Table(FIRST_COLUMNS, (), (), (), ",", ".")
+        # The names, and what differs between trials in most campaigns
+        columns = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
+        return Table(columns, (), (), (), ",", ".")
     try:
         table = read_table(path)
     except TableError as error:
@@ -125,21 +124,6 @@ def _path(text: str) -> PurePosixPath:
 # ------------------------------------------------------------------------------
 # Editing of `experiment.yaml` as text with its comments preserved, and a commented template for a new one.
 
-# Keys of a new file: what all trials of most campaigns share
-FIRST_KEYS = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_deg", "chamber_l")
-
-_HEAD = """\
-# What all trials share; a column of the same name in trials.csv overrides it. The unit of a value is in its name, and
-# a name may end in another one (yield_pressure_psi). `vinetrack settings` lists every key.
-"""
-_SCALE = """\
-# The scale: two marks on a ruler in the plane of growth (kind: two_points, from_px, to_px, length_mm), a printed board
-# (kind: charuco, image, squares, square_mm, marker_mm, dictionary), or the scale itself (kind: mm_per_px, mm_per_px).
-calibration:
-# The growth axis in the picture (from_px, to_px, width_mm); found from the motion if blank.
-axis:
-"""
-
 
 def read_settings_text(folder: Path) -> str:
     """Return the text of `experiment.yaml`; if there is none, that of a template with blanks to fill."""
@@ -152,17 +136,25 @@ def read_settings_text(folder: Path) -> str:
 
 def first_settings() -> str:
     """Return a template of `experiment.yaml`: keys without values, each with its meaning and how to measure it."""
-    width = max(len(key) for key in FIRST_KEYS) + 3
-    lines = [f"{f'{key}:':{width}}# {_comment(key)}\n" for key in FIRST_KEYS]
-    return _HEAD + "".join(lines) + _SCALE
-
-
-def _comment(key: str) -> str:
-    column = COLUMNS[key]
-    unit = f" [{column.unit}]" if column.unit and column.unit.lower() not in column.meaning.lower() else ""
-    how = f" {column.measured}" if column.measured else ""
-    blank = "" if column.default.startswith("required") else f" Blank: {column.default or 'unknown'}."
-    return f"{column.meaning.rstrip('.')}{unit}.{how}{blank}"
+    # What all trials of most campaigns share
+    keys = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_deg", "chamber_l")
+    width, lines = max(map(len, keys)) + 3, []
+    for key in keys:
+        column = COLUMNS[key]
+        unit = f" [{column.unit}]" if column.unit and column.unit.lower() not in column.meaning.lower() else ""
+        how = f" {column.measured}" if column.measured else ""
+        blank = "" if column.default.startswith("required") else f" Blank: {column.default or 'unknown'}."
+        lines.append(f"{f'{key}:':{width}}# {column.meaning.rstrip('.')}{unit}.{how}{blank}\n")
+    return f"""\
+# What all trials share; a column of the same name in trials.csv overrides it. The unit of a value is in its name, and
+# a name may end in another one (yield_pressure_psi). `vinetrack settings` lists every key.
+{"".join(lines)}\
+# The scale: two marks on a ruler in the plane of growth (kind: two_points, from_px, to_px, length_mm), a printed board
+# (kind: charuco, image, squares, square_mm, marker_mm, dictionary), or the scale itself (kind: mm_per_px, mm_per_px).
+calibration:
+# The growth axis in the picture (from_px, to_px, width_mm); found from the motion if blank.
+axis:
+"""
 
 
 def shared_values(text: str) -> dict[str, Any]:
@@ -290,27 +282,24 @@ def draft_folder(folder: Path, draft: Draft) -> Iterator[Path]:
 # Whatever matches nothing is named and changes nothing, so that no number stands beside another film than its own.
 
 SHARED_ROW = "shared"  # The row of the table that applies to all trials
-_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 
 
 def read_block(text: str) -> list[list[str]]:
     """Split pasted text into rows of cells, at tabs, semicolons, commas or blanks, whichever it has first."""
-    lines = [line for line in text.splitlines() if line.strip()]
+    lines, decimal_comma = [line for line in text.splitlines() if line.strip()], re.compile(r"[+-]?\d+,\d+")
     if any("\t" in line for line in lines):
         delimiter = "\t"
     elif any(";" in line for line in lines):
         delimiter = ";"
-    elif any("," in _DECIMAL_COMMA.sub("", line) or line.count(",") > 1 for line in lines) or _same_commas(lines):
+    elif any("," in decimal_comma.sub("", line) or line.count(",") > 1 for line in lines) or (
+        # One comma in each line separates cells where blanks do not, and not all lines are numbers.
+        all(line.count(",") == 1 for line in lines) and not all(decimal_comma.fullmatch(line.strip()) for line in lines)
+    ):
         delimiter = ","
     else:
         wide = any(re.search(r"\S {2,}\S", line) for line in lines)
         return [re.split(r" {2,}" if wide else r"\s+", line.strip()) for line in lines]
     return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
-
-
-def _same_commas(lines: Sequence[str]) -> bool:
-    """Whether one comma in each line separates cells: blanks do not, and not all lines are numbers."""
-    return all(line.count(",") == 1 for line in lines) and not all(_DECIMAL_COMMA.fullmatch(s.strip()) for s in lines)
 
 
 def place_block(

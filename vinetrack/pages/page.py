@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +62,6 @@ from vinetrack.pages.plots import (
     HeldModel,
     Plots,
     button,
-    command_block,
-    escaped,
     html_div,
     panel,
     progress_bar,
@@ -196,16 +195,16 @@ def _cosine_grid(diagnosis: Diagnosis) -> tuple[list[str], list[list[tuple[str, 
     if len(names) < 2:
         return [], []
     place = [known.index(name) for name in names]
-    return [spaced_name(name) for name in names], [[_cosine_cell(cosines[i][k]) for k in place] for i in place]
 
+    def cell(cosine: float) -> tuple[str, str]:
+        """A cosine and its style: blue if it is positive, vermillion if negative, the deeper the larger."""
+        if not math.isfinite(cosine):
+            return "–", ""
+        strength = min(abs(cosine), 1.0) ** 2
+        colour = f"rgba({'0,114,178' if cosine > 0 else '213,94,0'},{strength:.2f})"
+        return f"{cosine:+.2f}", f"background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}"
 
-def _cosine_cell(cosine: float) -> tuple[str, str]:
-    """A cosine and its style: blue if it is positive, vermillion if negative, the deeper the larger."""
-    if not math.isfinite(cosine):
-        return "–", ""
-    strength = min(abs(cosine), 1.0) ** 2
-    colour = f"rgba({'0,114,178' if cosine > 0 else '213,94,0'},{strength:.2f})"
-    return f"{cosine:+.2f}", f"background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}"
+    return [spaced_name(name) for name in names], [[cell(cosines[i][k]) for k in place] for i in place]
 
 
 def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
@@ -403,9 +402,15 @@ class Page:
         if self.shown is None and background.prediction is not None:
             self._show_first_prediction(background.prediction)
         if self.last is None and background.fitted is not None:
-            self._show_first_fit(background.fitted)
+            self.fits = [background.fitted]
+            if self.choice is background.initial:
+                self.choice = background.fitted.choice
+                self.panel.show(self.choice, background.fitted)
+            self._update_text()
         if self._refit_requested and background.fitted is not None:
-            self._begin_job(background.fitted)
+            self._refit_requested, self._step = False, None
+            work = partial(fit_choice, self.campaign, (self.last or background.fitted).fit, self.choice)
+            self._job = Job(work, self._on_step, self._fit_ended, self.document.add_next_tick_callback)
         elif self._refit_requested and not background.running and background.fitted is None:
             self._end_job(background.failure)
         self._update_status()
@@ -420,20 +425,6 @@ class Page:
         if self.choice is not self.background.initial and not as_fitted:
             self._sizes_changed = True
             self._soon(self._redraw, REDRAW_MS)
-
-    def _show_first_fit(self, fitted: Fitted) -> None:
-        self.fits = [fitted]
-        if self.choice is self.background.initial:
-            self.choice = fitted.choice
-            self.panel.show(self.choice, fitted)
-        self._update_text()
-
-    def _begin_job(self, first: Fitted) -> None:
-        self._refit_requested = False
-        before = (self.last or first).fit
-        self._step = None
-        work, soon = partial(fit_choice, self.campaign, before, self.choice), self.document.add_next_tick_callback
-        self._job = Job(work, self._on_step, self._fit_ended, soon)
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread. A page that cannot keep up draws only the newest step."""
@@ -519,7 +510,7 @@ class Page:
         set_text(self.tied, tied_panel(self.campaign, self.diagnosis, self.last))
         set_text(self.next, next_panel(self.campaign, self.diagnosis))
         lines = self._commands()
-        same = "<small>The same from the command line:</small>" + command_block(lines)
+        same = "<small>The same from the command line:</small>" + panel("commands", lines=lines)
         set_text(self.command_text, same if lines else "")
 
     def _update_status(self) -> None:
@@ -531,7 +522,7 @@ class Page:
             other = background.step if self._refit_requested else None
             text = progress_bar(*self._progress.state(time.monotonic(), task, other))
         elif failure := self._message or background.failure:
-            text = f'<span class="bad">{escaped(failure)}</span>'
+            text = f'<span class="bad">{escape(failure)}</span>'
         elif background.running:
             fitting = "fitting the model in use, in the background"
             text = f"<small>{'preparing the model' if background.prediction is None else fitting} …</small>"
@@ -568,7 +559,7 @@ class Page:
             path = save_model(folder, effects, self.campaign.own_files(effects))
         except (ExperimentError, TableError, OSError) as error:
             lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
-            self.saved.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
+            self.saved.text = f'<p class="bad">{escape("; ".join(lines))}</p>'
             return
         rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
         given = {"model": model_text(effects), "same": self._commands(save=True), "rerun": rerun}
@@ -592,12 +583,9 @@ def start_server(background: BackgroundFit, port: int | None = None) -> Server:
     """Return a server that is bound to the loopback address and refuses requests from other pages."""
     shown = [background]
 
-    def open_page(document: Document) -> None:
-        Page(shown[-1], document, shown.append)
-
     def serve(number: int) -> Server:
         return Server(
-            {"/": Application(FunctionHandler(open_page, trap_exceptions=False))},
+            {"/": Application(FunctionHandler(lambda document: Page(shown[-1], document, shown.append)))},
             prefix=secret_path(),
             address=LOOPBACK,
             port=number,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -53,23 +53,19 @@ from vinetrack.video.frames import RecordingError, inspect_recording, iterate_fr
 TEMPLATES = Path(__file__).with_name("templates")
 SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
 
-_AXIS = {
-    "axis_label_text_font": SANS,
-    "axis_label_text_font_size": "13px",
-    "axis_label_text_font_style": "normal",
-    "axis_label_text_color": INK,
-    "axis_line_color": INK,
-    "major_label_text_font": SANS,
-    "major_label_text_font_size": "12px",
-    "major_label_text_color": INK,
-    "major_tick_line_color": INK,
-    "minor_tick_line_color": None,
-    "axis_label_standoff": 6,
-}
 THEME: dict[str, Any] = {
     "attrs": {
         "Plot": {"background_fill_color": None, "border_fill_color": None, "outline_line_color": None},
-        "Axis": _AXIS,
+        "Axis": {
+            **dict.fromkeys(("axis_label_text_font", "major_label_text_font"), SANS),
+            **dict.fromkeys(("axis_label_text_color", "major_label_text_color"), INK),
+            **dict.fromkeys(("axis_line_color", "major_tick_line_color"), INK),
+            "axis_label_text_font_size": "13px",
+            "axis_label_text_font_style": "normal",
+            "major_label_text_font_size": "12px",
+            "minor_tick_line_color": None,
+            "axis_label_standoff": 6,
+        },
         "Grid": {"grid_line_color": GRID, "grid_line_width": 0.8},
     }
 }
@@ -135,11 +131,6 @@ def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
     return fig
 
 
-def escaped(text: object) -> str:
-    """Return text escaped for HTML."""
-    return html.escape(str(text))
-
-
 @cache
 def templates() -> Environment:
     """The templates of the page."""
@@ -154,12 +145,7 @@ def panel(name: str, **given: Any) -> str:
 def progress_bar(share: float, text: str) -> str:
     """Return a bar filled to a fraction, with text below it."""
     percent = 100 * min(max(share, 0.02), 1.0)
-    return f'<div class="bar"><i style="width:{percent:.0f}%"></i></div><small>{escaped(text)}</small>'
-
-
-def command_block(lines: Sequence[str]) -> str:
-    """Return commands to copy, as HTML."""
-    return panel("commands", lines=lines)
+    return f'<div class="bar"><i style="width:{percent:.0f}%"></i></div><small>{escape(text)}</small>'
 
 
 # ------------------------------------------------------------------------------
@@ -690,7 +676,7 @@ class FilmPanel:
         ]
         if view is not None and frame < view.by_hand.size and view.by_hand[frame]:
             positions_text.append("corrected by hand")
-        notice = f"<p>{escaped(self._no_view)}</p>" if self._no_view else ""
+        notice = f"<p>{escape(self._no_view)}</p>" if self._no_view else ""
         when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
         self.caption.text = f"{notice}<p>{when} · {' · '.join(positions_text)}</p>"
         self._instant(aligned.name, since_s)
@@ -700,13 +686,13 @@ class FilmPanel:
             self._stop()
             return
         self.play.label = "❚❚ pause"
-        # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
-        self._playing = self._document.add_periodic_callback(self._next_frame, 70)
 
-    def _next_frame(self) -> None:
-        step = max(int(self.frame.end) // 150, 1)
-        following = int(self.frame.value) + step
-        self.frame.value = following if following <= self.frame.end else 0
+        def advance() -> None:
+            following = int(self.frame.value) + max(int(self.frame.end) // 150, 1)
+            self.frame.value = following if following <= self.frame.end else 0
+
+        # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
+        self._playing = self._document.add_periodic_callback(advance, 70)
 
     def _stop(self) -> None:
         if self._playing is not None:

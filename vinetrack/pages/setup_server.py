@@ -222,11 +222,16 @@ def page_state(folder: Path) -> dict[str, Any]:
     sheet = draft.sheet
     # Columns that the page shows whether or not the sheet has them
     optional = ["payload_g", "growth_angle_deg", "chamber_l", "exposure_us", "pressure_trace"]
+    known = {}
+    for name in [name for name in COLUMNS if name not in ("trial", "video")]:
+        units = [split_unit(name)[1], *other_units(name).values()]
+        known[name] = {key: getattr(COLUMNS[name], key) for key in ("kind", "meaning", "measured", "default", "shared")}
+        known[name] |= {"quantity": quantity(name), "units": units if len(units) > 1 else []}
     return {
         "name": folder.resolve().name,
         "folder": str(folder),
         "stamp": draft.stamp,
-        "known": {name: _column_json(name) for name in COLUMNS if name not in ("trial", "video")},
+        "known": known,
         "units": {key: unit.text for key, unit in UNITS.items()},
         "offered": ["capture_fps", *REQUIRED_COLUMNS, *optional],
         "sheet": {"columns": list(sheet.columns), "rows": list(sheet.rows), "decimal": sheet.decimal},
@@ -242,12 +247,6 @@ def page_state(folder: Path) -> dict[str, Any]:
         "pictures": list_pictures(folder),
         "traces": list_tables(folder),
     }
-
-
-def _column_json(name: str) -> dict[str, Any]:
-    column, units = COLUMNS[name], [split_unit(name)[1], *other_units(name).values()]
-    told = {key: getattr(column, key) for key in ("kind", "meaning", "measured", "default", "shared")}
-    return {**told, "quantity": quantity(name), "units": units if len(units) > 1 else []}
 
 
 def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
@@ -313,15 +312,6 @@ def _problem_json(problem: Problem, columns: Sequence[str] = ()) -> dict[str, An
 log = logging.getLogger(__name__)
 
 TEMPLATES = Path(__file__).with_name("templates")
-CONTENT_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
-# Nothing is kept, and nothing is asked of another server
-HEADERS = {
-    "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    "connect-src 'self'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-}
 
 
 class SetupServer(ThreadingHTTPServer):
@@ -409,7 +399,14 @@ class _Handler(BaseHTTPRequestHandler):
             return
         url = urlsplit(self.path.removeprefix(self.server.secret))
         if url.path in ("/", "/setup.css") or url.path.endswith(".js"):
-            self._send_file("setup.html" if url.path == "/" else url.path.lstrip("/"))
+            name = "setup.html" if url.path == "/" else url.path.lstrip("/")
+            path = TEMPLATES / name
+            if "/" in name or not path.is_file():
+                self._send(HTTPStatus.NOT_FOUND)
+                return
+            frame = page_frame().encode() if path.suffix == ".css" else b""
+            kind = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}[path.suffix]
+            self._send(HTTPStatus.OK, frame + path.read_bytes(), f"{kind}; charset=utf-8")
         else:
             self._answer(f"GET {url.path}", lambda: dict(parse_qsl(url.query)))
 
@@ -459,18 +456,15 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._send(status, json.dumps(content, ensure_ascii=False).encode(), "application/json")
 
-    def _send_file(self, name: str) -> None:
-        path = TEMPLATES / name
-        if "/" in name or not path.is_file():
-            self._send(HTTPStatus.NOT_FOUND)
-            return
-        frame = page_frame().encode() if path.suffix == ".css" else b""
-        self._send(HTTPStatus.OK, frame + path.read_bytes(), f"{CONTENT_TYPES[path.suffix]}; charset=utf-8")
-
     def _send(self, status: HTTPStatus, data: bytes = b"", kind: str = "text/plain; charset=utf-8") -> None:
+        sources = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
+        headers = {"Content-Type": kind, "Content-Length": str(len(data))}
+        # Nothing is kept, and nothing is asked of another server
+        headers |= {"Cache-Control": "no-store", "Content-Security-Policy": sources}
+        headers |= {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.send_response(status)
-            for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **HEADERS}.items():
+            for name, value in headers.items():
                 self.send_header(name, value)
             self.end_headers()
             self.wfile.write(data)

@@ -85,7 +85,6 @@ DEPARTURES = (
 DEPARTURE_COLUMNS = (
     *("figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s", "slack_from_s"),
 )
-MOTION_COLUMNS = ("pressure_kPa", "departure", "time_s", "lead_position_m")
 
 
 def paper_trial(
@@ -143,25 +142,24 @@ def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
     return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
 
 
-def motion_table(instants: int = 200) -> pd.DataFrame:
-    """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`."""
+def motion_table() -> pd.DataFrame:
+    """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, 200 instants of each."""
     parts = []
     for trial in position_trials():
         for departure in (NONE, *DEPARTURES):
             moved = follow(trial, departure, published.DAMPING_B[4])
             end_s = moved.end_time_s if math.isfinite(moved.end_time_s) else LASTS_S
-            time_s = np.linspace(0, end_s, instants)
-            position_m = np.interp(time_s, moved.time_s, moved.lead_position_m)
-            columns = (trial.pressure_Pa / 1e3, departure.name, time_s, position_m)
-            parts.append(pd.DataFrame(dict(zip(MOTION_COLUMNS, columns, strict=True))))
+            time_s = np.linspace(0, end_s, 200)
+            motion = {"time_s": time_s, "lead_position_m": np.interp(time_s, moved.time_s, moved.lead_position_m)}
+            parts.append(pd.DataFrame({"pressure_kPa": trial.pressure_Pa / 1e3, "departure": departure.name, **motion}))
     return pd.concat(parts, ignore_index=True)
 
 
-def pressure_table(instants: int = 60) -> pd.DataFrame:
-    """Compute the remaining gauge pressure along the growth of Fig. 4's vine."""
+def pressure_table() -> pd.DataFrame:
+    """Compute the remaining gauge pressure along the growth of Fig. 4's vine, at 60 places."""
     parts = []
     for trial in position_trials():
-        y = np.linspace(0, trial.length_m, instants)
+        y = np.linspace(0, trial.length_m, 60)
         change = area_m2(1e3 * trial.diameter_m) * y / trial.chamber_m3
         for departure in DEPARTURES[:2]:
             columns = {"pressure_kPa": trial.pressure_Pa / 1e3, "departure": departure.name, "lead_position_m": y}
@@ -214,7 +212,11 @@ def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[fl
 
 
 def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
-    """A row of the damping fit that only the published rule uses."""
+    """A row of the damping fit that only the published rule uses, from a motion without noise."""
+    stop = int(np.searchsorted(moved.time_s, moved.end_time_s)) if math.isfinite(moved.end_time_s) else None
+    track = plain_track(moved.time_s[:stop], moved.lead_position_m[:stop])
+    fewest, cv = published.STEADY_FEWEST_POINTS, published.STEADY_CV
+    window = paper_window(track, travel_ratio=trial.travel_ratio, cv_limit=cv, min_points=fewest)
     unknown = dict.fromkeys(("x_ss_m_s", "x_ss_sigma_m_s", "force_N", "force_sigma_N"), math.nan)
     return {
         "trial": trial.name,
@@ -223,22 +225,11 @@ def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
         "thickness_um": 1e6 * trial.thickness_m,
         **unknown,
         "yield_force_sigma_N": 0.0,
-        "x_ss_paper_m_s": _published_window(moved, trial.travel_ratio),
+        "x_ss_paper_m_s": window.x_ss_m_s if window.accepted else math.nan,
         "force_paper_N": paper_force_N(trial),
         "eligible": True,
         "used": False,
     }
-
-
-def _published_window(moved: Trajectory, travel_ratio: float) -> float:
-    """Steady tail speed by the published rule in a motion without noise, m/s."""
-    stop = int(np.searchsorted(moved.time_s, moved.end_time_s)) if math.isfinite(moved.end_time_s) else None
-    time_s, position_m = moved.time_s[:stop], moved.lead_position_m[:stop]
-    track = plain_track(time_s, position_m)
-    window = paper_window(
-        track, travel_ratio=travel_ratio, cv_limit=published.STEADY_CV, min_points=published.STEADY_FEWEST_POINTS
-    )
-    return window.x_ss_m_s if window.accepted else math.nan
 
 
 # ------------------------------------------------------------------------------
@@ -395,15 +386,15 @@ def final_speed_m_s(trial: Trial, departure: Departure = NONE) -> float:
     return speed if math.isfinite(speed) else 0.0
 
 
-def speed_curves(conditions: Mapping[str, list[Trial]], instants: int = 15) -> pd.DataFrame:
-    """Compute Eq. (2) over the range of payloads of each pressure, in the columns of `final_speeds`."""
+def speed_curves(conditions: Mapping[str, list[Trial]]) -> pd.DataFrame:
+    """Compute Eq. (2) at 15 payloads over the range of each pressure, in the columns of `final_speeds`."""
     rows = []
     by_pressure: dict[float, list[Trial]] = {}
     for trials in conditions.values():
         by_pressure.setdefault(trials[0].pressure_Pa, []).append(trials[0])
     for pressure_Pa, trials in by_pressure.items():
         payloads_kg = [trial.payload_kg for trial in trials]
-        for payload_kg in np.linspace(min(payloads_kg), max(payloads_kg), instants):
+        for payload_kg in np.linspace(min(payloads_kg), max(payloads_kg), 15):
             speed = final_speed_m_s(replace(trials[0], payload_kg=float(payload_kg)))
             rows.append((trials[0].vine, pressure_Pa / 1e3, 1e3 * payload_kg, speed, math.nan))
     names = ["vine", "pressure_kPa", "payload_g", "final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s"]

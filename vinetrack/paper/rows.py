@@ -41,8 +41,6 @@ SIMULATED = "simulated from printed parameters"
 MEASURED = "measured"
 NOT_CHECKABLE = "not checkable"
 
-UNANSWERED = "the trials of this experiment do not tell"
-
 MARKS = {
     COMPUTED: f"follows by arithmetic, or by Eq. (2), from other numbers of {SOURCE}; ours is the corrected value "
     "where the two differ",
@@ -56,8 +54,6 @@ PAPER_COLUMNS = (
     *("row", "where", "quantity", "setting", "unit", "published", "as_printed"),
     *("ours", "ours_low_95", "ours_high_95", "mark", "how", "beside"),
 )
-
-PREFERRED = "both_axes"  # The fit of the damping law that supplies our numbers
 
 
 GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
@@ -109,7 +105,7 @@ def row_of(
         "ours_low_95": interval[0],
         "ours_high_95": interval[1],
         "mark": kind,
-        "how": UNANSWERED if unanswered else how.format(**facts),
+        "how": "the trials of this experiment do not tell" if unanswered else how.format(**facts),
         "beside": beside,
     }
 
@@ -148,11 +144,8 @@ def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> I
     rates = [trial.capture_fps for trial in trials if math.isfinite(trial.capture_fps)]
     yield row_of("capture_fps", _median(rates), published_as=published.CAPTURE_FPS, mark=mark)
     names = {trial.name for vines in by_scale.values() for trial in vines}
-    yield from _window_rows(steady[steady["trial"].isin(names)], mark)
-
-
-def _window_rows(windows: pd.DataFrame, mark: str) -> Iterator[Row]:
-    """What the published rule for a steady window accepts in trials without payload, and the gated rule."""
+    # What the published rule for a steady window accepts in trials without payload, and the gated rule
+    windows = steady[steady["trial"].isin(names)]
     literal, gated = windows[windows["rule"] == "paper"], windows[windows["rule"] == "gated"]
     accepted = literal[literal["accepted"]]
     fewest, largest = accepted["points"].min(), 100 * accepted["cv"].max()
@@ -215,7 +208,7 @@ def _fitted(line: Mapping[str, Any], key: str = "slope") -> dict[str, Any]:
 
 
 def _law_rows(results: ExperimentResults) -> Iterator[Row]:
-    laws = {method: results.damping.get(method) or {} for method in ("log_log", PREFERRED, "paper")}
+    laws = {method: results.damping.get(method) or {} for method in ("log_log", "both_axes", "paper")}
     for row, law in zip(("n_log_log", "n_both_axes", "n_literal"), laws.values(), strict=True):
         interval = _bounds(law.get("n_95_total"))
         yield row_of(row, or_nan(law.get("n")), interval, published_as=published.EXPONENT, mark=results.mark)
@@ -311,7 +304,7 @@ def _close(ours: float, printed: float) -> bool:
 
 
 def _wall_rows(results: ExperimentResults) -> Iterator[Row]:
-    vines = (results.damping.get(PREFERRED) or {}).get("vines") or {}
+    vines = (results.damping.get("both_axes") or {}).get("vines") or {}
     family: Mapping[str, Any] = {}
     for candidate in results.scaling.get("thickness") or ():
         diameters_mm = [vines.get(vine, {}).get("diameter_mm", nan) for vine in candidate["vines"]]
@@ -365,12 +358,6 @@ def p_value(R2: float, n: int) -> float:
     return 2 * float(student.sf(math.sqrt(R2 * dof / (1 - R2)), dof))
 
 
-def printed_steady_speed_m_s(scale: int, gauge_Pa: float, yield_Pa: float) -> float:
-    """Return the steady tail speed by Eq. (3) with the printed B and n."""
-    force_N = (gauge_Pa - yield_Pa) * area_m2(published.DIAMETER_MM[scale])
-    return (force_N / published.DAMPING_B[scale]) ** (1 / published.EXPONENT)
-
-
 def weight_over_gas(diameter_mm: float) -> float:
     """Return the work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y."""
     gas_Pa_m2 = 1e3 * published.EFFICIENCY_KPA * area_m2(diameter_mm)
@@ -392,8 +379,10 @@ def computed_rows() -> Iterator[Row]:
     yield row_of("B_line_R2", line["R2"])
     yield row_of("B_line_intercept", line["intercept"], line["intercept_95"])
     gauge_Pa, yield_Pa = 1e3 * published.STEADY_SPEED_KPA, 1e3 * published.YIELD_PRESSURE_KPA
-    for R in published.DAMPING_B:
-        bare, with_yield = (printed_steady_speed_m_s(R, gauge_Pa, least_Pa) for least_Pa in (0.0, yield_Pa))
+    for R, printed in published.DAMPING_B.items():
+        # By Eq. (3)
+        forces_N = [(gauge_Pa - least_Pa) * area_m2(diameters_mm[R]) for least_Pa in (0.0, yield_Pa)]
+        bare, with_yield = ((force_N / printed) ** (1 / published.EXPONENT) for force_N in forces_N)
         yield row_of("steady_speed_of_printed_B_R{R}", bare, R=R, with_yield=with_yield)
     for diameter_mm in (12.0, 18.0):  # of Fig. 9
         yield row_of("weight_share_{mm:g}mm", 100 * weight_over_gas(diameter_mm), mm=diameter_mm)
@@ -404,7 +393,12 @@ def computed_rows() -> Iterator[Row]:
     fast = published.FAST_VINE
     stress_Pa = hoop_stress_Pa(1e3 * fast["pressure_kPa"], fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
     yield row_of("fast_vine_hoop_stress", stress_Pa / 1e6, burst_MPa=BURST_STRESS_PA / 1e6)
-    yield _rounding_row()
+    # The printed pressures look like rounded pounds per square inch: 14 kPa is 2 psi, 13.79 kPa.
+    pressures_kPa, psi_kPa = (7, 14, 28, 34, 41, 48, 62), convert(1.0, "psi", "kPa")
+    exact = [round(kPa / psi_kPa) * psi_kPa for kPa in pressures_kPa]
+    errors = [abs(kPa / true - 1) for kPa, true in zip(pressures_kPa, exact, strict=True)]
+    worst = int(np.argmax(errors))
+    yield row_of("pressure_rounding", 100 * errors[worst], kPa=pressures_kPa[worst], exact=exact[worst])
 
 
 def _reservoir_rows() -> Iterator[Row]:
@@ -426,15 +420,6 @@ def _injector_rows() -> Iterator[Row]:
     slow, fast = (100 * (1 - gauge_left(1e3 * vine["pressure_kPa"], change, gamma)) for gamma in GAMMAS.values())
     yield row_of("injector_volume_change", 100 * change, published_as=printed)
     yield row_of("injector_gauge_drop", slow, published_as=printed, fast=fast)
-
-
-def _rounding_row() -> Row:
-    # The printed pressures look like rounded pounds per square inch: 14 kPa is 2 psi, 13.79 kPa.
-    pressures_kPa, psi_kPa = (7, 14, 28, 34, 41, 48, 62), convert(1.0, "psi", "kPa")
-    exact = [round(kPa / psi_kPa) * psi_kPa for kPa in pressures_kPa]
-    errors = [abs(kPa / true - 1) for kPa, true in zip(pressures_kPa, exact, strict=True)]
-    worst = int(np.argmax(errors))
-    return row_of("pressure_rounding", 100 * errors[worst], kPa=pressures_kPa[worst], exact=exact[worst])
 
 
 # ------------------------------------------------------------------------------

@@ -49,18 +49,18 @@ log = logging.getLogger(__name__)
 def fit_and_diagnose(job: Job) -> list[str]:
     """Fit the model in use, compare and audit it, and diagnose what it lacks."""
     job.say("fitting the model")
-    _, fitted = fit_model(job)
-    diagnose_results(job, fitted)
+    diagnose_results(job, fit_model(job))
     return [*comparison_lines(job.results), *diagnosis_lines(job.results)]
 
 
-def fit_model(job: Job) -> tuple[dict[str, Any], Fit | None]:
-    """Fit the model in use to all trials. Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv` and
-    `audit.csv`. Returns `fit.json` as written, whose `refused` is None or the reason; and the fit for a diagnosis.
+def fit_model(job: Job) -> Fit | None:
+    """Fit the model in use to all trials. Writes `fit.json`, whose `refused` is None or the reason, `comparison.csv`,
+    `comparison/`, `model_check.csv` and `audit.csv`. Returns the fit for a diagnosis.
     """
     from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS, compare
     from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
-    from vinetrack.inference.fit_result import CHECK_COLUMNS
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.inference.fit_result import CHECK_COLUMNS, check_damping
     from vinetrack.inference.fit_summary import FitSummary, summary_of
 
     experiment, results = job.experiment, Results(job.results)
@@ -70,9 +70,13 @@ def fit_model(job: Job) -> tuple[dict[str, Any], Fit | None]:
     try:
         initial, fit = _fits(experiment, pairs)
         comparison = compare(fit, pairs, kinematics=kinematics, final_at_fraction=job.settings.final_at_fraction)
-        check, messages = _damping_check(fit, damping)
+        check, messages = empty_table(CHECK_COLUMNS), list[str]()
+        try:
+            check = check_damping(fit, damping["log_log" if damping["both_axes"].get("refused") else "both_axes"])
+        except FitError as error:
+            messages.append(str(error))
         audited = _audit(fit, comparison, pairs, kinematics)
-        content = summary_of(fit, audited.warnings, messages).to_json()
+        content = summary_of(fit, audited.warnings, tuple(messages)).to_json()
         trajectories, tables = comparison.trajectories, [comparison.table, check, audited.table]
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
@@ -84,7 +88,7 @@ def fit_model(job: Job) -> tuple[dict[str, Any], Fit | None]:
         write_csv(results.trajectories(condition), table)
     write_json(results.fit, content)
     log.info("%s", content["refused"] or f"fitted {len(content['trials'])} trials")
-    return content, initial
+    return initial
 
 
 def _emptied(folder: Path) -> Path:
@@ -112,18 +116,6 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     own = with_host(initial, initial.predictor.host)  # a predictor of its own: what uses one adapts its steps
     fit = assemble(own.predictor, own.solution, own.left_out, own.options, profile=True)
     return initial, replace(fit, pairs=initial.pairs)
-
-
-def _damping_check(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Return the table `model_check.csv`, and the reason if it is empty."""
-    from vinetrack.inference.fit_data import FitError
-    from vinetrack.inference.fit_result import CHECK_COLUMNS, check_damping
-
-    method = "log_log" if damping["both_axes"].get("refused") else "both_axes"
-    try:
-        return check_damping(fit, damping[method]), ()
-    except FitError as error:
-        return empty_table(CHECK_COLUMNS), (str(error),)
 
 
 def _audit(
@@ -324,20 +316,12 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     from vinetrack.diagnosis.ladder import in_sample
 
     final = {} if after is before else {one.name: one.predicted_position_m for one in in_sample(after).trials}
-    return [
-        (
-            one,
-            pd.DataFrame(
-                {
-                    "time_s": one.time_s,
-                    "lead_position_m": one.lead_position_m,
-                    "model_before_m": one.predicted_position_m,
-                    "model_after_m": final.get(one.name, np.nan),
-                }
-            ),
-        )
-        for one in in_sample(before).trials
-    ]
+    found = []
+    for one in in_sample(before).trials:
+        measured = {"time_s": one.time_s, "lead_position_m": one.lead_position_m}
+        models = {"model_before_m": one.predicted_position_m, "model_after_m": final.get(one.name, np.nan)}
+        found.append((one, pd.DataFrame(measured | models)))
+    return found
 
 
 def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> list[str]:

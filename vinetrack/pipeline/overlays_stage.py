@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import INTERNAL_ERROR, UserError
-from vinetrack.core.records import UNUSABLE_FLAGS, PictureAxis, Trial, hand_corrected, with_flag
+from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, hand_corrected, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
@@ -37,11 +37,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
-
-
 MARGIN_FRAMES = 8  # Frames before and after the motion that a clip shows (chosen)
-
 FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a prediction into the picture (derived)
 
 
@@ -60,7 +56,6 @@ def draw_overlays(job: Job) -> list[str]:
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
     """Write the clip of one trial of a results folder with the settings of its run; return its path."""
     from vinetrack.experiment.folder import read_experiment
-    from vinetrack.experiment.settings import OverlaySettings
 
     results = Results(folder)
     provenance = read_json(results.provenance)
@@ -198,7 +193,8 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
     from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
 
     edge_px = track["edge_px"].to_numpy(dtype=float)
-    edges, release_s = [Edge("tracked edge", TRACKED, edge_px)], _first_moving_s(track)
+    edges, first_moving = [Edge("tracked edge", TRACKED, edge_px)], frames_to_show(track).start + MARGIN_FRAMES
+    release_s = float(track["time_s"].iloc[min(first_moving, len(track) - 1)])
     path = results.predictions(trial)
     if path.exists():
         predicted, to_px = read_result(path), position_to_px(track)
@@ -232,10 +228,6 @@ def position_to_px(track: pd.DataFrame) -> Any:
         raise ResultsError("too few of its positions are known in pixels and in metres")
     middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
     return np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
-
-
-def _first_moving_s(track: pd.DataFrame) -> float:
-    return float(track["time_s"].iloc[min(frames_to_show(track).start + MARGIN_FRAMES, len(track) - 1)])
 
 
 # ------------------------------------------------------------------------------
@@ -409,11 +401,8 @@ def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
         "y_px": edge_xy_px[:, 1],
     }
     if scaled:
-        columns |= {
-            "position_m": track.lead_position_m,
-            "sigma_m": track.lead_position_sigma_m,
-            "systematic_m": systematic_m,
-        }
+        columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m}
+        columns |= {"systematic_m": systematic_m}
     return pd.DataFrame(columns | {"flag": track.flag})
 
 

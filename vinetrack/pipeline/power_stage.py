@@ -130,14 +130,6 @@ def campaign_of_target(request: PowerRequest) -> PowerCampaign:
     return _measured_campaign(request, model, pairs, settings.candidates, settings.limits)
 
 
-def campaign_in_memory(request: PowerRequest, given: Fit | Pairs) -> PowerCampaign:
-    """Return the campaign of a fit, or of trials in memory with the base model."""
-    if isinstance(given, Fit):
-        tests, not_testable = fitted_tests(given)
-        return PowerCampaign(power_of(tests, not_testable, nonlinear=True), design_of_fit(given))
-    return _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
-
-
 def _measured_campaign(
     request: PowerRequest, model: Model, pairs: Pairs, candidates: Sequence[str] | None, limits: Limits
 ) -> PowerCampaign:
@@ -149,15 +141,8 @@ def _measured_campaign(
     )
     noise_stated, spreads_stated = (row.origin == "stated" for row in inputs[:2])
     if noise_stated or spreads_stated:
-        fitted = fit(
-            model,
-            pairs,
-            spreads=spreads if spreads_stated else None,
-            noise=noise if noise_stated else None,
-            host=host,
-            profile=False,
-            thorough=False,
-        )
+        of_trials, of_points = spreads if spreads_stated else None, noise if noise_stated else None
+        fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False, thorough=False)
     tests, not_testable = fitted_tests(fitted, candidates)
     power = power_of(tests, not_testable, inputs if noise_stated or spreads_stated else (), nonlinear=True)
     return PowerCampaign(power, design_of_fit(fitted, candidates), limits)
@@ -169,10 +154,8 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     settings = planned.settings
     stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=effects_of_plan(planned))
     first_of_vine = {trial.vine: trial for trial in reversed(planned.trials)}
-    by_vine = {
-        vine: predictive_inputs(first_of_vine[vine], stated)
-        for vine in dict.fromkeys(trial.vine for trial in planned.trials)
-    }
+    vines = dict.fromkeys(trial.vine for trial in planned.trials)
+    by_vine = {vine: predictive_inputs(first_of_vine[vine], stated) for vine in vines}
     first = next(iter(by_vine.values()))
     noise, spreads, inputs = request.assumptions(
         (default_noise_m, 0.0), first.spreads, ("guess", "guess: a usual batch of vines")
@@ -216,14 +199,27 @@ def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[
 
 @in_one_blas_thread
 def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
-    """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns."""
+    """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns; of
+    those in memory, of a fit or with the base model, where they are given.
+    """
     with waiting("calculating the power of the trials"):
-        campaign = campaign_of_target(request) if given is None else campaign_in_memory(request, given)
+        if given is None:
+            campaign = campaign_of_target(request)
+        elif isinstance(given, Fit):
+            tests, not_testable = fitted_tests(given)
+            campaign = PowerCampaign(power_of(tests, not_testable, nonlinear=True), design_of_fit(given))
+        else:
+            campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
     names = [text.partition("=")[0] for text in request.effects]
     power = campaign.power
     for name in names:
         if name not in power.not_testable and name not in {entry.effect for entry in power.effects}:
-            _refuse_effect(name, power)
+            candidates = [*(entry.effect for entry in power.effects), *power.not_testable]
+            close = difflib.get_close_matches(name, candidates, 1, 0.6)
+            remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(sorted(candidates))}"
+            in_model = name in power.model
+            message = "is in the model already" if in_model else "is not a candidate for these trials"
+            raise _refusal(message, name, remedy)
     if request.simulate:
         power = replace(power, simulated=tuple(_simulated_rates(request, campaign)))
     if request.recommend:
@@ -262,15 +258,6 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
     ]
 
 
-def _refuse_effect(name: str, power: Power) -> None:
-    """Raise an ExperimentError: the effect is in the model already, or is not a candidate."""
-    candidates = [*(entry.effect for entry in power.effects), *power.not_testable]
-    close = difflib.get_close_matches(name, candidates, 1, 0.6)
-    remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(sorted(candidates))}"
-    in_model = name in power.model
-    raise _refusal("is in the model already" if in_model else "is not a candidate for these trials", name, remedy)
-
-
 def _size_of(text: str, entry: EffectPower) -> float:
     """Read the size in `name=size`; return it in SI."""
     unit, factor = display_unit(entry.unit)
@@ -289,11 +276,8 @@ def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator
         if name not in power.not_testable:
             entry = power[name]
             sizes = [_size_of(text, entry)] if size else [entry.size_at(0.5), entry.size_at(0.9)]
-            wanted += [
-                (name, (value, *entry.other_values), entry.probability_at(value))
-                for value in sizes
-                if math.isfinite(value)
-            ]
+            known = filter(math.isfinite, sizes)
+            wanted += [(name, (value, *entry.other_values), entry.probability_at(value)) for value in known]
     seeds = range(request.first_seed, request.first_seed + request.simulate)
     bar: Progress[None]
     with progress(len(wanted) * len(seeds), "simulating", unit="campaign") as bar:

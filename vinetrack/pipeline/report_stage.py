@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from vinetrack.experiment.settings import FigureSettings
     from vinetrack.figures.diagnosis_figures import DiagnosisTables
     from vinetrack.pipeline.stages import Job
-    from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
-    from vinetrack.report.section import DiagnosisResult
+    from vinetrack.report.build import Clip, DiagnosisResult, ReportContent, ReportFigure, ReportSection
 
 
 # ------------------------------------------------------------------------------
@@ -65,7 +64,7 @@ def compare_with_paper(job: Job) -> list[str]:
     """Write `paper.csv`, and the tables and figures of the comparison."""
     from vinetrack.figures.style import blank
     from vinetrack.paper import rows as paper
-    from vinetrack.report.section import tally
+    from vinetrack.report.build import tally
 
     experiment, results = job.experiment, Results(job.results)
     kind = experiment.settings.published
@@ -148,8 +147,7 @@ def write_report(job: Job) -> list[str]:
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
     """Collect the content of the report from a results folder."""
-    from vinetrack.report.build import ModelResult, ReportContent, TrackedRecording
-    from vinetrack.report.section import paper_section
+    from vinetrack.report.build import ModelResult, ReportContent, TrackedRecording, paper_section
 
     results, tables = Results(folder), FigureTables(folder, experiment.trials)
     trials, diagnosis = read_result(results.trials), read_diagnosis(results)
@@ -193,7 +191,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
 def _diagnosis_section(results: Results, diagnosis: Diagnosis, experiment: Experiment) -> DiagnosisResult:
     """Return the content of the report's section on the diagnosis."""
     from vinetrack.effects import EffectError, catalogue, own_effects
-    from vinetrack.report.section import DiagnosisResult
+    from vinetrack.report.build import DiagnosisResult
 
     known = dict(catalogue())
     with contextlib.suppress(EffectError):  # the file of an effect may no longer exist

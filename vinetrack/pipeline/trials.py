@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from functools import lru_cache, partial
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,7 +28,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR
-from vinetrack.core.records import Track, Trial, Window
+from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_bytes, write_csv, write_json
 from vinetrack.figures.registry import describe_trial
 from vinetrack.results.folder_layout import (
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
 # month is dropped.
 
 PACKAGE = Path(__file__).parents[1]
-TRACKER_LIBRARIES = ("numpy", "scipy", "numba", "av", "opencv-python-headless", "scikit-image")
 SCALARS = (
     "blur_px", "exposure_frames", "tube_width_px", "tube_width_sigma_px", "seen_exposure_frames", "fast_px_per_frame",
 )  # fmt: skip
@@ -100,7 +100,7 @@ class Kept:
         """The tracking in pixels of a recording (the first input is its path), kept or made."""
         film, *others = inputs
         assert isinstance(film, Path)
-        libraries = [version(name) for name in TRACKER_LIBRARIES]
+        libraries = list(map(version, ("numpy", "scipy", "numba", "av", "opencv-python-headless", "scikit-image")))
         code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
         self.tracked = _key(code, libraries, film.resolve(), identity(film), others)
         path = self.folder / f"{self.tracked}.npz"
@@ -236,6 +236,7 @@ def _end_with_parent() -> None:
 # ------------------------------------------------------------------------------
 # One trial: its track, kinematics, contribution to the tables, and pictures.
 
+
 TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
 
 
@@ -247,7 +248,11 @@ def analyse_trials(job: Job) -> list[str]:
     names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
     model_of(experiment)
     if job.threads > 1:
-        _import_for_workers(experiment)
+        # What every worker needs is imported once, before they are forked.
+        rooms = ["figures.motion_figures", "kinematics.summary"]
+        rooms += ["figures.overlay", "video.survey"] if any(trial.video for trial in experiment.trials) else []
+        for room in rooms:
+            import_module(f"vinetrack.{room}")
     work = partial(_analyse, experiment=experiment, results=Results(job.results), settings=job.settings)
     failed = {}
     for count, (name, reason, fault) in enumerate(map_unordered(work, names, job.threads), 1):
@@ -259,16 +264,6 @@ def analyse_trials(job: Job) -> list[str]:
         job.say(f"{count} of {len(names)} trials")
     Kept(job.results).forget()
     return [f"  {name}: {failed[name]}" for name in names if name in failed][:10]
-
-
-def _import_for_workers(experiment: Experiment) -> None:
-    """Import what every worker needs once, before they are forked."""
-    import vinetrack.figures.motion_figures
-    import vinetrack.kinematics.summary
-
-    if any(trial.video is not None for trial in experiment.trials):
-        import vinetrack.figures.overlay
-        import vinetrack.video.survey  # noqa: F401
 
 
 def _analyse(name: str, experiment: Experiment, results: Results, settings: RunSettings) -> tuple[str, str, str]:
@@ -367,37 +362,30 @@ def _write(results: Results, name: str, summary: TrialResult | None, row: dict[s
     content: dict[str, Any] = {"row": row, "windows": (), "point": None}
     track, kinematics = empty_table(TRACK_COLUMNS), empty_table(KINEMATICS_COLUMNS)
     if summary is not None:
-        track = _track_table(summary.track)
+        measured = summary.track
+        columns = (
+            np.arange(len(measured.time_s)),
+            measured.time_s,
+            measured.edge_px,
+            measured.lead_position_m,
+            measured.lead_position_sigma_m,
+            measured.flag,
+            measured.edge_px if measured.tracked_px is None else measured.tracked_px,
+            np.nan if measured.lead_position_systematic_m is None else measured.lead_position_systematic_m,
+        )
+        track = pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
         kinematics = pd.DataFrame({column: getattr(summary.kinematics, column) for column in KINEMATICS_COLUMNS})
         point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
-        windows = [_window_row(name, window) for window in summary.windows.values()]
+        windows = []
+        for window in summary.windows.values():
+            low, high = window.drift_95
+            row_of = {column: getattr(window, column, None) for column in STEADY_COLUMNS}
+            row_of |= {"trial": name, "points": window.n_points, "drift_95_low": low, "drift_95_high": high}
+            windows.append(row_of)
         content |= {"windows": windows, "point": point}
     write_csv(results.track(name), track)
     write_csv(results.kinematics(name), kinematics)
     write_json(results.analysed(name), content | view)
-
-
-def _track_table(track: Track) -> pd.DataFrame:
-    """Return a track as the table `tracks/<trial>.csv`: one row per frame, `frame` counted from 0."""
-    import pandas as pd
-
-    columns = (
-        np.arange(len(track.time_s)),
-        track.time_s,
-        track.edge_px,
-        track.lead_position_m,
-        track.lead_position_sigma_m,
-        track.flag,
-        track.edge_px if track.tracked_px is None else track.tracked_px,
-        np.nan if track.lead_position_systematic_m is None else track.lead_position_systematic_m,
-    )
-    return pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
-
-
-def _window_row(trial: str, window: Window) -> dict[str, Any]:
-    low, high = window.drift_95
-    row = {column: getattr(window, column, None) for column in STEADY_COLUMNS}
-    return row | {"trial": trial, "points": window.n_points, "drift_95_low": low, "drift_95_high": high}
 
 
 def _draw_trial(name: str, trial: Trial | None, results: Results, settings: FigureSettings, kept: Kept) -> None:

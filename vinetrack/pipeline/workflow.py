@@ -56,16 +56,12 @@ def find_experiment(folder: Path) -> Path:
     close = difflib.get_close_matches(missing, folders, 1, 0.5)
     experiments = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
     if close:
-        remedy = f"did you mean {_shown(parent / close[0])}?"
+        remedy = f"did you mean {os.path.relpath(parent / close[0])}?"
     elif experiments:
-        remedy = f"existing experiments are {', '.join(_shown(parent / name) for name in experiments)}"
+        remedy = f"existing experiments are {', '.join(os.path.relpath(parent / name) for name in experiments)}"
     else:
-        remedy = f"the nearest existing folder is {_shown(parent)}"
+        remedy = f"the nearest existing folder is {os.path.relpath(parent)}"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
-
-
-def _shown(path: Path) -> str:
-    return os.path.relpath(path)
 
 
 def command_for_results(experiment: Path, results: Path) -> str:
@@ -75,7 +71,7 @@ def command_for_results(experiment: Path, results: Path) -> str:
         return shlex.join(["snakemake", "--config", f"experiment={experiment}", f"results={results}"])
     command = ["vinetrack", "run", str(experiment)]
     usual = where.parent == Path("results").absolute()
-    return shlex.join(command if usual else [*command, "--results", _shown(where.parent)])
+    return shlex.join(command if usual else [*command, "--results", os.path.relpath(where.parent)])
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
@@ -174,25 +170,15 @@ def begin_run(results: Path, experiment: Path) -> FileLock:
 # ------------------------------------------------------------------------------
 # What the Snakefile asks: the plan of a run with its inputs and outputs.
 
-
 # Additional tables of an experiment that is compared with published numbers
 PAPER_TABLES = (
-    "paper",
-    "paper_departures",
-    "paper_motions",
-    "paper_means",
-    "paper_positions",
-    "paper_pressures",
-    "paper_speeds",
+    "paper", "paper_departures", "paper_motions", "paper_means", "paper_positions", "paper_pressures", "paper_speeds",
     "paper_speed_curves",
-)
+)  # fmt: skip
 
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 
 TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings of a job take a minute or a few)
-
-# The rules: `vinetrack run` runs this file from anywhere, and the Snakefile of a checkout includes it
-SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
 
 
 @dataclass(frozen=True)
@@ -430,7 +416,6 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
 
 
 RUN = "VINETRACK_RUN"  # Variable that asks stages to say in a line what they have done
-_PROGRESS = re.compile(r"(\d+) of (\d+) \w+")  # What a stage says while it works
 
 
 class RunError(UserError):
@@ -479,8 +464,9 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     config_file = log.with_name("run.json")
     write_text(config_file, json.dumps({"experiment": str(paths.experiment), "results": str(paths.results)}))
     command = [
-        sys.executable, "-m", "snakemake", "--snakefile", str(SNAKEFILE), "--directory", str(paths.results),
-        "--cores", str(cores), "--rerun-incomplete", "--nolock", "--quiet", "all", "--configfile", str(config_file),
+        sys.executable, "-m", "snakemake", "--snakefile", str(PACKAGE / "pipeline" / "Snakefile"),
+        "--directory", str(paths.results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--quiet", "all",
+        "--configfile", str(config_file),
     ]  # fmt: skip
     bar: Progress[None]
     # Its standard output is what the stages say, since Snakemake itself is quiet; in a process of its own it stops its
@@ -495,7 +481,7 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
         assert process.stdout is not None
         finished = {stage.done for stage in STAGES.values()}
         for line in map(str.rstrip, process.stdout):
-            if match := _PROGRESS.fullmatch(line):
+            if match := re.fullmatch(r"(\d+) of (\d+) \w+", line):  # what a stage says while it works
                 bar.reach(int(match[1]), int(match[2]))
             elif line in finished:
                 say(line)

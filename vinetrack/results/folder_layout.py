@@ -54,7 +54,7 @@ TEXT_COLUMNS = frozenset({
     "quantity", "setting", "as_printed", "mark", "how", "beside", "figure", "departure", "method",
 })  # fmt: skip
 COUNT_COLUMNS = frozenset({"n_frames", "points"})
-TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative"})
+TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative", "partial"})
 
 
 class ResultsError(UserError):
@@ -227,7 +227,13 @@ def measured_trials(
         table = read_result(results.track(trial.name))
         if len(table) and trial.name not in failed:
             pairs.append((trial, read_stored_track(trial, table)))
-            kinematics[trial.name] = _kinematics(read_result(results.kinematics(trial.name)), trial.travel_ratio)
+            motion = read_result(results.kinematics(trial.name))
+            columns: dict[str, Any] = {
+                name: motion[name].to_numpy(dtype=float) for name in KINEMATICS_COLUMNS if name != "tail_velocity_m_s"
+            }
+            # Smoothing windows and noise are not stored.
+            columns |= {"window_points": np.zeros(len(motion), dtype=int), "noise_m": np.nan}
+            kinematics[trial.name] = Kinematics(**columns, noise_correlation=np.nan, travel_ratio=trial.travel_ratio)
     return pairs, kinematics
 
 
@@ -251,16 +257,3 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     if source_track is None or source_track.pressure_Pa is None:
         return track
     return replace(track, pressure_Pa=np.interp(track.time_s, source_track.time_s, source_track.pressure_Pa))
-
-
-def _kinematics(table: pd.DataFrame, travel_ratio: float) -> Kinematics:
-    """Make kinematics of `kinematics/<trial>.csv`, which does not store smoothing windows and noise."""
-    names = ("time_s", "lead_position_m", "lead_velocity_m_s", "lead_velocity_sigma_m_s", "lead_acceleration_m_s2")
-    columns = {name: table[name].to_numpy(dtype=float) for name in names}
-    return Kinematics(
-        **columns,
-        window_points=np.zeros(len(table), dtype=int),
-        noise_m=np.nan,
-        noise_correlation=np.nan,
-        travel_ratio=travel_ratio,
-    )
