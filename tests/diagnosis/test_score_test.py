@@ -52,7 +52,9 @@ def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float =
     informations = np.einsum("nkj,nkl->njl", root, root)
     noise = scatter * np.einsum("nkj,nk->nj", root, draw.standard_normal((trials, 3 * shapes)))
     single = noise + informations @ np.broadcast_to(sizes, (shapes,))
-    return Scores(single.sum(axis=0), informations.sum(axis=0), single, informations, float(trials - 1))
+    return Scores(
+        single.sum(axis=0), informations.sum(axis=0), single, informations, 1, [str(i) for i in range(trials)]
+    )
 
 
 def questioned(
@@ -179,7 +181,7 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
     for _ in range(300):
         one = scores(draw, 12, 1, sizes=true * unit)
         of_trials = (one.trial_scores * unit, one.trial_informations * unit**2)
-        of = Scores(one.score * unit, one.information * unit**2, *of_trials, 11.0)
+        of = Scores(one.score * unit, one.information * unit**2, *of_trials, 1, [str(i) for i in range(12)])
         asked = MisfitTests(fit, (friction,), answers, fit, of, QUIET, FALSE_ALARM_LEVEL_FIRST_ROUND)
         limits, testable = asked.upper_limits(friction)
         assert testable
