@@ -46,7 +46,7 @@ FLOORS = (
 BUDGETS = {
     "cli": (634, 4, 5),
     "core": (1467, 9, 57),
-    "diagnosis": (11602, 23, 137),
+    "diagnosis": (11607, 23, 137),
     "dynamics": (2501, 8, 28),
     "effects": (2580, 43, 143),
     "experiment": (1948, 7, 17),

@@ -173,6 +173,19 @@ def test_a_misfit_no_larger_than_the_slow_errors_of_tracks_is_not_far_off(
     assert misfit_tests.exceeds_slow_errors(fit) == exceeds
 
 
+def test_scores_that_a_specimen_shares_count_once() -> None:
+    """Ten specimens of four trials each, whose scores are the same, tell as much as ten trials."""
+    draw = np.random.default_rng(8)
+    groups = [f"tube {k // 4}" for k in range(40)]
+    shared = np.repeat(draw.standard_normal((10, 300)), 4, axis=0)
+    of = Scores(shared.sum(axis=0), 40 * np.eye(300), shared, np.tile(np.eye(300), (40, 1, 1)), 1, groups)
+    assert of.degrees == 9
+    # The sum of ten independent fours has the standard deviation 4 √10.
+    assert np.mean(of.robust_sigma * 40) == pytest.approx(4 * math.sqrt(10), rel=0.1)
+    alone = Scores(of.score, of.information, of.trial_scores, of.trial_informations, 1, [str(k) for k in range(40)])
+    assert np.mean(alone.robust_sigma * 40) < 0.6 * np.mean(of.robust_sigma * 40)
+
+
 def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
     draw = np.random.default_rng(20608)
     friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, cast(Any, None)
@@ -316,6 +329,7 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
     problem = SimpleNamespace(
         index=np.array([[0, 1]]),
         places=np.array([[0, 1]]),
+        places_of_pairs=np.array([0, 1, 3, 4]),
         prior_mean=np.zeros(2),
         prior_precision=np.zeros(2),
         free=np.ones(2, bool),

@@ -530,14 +530,19 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
 
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
-    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails."""
-    if not pushes(fit):
+    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails. Trial effects may have
+    absorbed the misfit until no tail pushes: where trials scatter much, the refit starts without them.
+    """
+    taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
+    scattered = taut and has_excess_scatter(fit)
+    if not scattered and not pushes(fit):
         return None
     data = [
         replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
     try:
-        after = refit(replace(fit, predictor=Predictor(fit.predictor.layout, data)), thorough=False)
+        slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
+        after = refit(slack, thorough=False, afresh=scattered)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
     return likelihood_ratio(fit, (TAIL_SLACK,), after)
