@@ -29,4 +29,6 @@ def test_nothing_is_shown_where_nobody_looks(capfd: pytest.CaptureFixture[str]) 
     with progress(2, "steps", unit="step") as bar, waiting("fitting"):
         bar.advance()
         bar.reach(2, 2)
+        bar.begin("fitting the model")
+        bar.reach(1, 3)
     assert capfd.readouterr() == ("", "")

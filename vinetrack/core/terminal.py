@@ -100,6 +100,10 @@ class Progress(Generic[Item]):
         """Advance by a number of steps."""
         self._bar.advance(self._task, count)
 
+    def begin(self, description: str) -> None:
+        """Show other work, of unknown length until `reach` says more."""
+        self._bar.reset(self._task, description=description, total=None)
+
     def reach(self, done: int, total: int) -> None:
         """Set the number of completed steps, and of how many."""
         self._bar.update(self._task, completed=done, total=total)

@@ -485,6 +485,8 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
                 bar.reach(int(match[1]), int(match[2]))
             elif line in finished:
                 say(line)
+            else:
+                bar.begin(line)
     if process.returncode:
         # 12: last lines of a run that failed which are printed (chosen)
         explanation = log.read_text(encoding="utf-8").splitlines()[-12:]
