@@ -46,7 +46,7 @@ THRESHOLDS = (
     ),
     *(
         ("likelihood_ratio", name)
-        for name in ("ANSWER_SET_DELTA_CHI2", "MAX_INFLATION", "CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS")
+        for name in ("ANSWER_SET_DELTA_CHI2", "OUT_OF_REACH", "CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS")
     ),
     *(("selection", name) for name in ("CLEAR_SCORE_EXCESS", "STALLED_CHI2_SHARE", "PARTIAL_SHARE")),
     ("plausibility_prior", "RANGE_EDGE_DISTANCE"),

@@ -16,8 +16,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.likelihood_ratio import (
-    ANSWER_SET_DELTA_CHI2,
-    MAX_INFLATION,
+    OUT_OF_REACH,
     LikelihoodRatio,
     NestedForm,
     likelihood_ratio,
@@ -318,7 +317,7 @@ def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
     for key, hypothesis in ranked[8:]:
         fit = hypothesis.fit
         deviance_excess = 2 * (ranked[0][1].fit.log_likelihood - fit.log_likelihood)
-        if fit.trials and deviance_excess > ANSWER_SET_DELTA_CHI2 * MAX_INFLATION and is_large(fit):
+        if fit.trials and deviance_excess > OUT_OF_REACH and is_large(fit):
             fitted[key] = replace(hypothesis, fit=without_curves(fit))
 
 
@@ -456,7 +455,7 @@ class CandidateFits:
         before = self.tests.fit
         best = max((hypothesis.fit.log_likelihood for hypothesis in self.fitted.values()), default=0.0)
         for hypothesis in list(self.fitted.values()):
-            excluded = 2 * (best - hypothesis.fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
+            excluded = 2 * (best - hypothesis.fit.log_likelihood) > OUT_OF_REACH
             if excluded or any(checked is hypothesis.fit for checked in self.nested_checked):
                 continue
             self.nested_checked.append(hypothesis.fit)

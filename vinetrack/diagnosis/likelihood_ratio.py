@@ -339,8 +339,8 @@ def posterior_weights(log_evidences: Sequence[float]) -> list[float]:
 
 ANSWER_SET_DELTA_CHI2 = 9.0  # A hypothesis whose −2 ln L lies within this of the best cannot be excluded (derived)
 
-# Upper limit of the variance inflation, the observed scatter of trials over that of the noise model (chosen)
-MAX_INFLATION = 6.0
+# −2 ln L behind the best from which a hypothesis is not looked at again, whatever the scatter of trials (chosen)
+OUT_OF_REACH = 54.0
 
 CREDIBLE_RANGE_FACTOR = 3.0  # Multiple of its plausible range within which a size is still credible (chosen)
 
@@ -430,7 +430,7 @@ def likelihood_ratio(
         plausible=plausible,
         reason=compatible_with_none or reason,
         credible=not compatible_with_none and plausibility(effects, after, CREDIBLE_RANGE_FACTOR)[0],
-        inflation=min(ratio**2, MAX_INFLATION),
+        inflation=ratio**2,
         prior_penalty=prior_penalty(after, parameters),
         log_evidence=log_evidence(after, parameters),
         film_gain=film_gain(after),

@@ -34,7 +34,7 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, wit
 from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce, variables_in_words
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
-    MAX_INFLATION,
+    OUT_OF_REACH,
     LikelihoodRatio,
     answer_set,
     likelihood_ratio,
@@ -429,8 +429,8 @@ def _fitted_laws(model: Model, before: Fit, detected: Sequence[DetectedLaw], rep
 
 
 def _may_tie(ratio: LikelihoodRatio, highest: float) -> bool:
-    """Whether a law could be in the answer set at the largest inflation; only for these are more errors computed."""
-    return 2 * (highest - ratio.fit.log_likelihood) < ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
+    """Whether a law is near enough to the best for its errors on left-out conditions to be computed."""
+    return 2 * (highest - ratio.fit.log_likelihood) < OUT_OF_REACH
 
 
 def _proposal(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:

@@ -31,7 +31,7 @@ from vinetrack.diagnosis.drift import drift
 from vinetrack.diagnosis.ladder import left_out, with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
-    MAX_INFLATION,
+    OUT_OF_REACH,
     LikelihoodRatio,
     NestedForm,
     answer_set,
@@ -264,7 +264,7 @@ def adequate_hypotheses(
     next_best = [
         hypothesis
         for hypothesis in others
-        if hypothesis.label not in rejected and hypothesis.deviance_excess(best) < ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
+        if hypothesis.label not in rejected and hypothesis.deviance_excess(best) < OUT_OF_REACH
     ]
     for group in (in_answer_set, next_best):
         adequate: list[LikelihoodRatio] = []
