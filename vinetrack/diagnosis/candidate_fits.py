@@ -378,7 +378,6 @@ class CandidateFits:
     def __post_init__(self) -> None:
         self.subset_fitter = SubsetFitter(self.tests.fit)
         self.best_deviance = math.inf
-        self.null_deviance = -math.inf
 
     @property
     def linear_prediction_holds(self) -> bool:
@@ -424,8 +423,7 @@ class CandidateFits:
             return []
         best = ranked[0]
         null_fit = self.subset_fitter.fit_hypothesis((), {}, iterations=4)
-        self.null_deviance = null_fit.deviance if null_fit else best.deviance
-        gain = max(self.null_deviance - best.deviance, 0.0)
+        gain = null_fit.deviance - best.deviance if null_fit else 0.0
         # 0.1: the same as a share of the gain of the best subset fit (chosen)
         reach = max(SUBSET_REACH, 0.1 * gain)
         within_reach = [fit for fit in ranked if fit.deviance - best.deviance < reach]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +20,6 @@ from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, numbers_text
 from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.robust_covariance import FILM_ERROR, film_errors, sandwich
-
-if TYPE_CHECKING:
-    pass
-
 
 # ------------------------------------------------------------------------------
 # Sensitivity of fitted numbers to the mass of the film.

@@ -20,12 +20,12 @@ from vinetrack.core.notebook import html_table, plot
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import PROVENANCE
-from vinetrack.diagnosis.diagnose import diagnose as diagnose_pairs
 from vinetrack.diagnosis.ladder import Comparison
 from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
+from vinetrack.effects import catalogue, own_effects
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
@@ -137,8 +137,6 @@ class LoadedResults:
         return self._model(FitSummary(diagnosis.final_model, numbers=diagnosis.parameters))
 
     def _model(self, fit: FitSummary) -> Model:
-        from vinetrack.effects import catalogue
-
         own = not set(fit.names) <= set(catalogue())
         model = make_model(fit.names, named_model(self.experiment).user_effects if own else {})
         return model.with_values({key: one for key, one in fit.fitted_values.items() if key in model.parameter_names})
@@ -510,6 +508,8 @@ def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
     >>> diagnosis.candidates().loc[0, ["effect", "status"]].tolist()
     ['reservoir_depletion', 'refitted']
     """
+    from vinetrack.diagnosis.diagnose import diagnose as diagnose_pairs
+
     if isinstance(source, Fit) or "tracks" in options:
         return diagnose_pairs(source, **options)  # type: ignore[arg-type]
     given = read_source(source)
@@ -603,8 +603,6 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
 
 def named_model(experiment: Experiment | None) -> Model:
     """Return the model that an experiment names, including the user's own effects; without one, the base model."""
-    from vinetrack.effects import own_effects
-
     if experiment is None:
         return make_model()
     settings = experiment.settings

@@ -203,7 +203,7 @@ def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> NDArray[np.int_]:
     # 6: fewest rows, of the whole length together, that tell of flicker and shift (chosen)
     if len(places) < 6 * axis.length_px:
         return places[:0]
-    # 9000: pixels used (derived), every so-manieth, an odd number: rows come in pairs, and none is left out
+    # 9000: pixels used (derived), an odd number apart: rows come in pairs, and none is left out
     places = places[:: max(1, len(places) // 9000) | 1]
     return places[np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1]
 
