@@ -267,3 +267,9 @@ def test_a_module_takes_no_private_name_of_another_room() -> None:
 def test_no_two_modules_share_a_name() -> None:
     names = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
     assert not [name for name, times in names.items() if times > 1]
+
+
+def test_every_deliberate_fault_still_finds_the_text_that_it_alters() -> None:
+    command = [sys.executable, str(ROOT / "benchmarks" / "mutations.py"), "--list"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
