@@ -29,7 +29,16 @@ from vinetrack.effects import EffectError
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.marginal_likelihood import FitState, inverse_of_block, matrix_root, trial_deviation_sd
-from vinetrack.inference.optimiser import MOST_ITERATIONS, POOR_FIT, FixedTerms, Solution, Watch, solve
+from vinetrack.inference.optimiser import (
+    MOST_ITERATIONS,
+    POOR_FIT,
+    FixedTerms,
+    Solution,
+    Watch,
+    first_state,
+    make_problem,
+    solve,
+)
 from vinetrack.inference.position_errors import pool, position_shapes, student, trial_information
 from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA
 from vinetrack.inference.sensitivity import (
@@ -37,8 +46,6 @@ from vinetrack.inference.sensitivity import (
     N_TRIAL_EFFECTS,
     ORIGIN,
     PRESSURE,
-    RELEASE,
-    RELEASE_STEP_FRAMES,
     Predictor,
     align,
     initial_trial_effects,
@@ -54,7 +61,7 @@ from vinetrack.inference.solving import (
     with_fitted_trace_errors,
 )
 from vinetrack.inference.trial_effects import Indices, subset
-from vinetrack.inference.whitening import all_products, at_correlation, whiten
+from vinetrack.inference.whitening import at_correlation, whiten
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -428,12 +435,20 @@ def _aligned(
     model: Model, data: Sequence[FitTrial], host: Model | None, rho: float, *, from_rest: bool
 ) -> tuple[Predictor, Floats, Floats]:
     predictor = Predictor(_without_free_parameters(model, data), data, host)
+    predictor.has_pressure_deviation[:] = predictor.has_damping_deviation[:] = False
     try:
         trial_effects, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
-        trial_effects, square = _fit_release_and_origin(predictor, trial_effects, rho, from_rest)
+        problem = make_problem(predictor, trial_effects)
+        for i in np.flatnonzero(rest_is_seen(data) & from_rest).tolist():
+            trial_effects[i, ORIGIN] = problem.release_origin_mean[i, 1] = data[i].rest_origin_m
+            problem.release_origin_precision[i, 1] = 1e24  # The origin is known.
+        state = first_state(data, np.empty(0), trial_effects)
+        noise = rho, np.array([trial_data.noise_m**2 * (1 - rho**2) for trial_data in data])
+        solution = solve(predictor, problem, state, FixedTerms((0.0, 0.0), noise), warm=True)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
-    return predictor, trial_effects, square
+    square = at_correlation(solution.cross_products, rho)[:, :2, :2]
+    return predictor, solution.state.trial_effects, square
 
 
 def scaled_least_squares(design: Floats, residual: Floats, least: float) -> Floats:
@@ -477,63 +492,6 @@ def _without_free_parameters(model: Model, data: Sequence[FitTrial]) -> Paramete
         raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
     base = base.reshape(len(data), len(model.parameter_names))
     return ParameterMap(model, (), (), np.zeros((len(data), 0), dtype=int), base)
-
-
-def _fit_release_and_origin(
-    predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool
-) -> tuple[Floats, Floats]:
-    """Gauss–Newton steps in release and origin, of at most two frames, until each trial has converged."""
-    data = predictor.data
-    frames = np.array([trial_data.frame_s for trial_data in data])
-    origin_fixed = rest_is_seen(data) & from_rest
-    trial_effects, square = trial_effects.copy(), np.zeros((len(data), 2, 2))
-    trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-    pressurised_in_recording = np.array([trial_data.pressurised_in_recording for trial_data in data], dtype=bool)
-    for i in np.flatnonzero(origin_fixed).tolist():
-        trial_effects[i, ORIGIN] = data[i].rest_origin_m
-    active = np.arange(len(data))
-    # 20: maximum number of Gauss–Newton steps for release and origin (chosen)
-    for _ in range(20):
-        sums = _cross_products_of(predictor, trial_effects, active, rho)
-        square[active] = sums[:, :2, :2]
-        sums[origin_fixed[active], ORIGIN, :] = sums[origin_fixed[active], :, ORIGIN] = 0.0
-        sums[pressurised_in_recording[active], RELEASE, :] = sums[pressurised_in_recording[active], :, RELEASE] = 0.0
-        # At constant speed release and origin are collinear, which shows at a unit diagonal.
-        scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
-        scale[origin_fixed[active], ORIGIN] = scale[pressurised_in_recording[active], RELEASE] = 0.0
-        scaled = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
-        # 1e-4: least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both
-        # determined (chosen)
-        inverse = np.linalg.pinv(scaled, rcond=1e-4, hermitian=True) * scale[:, :, None] * scale[:, None, :]
-        step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])
-        largest_step = 2 * frames[active]
-        step[:, RELEASE] = np.clip(step[:, RELEASE], -largest_step, largest_step)
-        trial_effects[active, :2] += step
-        # 1e-3: step of the release below which it has converged, frames (chosen)
-        active = active[np.abs(step[:, RELEASE]) >= 1e-3 * frames[active]]
-        if not active.size:
-            break
-    return trial_effects, square
-
-
-def _cross_products_of(predictor: Predictor, trial_effects: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
-    """Whitened cross products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
-    jobs = predictor.jobs(np.empty(0), trial_effects)
-    differenced = [row for row in rows.tolist() if not predictor.release_is_shift[row]]
-    steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in differenced}
-    trajectories = predictor.run(
-        [jobs[row] for row in rows]
-        + [jobs[k]._replace(release_s=trial_effects[k, RELEASE] + steps[k]) for k in differenced]
-    )
-    shifted = dict(zip(differenced, trajectories[rows.size :], strict=True))
-    columns = []
-    for row, trajectory in zip(rows.tolist(), trajectories, strict=False):
-        sensitivity = -trajectory.lead_velocity_m_s
-        if row in shifted:
-            sensitivity = (shifted[row].observed_position_m - trajectory.observed_position_m) / steps[row]
-        residual = predictor.data[row].lead_position_m - trial_effects[row, ORIGIN] - trajectory.observed_position_m
-        columns.append(np.column_stack([sensitivity, np.ones_like(sensitivity), residual]))
-    return at_correlation(all_products(columns, [predictor.data[row].first for row in rows]), rho)
 
 
 @in_one_blas_thread
