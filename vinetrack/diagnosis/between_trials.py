@@ -15,6 +15,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     Difference,
     LikelihoodRatio,
     gain_p_value,
-    gains_by_onset,
     likelihood_ratio,
     linear_gain,
     with_shared_errors,
@@ -122,8 +122,19 @@ def _steps(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference
         return []
     ranks, stated = trial_order(trials)
     ordered = [int(i) for i in np.argsort(ranks)]
-    first = begins[int(np.argmax(gains_by_onset(fit, base, _step(range(len(trials)), trials), ordered, begins)))]
-    return [replace(_step(ordered[first:], trials), stated=stated, n_forms=len(begins))]
+    best = _likeliest(fit, base, begins, lambda first: _step(ordered[first:], trials))
+    return [replace(best, stated=stated, n_forms=len(begins))]
+
+
+def _likeliest(fit: Fit, base: Solution, begins: range, form_of: Callable[[int], Difference]) -> Difference:
+    """The difference that begins where it gains most: of twenty places or so, then of all about the best of these."""
+
+    def gain(first: int) -> float:
+        return linear_gain(fit, base, form_of(first), base.state.spread)
+
+    stride = len(begins) // 20 + 1
+    near = max(begins[::stride], key=gain)
+    return form_of(max(range(max(near - stride + 1, begins[0]), min(near + stride, begins[-1] + 1)), key=gain))
 
 
 def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
@@ -194,16 +205,21 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
         if not begins:
             continue
         tube = f"{vine}, later tube"
-        vine_in_group = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
-        form = _forms(SPECIMEN, vine_in_group, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
-        first = begins[int(np.argmax(gains_by_onset(fit, base, form, members, begins)))]
-        for i in members[first:]:
-            groups[i] = tube
+        later = partial(_later_tube, members, tube, groups, trials)
+        groups = list(_likeliest(fit, base, begins, later).terms[0].groups)
     conditions = [trial.condition for trial in trials]
     changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
     if _replicates_are_consecutive(ranks, conditions):
         changes += _forms(SPECIMEN, conditions, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
     return changes
+
+
+def _later_tube(
+    members: Sequence[int], tube: str, groups: Sequence[str], trials: Sequence[Trial], first: int
+) -> Difference:
+    """Another tube for the later trials of a vine, beside those of the vines before."""
+    apart = [tube if i in members[first:] else group for i, group in enumerate(groups)]
+    return _forms(SPECIMEN, apart, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
 
 
 def _replicates_are_consecutive(ranks: Floats, conditions: Sequence[str]) -> bool:

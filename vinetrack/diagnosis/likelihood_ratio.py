@@ -27,11 +27,8 @@ from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
     deviance,
-    deviations_eliminated,
     estimate_between_trial_sd,
     marginal,
-    normal_equations,
-    profiled_deviance,
 )
 from vinetrack.inference.optimiser import Solution, is_poor_fit, make_problem
 from vinetrack.inference.position_errors import with_shapes, with_smooth_errors
@@ -134,43 +131,6 @@ def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
         cross_products=fit.predictor.products(columns),
         columns=tuple(columns),
     )
-
-
-def gains_by_onset(
-    fit: Fit, base: Solution, difference: Difference, members: Sequence[int], onsets: Iterable[int]
-) -> list[float]:
-    """`linear_gain` of a difference for each of several onsets of its group. Between-trial standard deviations stay
-    those of the solution. The contribution of each trial to the sums over trials is removed in turn, so that all onsets
-    take little longer than one.
-    """
-    cross_products, problem, state = _widened(fit, base, difference)
-    spread = base.state.spread
-    deviance_before = deviance(
-        marginal(base.cross_products, base.problem, base.state), base.problem, base.state, spread, restricted=False
-    )
-    marginals = marginal(cross_products, problem, state)
-    information, gradient, square, log_det = normal_equations(marginals, problem, state, spread)
-    constant = square + log_det + marginals.log_constant
-    blocks, _ = deviations_eliminated(marginals, problem, spread)
-    places, shapes = problem.places, base.problem.index.shape[1] - len(fit.predictor.layout.keys)
-    end_of_terms = places.shape[1] - shapes
-    of_term = np.zeros(places.shape[1], dtype=bool)
-    of_term[end_of_terms - len(difference.terms) : end_of_terms] = True
-    affected = of_term[:, None] | of_term
-    # One more row for keys to which a trial does not respond.
-    information, gradient = np.pad(information, (0, 1)), np.append(gradient, 0.0)
-    gains: list[float] = []
-    removed = 0
-    for onset in onsets:
-        for i in members[removed:onset]:
-            np.subtract.at(information, (places[i][:, None], places[i]), np.where(affected, blocks[i, :-1, :-1], 0.0))
-            np.subtract.at(gradient, places[i][of_term], blocks[i, :-1, -1][of_term])
-        removed = onset
-        deviance_after = profiled_deviance(
-            information[:-1, :-1], gradient[:-1], constant, problem, state, restricted=False
-        )
-        gains.append(deviance_before - deviance_after)
-    return gains
 
 
 def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, MixedProblem, FitState]:
