@@ -24,20 +24,18 @@ from vinetrack.diagnosis.likelihood_ratio import (
 )
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
-    SEARCH_CHI2_PER_DOF,
     MisfitTests,
     misfit_tests,
 )
-from vinetrack.diagnosis.score_test import CandidateShape, is_plausible
+from vinetrack.diagnosis.score_test import CandidateShape
 from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, FitTrial
-from vinetrack.inference.fit_result import EXPONENT, YIELD_PRESSURE, Fit, ParameterMap, make_layout
+from vinetrack.inference.fit_result import YIELD_PRESSURE, Fit, ParameterMap, make_layout
 from vinetrack.inference.marginal_likelihood import deviance, marginal
 from vinetrack.inference.optimiser import (
-    STAGNATION_DECREASE,
     FixedTerms,
     first_state,
     is_poor_fit,
@@ -66,32 +64,20 @@ MIN_SHARE_OF_BEST_GAIN = 0.3
 
 @dataclass(frozen=True)
 class SubsetFit:
-    """End of a subset fit, from which a full fit starts: −2 ln L on its trials, values, and whether it is far off.
+    """End of a subset fit, from which a full fit starts: −2 ln L on its trials, NaN where none was made, and values.
     `yields_Pa` are yield pressures by name of number: with a friction at rest added, those fitted without it may stop a
-    vine altogether. A start that no subset fit was made for has the deviance NaN.
+    vine altogether.
     """
 
     effects: tuple[Effect, ...]
     deviance: float
     values: Mapping[str, Value]
-    far_off: bool = False
     yields_Pa: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the effects that were added."""
         return tuple(effect.name for effect in self.effects)
-
-    @property
-    def far_beyond_plausible(self) -> bool:
-        """Whether a size is so far beyond its plausible range that a full fit will not bring it back."""
-        # 6.0: multiple of its plausible range beyond which a size of a subset fit is hopeless (chosen)
-        return any(
-            not is_plausible(parameter, value, 0.0, widened=6.0)
-            for effect in self.effects
-            for parameter in effect.parameters
-            if isinstance(value := self.values.get(f"{effect.name}.{parameter.name}"), float)
-        )
 
 
 class SubsetFitter:
@@ -109,8 +95,6 @@ class SubsetFitter:
         start: Mapping[str, Value],
         *,
         iterations: int,
-        align_first: bool = True,
-        search: bool = False,
     ) -> SubsetFit | None:
         """Fit the model with these effects added; None where the fit fails."""
         subset_spreads = (0.01, 0.03)  # Between-trial standard deviations of pressure and ln B in a subset fit (chosen)
@@ -122,11 +106,10 @@ class SubsetFitter:
         fixed = FixedTerms(spread=subset_spreads, correlation=self.correlation)
         try:
             theta = layout.start
-            if align_first:
-                trial_effects, _ = align(self.data, predictor, theta, trial_effects)
+            trial_effects, _ = align(self.data, predictor, theta, trial_effects)
             problem = make_problem(predictor, trial_effects)
             state = first_state(self.data, theta, trial_effects)
-            solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=iterations, search=search)
+            solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=iterations, search=True)
             part = marginal(solution.cross_products, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
@@ -134,17 +117,12 @@ class SubsetFitter:
         if not math.isfinite(level):
             return None
         values, yields_Pa = _values(layout, solution.state.theta)
-        return SubsetFit(tuple(effects), level, values, is_poor_fit(predictor, solution), yields_Pa)
+        return SubsetFit(tuple(effects), level, values, yields_Pa)
 
     @property
     def n_points(self) -> int:
         """Number of points of the subset."""
         return sum(trial_data.time_s.size for trial_data in self.data)
-
-    def null_deviance(self) -> float:
-        """−2 ln L of the model without further effects, after a few iterations; infinite where the fit fails."""
-        null_fit = self.fit_hypothesis((), {}, iterations=SUBSET_FIRST_ITERATIONS, align_first=False)
-        return math.inf if null_fit is None else null_fit.deviance
 
     def _fixed(self, names: Iterable[str]) -> tuple[str, ...]:
         fixed = self.fit.options["fixed"]
@@ -198,9 +176,7 @@ def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
     return {f"{effect.name}.{p.name}": value for p, value in zip(effect.parameters, values, strict=True)}
 
 
-def best_subset_fit(
-    fitter: SubsetFitter, starts: Sequence[Start], goal: float, *, search: bool = False
-) -> SubsetFit | None:
+def best_subset_fit(fitter: SubsetFitter, starts: Sequence[Start], goal: float) -> SubsetFit | None:
     """Fit one hypothesis to the subset from several starts: a few iterations from each, then the best one on."""
     first_fits = [
         subset_fit
@@ -216,18 +192,17 @@ def best_subset_fit(
         return best
     for _ in range(3):
         # 10: iterations of the best subset fit each further time (chosen)
-        further = fitter.fit_hypothesis(best.effects, best.values, iterations=10, search=search)
+        further = fitter.fit_hypothesis(best.effects, best.values, iterations=10)
         if further is None:
             break
-        required_fall = STAGNATION_DECREASE * fitter.n_points if search and further.far_off else 0.1
-        improves_slowly = further.deviance > best.deviance - required_fall
+        improves_slowly = further.deviance > best.deviance - 0.1
         best = min((best, further), key=lambda subset_fit: subset_fit.deviance)
         if improves_slowly:
             break
     return best
 
 
-def full_fit(before: Fit, start: SubsetFit, best: float = -math.inf, *, rescue: bool = True) -> Fit | None:
+def full_fit(before: Fit, start: SubsetFit, best: float = -math.inf) -> Fit | None:
     """Fit a hypothesis to all trials from where its subset fit ended; None where the fit fails."""
     model = before.model.with_effects(start.effects)
     goal = (
@@ -242,7 +217,6 @@ def full_fit(before: Fit, start: SubsetFit, best: float = -math.inf, *, rescue: 
             yields_Pa=start.yields_Pa,
             most_iterations=14,
             thorough=False,
-            led=rescue,
             goal=goal,
         )
         poor = is_poor_fit(fit.predictor, fit.solution)
@@ -254,21 +228,6 @@ def full_fit(before: Fit, start: SubsetFit, best: float = -math.inf, *, rescue: 
         return refit(fit, most_iterations=40, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
-
-
-def restart_exponents(fit: Fit) -> Fit:
-    """Refit a model from several exponents n of the damping law; return the better of this and the given fit."""
-    if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
-        return fit
-    fitter = SubsetFitter(fit)
-    null_deviance = fitter.null_deviance()
-    # (0.2, 0.4, 0.7): exponents from which a model is started (chosen)
-    subset_fit = best_subset_fit(fitter, [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)], null_deviance)
-    # 0.02: fall of −2 ln L per point of a subset fit from which its start is worth a full fit (chosen)
-    if subset_fit is None or subset_fit.deviance > null_deviance - 0.02 * fitter.n_points:
-        return fit
-    refitted = full_fit(fit, subset_fit, fit.log_likelihood)
-    return refitted if refitted is not None and refitted.log_likelihood > fit.log_likelihood else fit
 
 
 def distinct_starts(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
@@ -397,11 +356,6 @@ class CandidateFits:
         """Fitted hypotheses of plausible and credible sizes."""
         return [hypothesis for hypothesis in self.fitted.values() if hypothesis.plausible and hypothesis.credible]
 
-    @property
-    def has_adequate_fit(self) -> bool:
-        """Whether a hypothesis fits the tracks: another that is still far off once fitted is then no rival."""
-        return any(hypothesis.fit.chi2_per_dof < SEARCH_CHI2_PER_DOF for hypothesis in self.fitted.values())
-
     def tests_after(self, fit: Fit, *, film: bool = False) -> MisfitTests:
         """Run the misfit tests of one of the fits, at the level of later rounds."""
         for tested_fit, with_film, tests in self.tests_by_fit:
@@ -416,18 +370,10 @@ class CandidateFits:
     def fit_singles(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
         """Fit each effect alone that may be the best or near it."""
         if self.linear_prediction_holds:
-            return self._fit_predicted(all_of_them=all_of_them)
-        self._fit_subsets(self.names if all_of_them else self._worth_a_subset_fit())
-        ranked = sorted(self.subset_fits.values(), key=lambda fit: (fit.far_beyond_plausible, fit.deviance))
-        if not ranked:
-            return []
-        best = ranked[0]
-        null_fit = self.subset_fitter.fit_hypothesis((), {}, iterations=4)
-        gain = null_fit.deviance - best.deviance if null_fit else 0.0
-        # 0.1: the same as a share of the gain of the best subset fit (chosen)
-        reach = max(SUBSET_REACH, 0.1 * gain)
-        within_reach = [fit for fit in ranked if fit.deviance - best.deviance < reach]
-        chosen = [fit for fit in within_reach if not fit.far_beyond_plausible] or within_reach
+            return self.fit_to_all_trials(all_of_them=all_of_them)
+        self._fit_subsets(self.names if all_of_them else self._promising(most=5))
+        ranked = sorted(self.subset_fits.values(), key=lambda subset_fit: subset_fit.deviance)
+        chosen = [subset_fit for subset_fit in ranked if subset_fit.deviance - ranked[0].deviance < SUBSET_REACH]
         for subset_fit in chosen if all_of_them else chosen[: self.max_full_fits]:
             self._fit(subset_fit)
         self._fit_simpler_forms()
@@ -438,10 +384,8 @@ class CandidateFits:
         may end in a local minimum. And a model whose parameters have adapted to the lack of an effect may predict no
         gain for it, not even the right sign.
         """
-        top = self.tests.predicted_gain(self.names[0]) if self.names else 0.0
-        for name in self.names:
-            promising = all_of_them or self.tests.predicted_gain(name) > MIN_SHARE_OF_BEST_PREDICTION * top
-            if promising and name not in self.fitted and name not in self.failed:
+        for name in self.names if all_of_them else self._promising():
+            if name not in self.fitted and name not in self.failed:
                 self._fit_from_prediction(name)
         self._fit_simpler_forms()
         return list(self.fitted.values())
@@ -464,23 +408,21 @@ class CandidateFits:
                 if known is None or simpler.delta_chi2 > max(known.delta_chi2, FAILED_FIT_DELTA_CHI2):
                     self.fitted[simpler.label] = simpler
 
-    def _worth_a_subset_fit(self) -> list[str]:
-        """Effects of a large predicted gain or score, and those that look like the most promising one."""
-        top = self.tests.predicted_gain(self.names[0]) if self.names else 0.0
-        highest_scores = self._highest_scores()
-        # 5: effects of the largest predicted gains, fitted to the subset in any case (chosen)
+    def _promising(self, most: int = 0) -> list[str]:
+        """Effects of a large predicted gain, `most` in any case, or of the highest score, and those that look like the
+        most promising one.
+        """
+        names = self.names
+        top = self.tests.predicted_gain(names[0]) if names else 0.0
+        by_score = sorted(names, key=lambda name: -self.tests.best_z(name)[0])
         return [
             name
-            for k, name in enumerate(self.names)
-            if k < 5
-            or name in highest_scores
+            for k, name in enumerate(names)
+            if k < most
+            or name in by_score[: max(most - 1, 1)]
             or self.tests.predicted_gain(name) > MIN_SHARE_OF_BEST_PREDICTION * top
-            or self.tests.cosine(name, self.names[0]) > ALIKE_COSINE
+            or self.tests.cosine(name, names[0]) > ALIKE_COSINE
         ]
-
-    def _highest_scores(self) -> list[str]:
-        # 4: effects of the highest scores, fitted to the subset in any case (chosen)
-        return sorted(self.names, key=lambda name: -self.tests.best_z(name)[0])[:4]
 
     def _fit_subsets(self, names: Iterable[str]) -> None:
         """Fit effects to the subset, each from its best shapes and from the sizes of common slips in the sheet."""
@@ -493,30 +435,12 @@ class CandidateFits:
             shapes = self.tests.sensitivities.shapes
             starts = distinct_starts((shapes[i], float(sizes[i])) for i in indices)
             starts += sheet_slip_starts(shapes[indices[0]].effect)
-            subset_fit = best_subset_fit(self.subset_fitter, starts, self.best_deviance, search=True)
+            subset_fit = best_subset_fit(self.subset_fitter, starts, self.best_deviance)
             if subset_fit is None:
                 self.failed.add(name)
                 continue
             self.best_deviance = min(self.best_deviance, subset_fit.deviance)
             self.subset_fits[name] = subset_fit
-
-    def _fit_predicted(self, *, all_of_them: bool) -> list[LikelihoodRatio]:
-        """Fit to all trials the effects whose predicted gain is near the best, or all."""
-        names = self.names
-        if not names:
-            return []
-        top, highest_score = self.tests.predicted_gain(names[0]), self._highest_scores()[:1]
-        # 16.0, 0.4, 0.75: Δχ², and shares of the best predicted gain, by which that of an effect may fall short of
-        # the best one for it still to be fitted (chosen)
-        reach = min(max(16.0, 0.4 * top), 0.75 * top)
-        for name in names:
-            promising = self.tests.predicted_gain(name) > top - reach
-            alike = self.tests.cosine(name, names[0]) > ALIKE_COSINE or name in highest_score
-            if (promising or alike or all_of_them) and name not in self.fitted and name not in self.failed:
-                self.report(f"fitting {name}")
-                self._fit_from_prediction(name)
-        self._fit_simpler_forms()
-        return list(self.fitted.values())
 
     def _fit_from_prediction(self, name: str) -> None:
         """Fit an effect to all trials from its shapes of largest predicted gain, until one gains what is predicted."""
@@ -529,19 +453,6 @@ class CandidateFits:
             required = 0.7 * self.tests.predicted_gain(name)
             if name in self.fitted and self.fitted[name].delta_chi2 > required:
                 break
-            if self._is_hopeless(name):
-                break
-
-    def _is_hopeless(self, name: str) -> bool:
-        """Whether a hypothesis is out of the running from its best shape, and subset fits tried its other shapes."""
-        hypothesis = self.fitted.get(name)
-        if hypothesis is None or name not in self.subset_fits:
-            return False
-        best = max(known.delta_chi2 for known in self.fitted.values())
-        # 0.5: share of the best gain below which a hypothesis that still misses a visible part of the growth
-        # is not fitted from its other shapes, if subset fits tried them (chosen)
-        small_gain = hypothesis.delta_chi2 < 0.5 * best
-        return small_gain and is_poor_fit(hypothesis.fit.predictor, hypothesis.fit.solution)
 
     def _fit(self, start: SubsetFit) -> None:
         """Fit a hypothesis to all trials from a start, unless it is known from a better one."""
@@ -552,7 +463,7 @@ class CandidateFits:
         self.report(f"fitting {name}")
         # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
         best = max((known.fit.log_likelihood for known in self.credible_fits), default=-math.inf)
-        fit = full_fit(self.tests.fit, start, best, rescue=from_subset or not self.has_adequate_fit)
+        fit = full_fit(self.tests.fit, start, best)
         hypothesis = None if fit is None else likelihood_ratio(self.tests.fit, start.effects, fit)
         if hypothesis is None or hypothesis.delta_chi2 < FAILED_FIT_DELTA_CHI2:
             self.failed.add(name)

@@ -24,11 +24,10 @@ from vinetrack.diagnosis.candidate_fits import (
     CandidateFits,
     Report,
     drop_curves,
-    restart_exponents,
     with_curves,
 )
 from vinetrack.diagnosis.drift import drift
-from vinetrack.diagnosis.ladder import left_out, with_host
+from vinetrack.diagnosis.ladder import with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -45,7 +44,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
-    FAR_OFF_CHI2_PER_DOF,
     SEARCH_SIGMAS,
     MisfitTests,
     exceeds_slow_errors,
@@ -55,12 +53,11 @@ from vinetrack.diagnosis.misfit_tests import (
 from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
 from vinetrack.diagnosis.score_test import levers_of, plausible_range
-from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import Effect, EffectError, Parameter
+from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit, Number, TrialFit
+from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.sensitivity import Predictor
 
 if TYPE_CHECKING:
@@ -426,31 +423,6 @@ def size_not_excluded(estimate: float, sigma: float, parameter: Parameter) -> tu
 CONTRADICTING_DRIFT_SIGMAS = 4.0  # Significance of a drift from which it contradicts an adequate model (chosen)
 
 
-def displacement_m(before: Fit, after: Fit) -> float:
-    """Root mean square displacement of the predicted positions by an added effect. Returns over trials, of the largest
-    difference of predicted positions, each fit with its own release and origin, m.
-    """
-    moved = [
-        float(np.max(np.abs(trial.predicted_position_m - later.predicted_position_m)))
-        for trial, later in zip(before.trials, after.trials, strict=True)
-    ]
-    return float(np.sqrt(np.mean(np.square(moved))))
-
-
-def is_within_position_errors(before: Fit, after: Fit) -> bool:
-    """Whether an effect moves positions by less than their systematic error and does not improve left-out predictions.
-    Such a gain in likelihood may be lens distortion. The left-out error is computed only for so small a displacement.
-    """
-    systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in before.predictor.data]))
-    if not displacement_m(before, after) < systematic_m:
-        return False
-    try:
-        without_m, with_m = left_out(before).rms_m, left_out(after).rms_m
-    except (FitError, SimulationError, np.linalg.LinAlgError):
-        return False
-    return math.isfinite(without_m + with_m) and with_m >= without_m
-
-
 def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFrame | None) -> tuple[Remark, ...]:
     """List the results that contradict the final model of a diagnosis where the verdict calls it adequate. Returns
     remarks; empty where nothing contradicts the verdict.
@@ -498,64 +470,25 @@ TAIL_SLACK = Effect(
     path=Path(__file__).resolve(),
 )
 
-# Compression of the tail, as a fraction of the drive ½PA, from which the rule is tried (chosen)
-MIN_PUSH_FRACTION = 0.02
-
-
-def pushes(fit: Fit) -> bool:
-    """Whether the fitted model predicts compression in the tail of any trial that is not allowed to go slack."""
-    return any(_pushes(fit, trial) for trial in fit.trials)
-
-
-def _pushes(fit: Fit, trial: TrialFit) -> bool:
-    if trial.trial.tail_slack == "free" or trial.trial.travel_ratio == 1:
-        return False
-    moving = trial.time_s > trial.release_s
-    if not moving.any():
-        return False
-    since_s = trial.time_s[moving] - trial.release_s
-    trace = next(trial_data.trace for trial_data in fit.predictor.data if trial_data.trial is trial.trial)
-    measured_Pa = None if trace is None else np.interp(trial.time_s[moving], *trace)
-    position_m = trial.predicted_position_m[moving] - trial.origin_m
-    velocity_m_s = trial.predicted_velocity_m_s[moving]
-    fitted_trial = replace(trial.trial, pressure_Pa=trial.trial.pressure_Pa * (1 + trial.pressure_deviation))
-    try:
-        terms = evaluate(fit.model, fitted_trial, since_s, position_m, velocity_m_s, measured_Pa=measured_Pa)
-    except EffectError:
-        return False
-    ratio = trial.trial.travel_ratio
-    damping_N = terms.tip_N.get("eversion_damping", np.zeros_like(since_s))
-    tension_N = terms.tension_N + trial.damping_deviation * damping_N / ratio
-    return bool(np.any(tension_N < -MIN_PUSH_FRACTION * terms.pressure_Pa * terms.area_m2 / ratio))
-
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
-    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails. Trial effects may have
+    """Refit the model with tails that may go slack; None where none is taut or the fit fails. Trial effects may have
     absorbed the misfit until no tail pushes: where trials scatter much, the refit starts without them.
     """
-    taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
-    scattered = taut and has_excess_scatter(fit)
-    if not scattered and not pushes(fit):
+    if not any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials):
         return None
     data = [
         replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
     try:
         slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
-        after = refit(slack, thorough=False, afresh=scattered)
+        after = refit(slack, thorough=False, afresh=has_excess_scatter(fit))
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
     return likelihood_ratio(fit, (TAIL_SLACK,), after)
 
 
 MAX_BACKWARD_STEPS = 2  # Times that a search over sets goes on from a smaller set (chosen)
-
-# Standard deviations by which a score must exceed its threshold to count although no refit confirms it
-CLEAR_SCORE_EXCESS = 1.0
-
-# If the model is still far off, a third or further effect must reduce χ² to less than this share, or no more effects
-# are added (chosen)
-STALLED_CHI2_SHARE = 0.7
 
 # Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them
 # (chosen)
@@ -583,12 +516,7 @@ class SelectionStep:
 
 
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[SelectionStep]:
-    """Select the effects that a model lacks. If the model's fit is only a local optimum, any added effect seems to
-    help.
-    """
-    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
-        report("fitting the model from other starts")
-        fit = restart_exponents(fit)
+    """Select the effects that a model lacks."""
     report("testing the model")
     tests = misfit_tests(fit, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
     trial_differences = differences(fit)
@@ -632,9 +560,8 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in between]
     credible = [hypothesis for hypothesis in hypotheses if hypothesis.credible]
     if not credible or not _any_exceeds_threshold(credible, tests):
-        # A score that no refit confirms counts only if it is high or another test rejects the model too.
-        clear_score = tests.largest_excess(tests.family) > CLEAR_SCORE_EXCESS
-        rejected = tests.omnibus_rejects or tests.exceeds_slow_errors or clear_score
+        # A score that no refit confirms counts only if another test rejects the model too.
+        rejected = tests.omnibus_rejects or tests.exceeds_slow_errors
         verdict = UNEXPLAINED if rejected else ADEQUATE
         unstated = unstated if verdict == ADEQUATE else ()
         return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
@@ -707,10 +634,6 @@ def _single_effect_rounds(
         return None
     best, fitted = adequate[0], tuple(hypotheses)
     verdict = verdict_of(adequate)
-    if verdict == MISSING and is_within_position_errors(tests.fit, best.fit):
-        moved_m = displacement_m(tests.fit, best.fit)
-        note = remark("not_counted", label=best.label, sigma=best.sigma, moved_m=moved_m)
-        return [SelectionStep(ADEQUATE, tests, fitted=fitted, search=search, note=note)]
     first = SelectionStep(
         verdict,
         tests,
@@ -751,10 +674,7 @@ def _effect_set_rounds(
             rejected[adequate[0].label] = remark("gain_within_chance")
         if not sets.is_better(of_this_size[0]):
             break
-        stalled = size > 2 and _is_stalled(of_this_size, best_so_far)
         best_so_far = of_this_size[0]
-        if stalled:
-            break
         # An effect added early may have stood in for two added later: go on from a smaller set if that is now better.
         step_back = size > 2 and backward_steps < MAX_BACKWARD_STEPS and sets.prune(of_this_size[0])
         size, backward_steps = (size - 1, backward_steps + 1) if step_back else (size + 1, backward_steps)
@@ -762,14 +682,6 @@ def _effect_set_rounds(
     reasons = _rejection_reasons((*singles[:1], *sets.of_size(2)[:1], best_so_far), rejected)
     steps = _partial_steps(tests, sets)
     return [SelectionStep(UNEXPLAINED, tests, fitted=fitted, search=search, rejected=reasons, partial=steps)]
-
-
-def _is_stalled(of_this_size: Sequence[LikelihoodRatio], best_so_far: LikelihoodRatio) -> bool:
-    """Whether larger sets are not worth their time: no set has credible sizes, or the best stays about as far off."""
-    if not any(has_credible_sizes(hypothesis) for hypothesis in of_this_size):
-        return True
-    remaining = of_this_size[0].fit.chi2_per_dof
-    return remaining > FAR_OFF_CHI2_PER_DOF and remaining > STALLED_CHI2_SHARE * best_so_far.fit.chi2_per_dof
 
 
 def _rounds_of_sets(

@@ -572,7 +572,6 @@ def refit(
     most_iterations: int = MOST_ITERATIONS,
     thorough: bool = True,
     afresh: bool = False,
-    led: bool = True,
     goal: float = -math.inf,
     watch: Watch | None = None,
 ) -> Fit:
@@ -604,9 +603,6 @@ def refit(
         iterated to convergence with free noise; otherwise only as far as a comparison with other models needs.
     afresh : bool
         Whether release, deviations and noise start from the tracks alone instead of the previous fit.
-    led : bool
-        Whether a poor fit is repeated at fixed noise at all; not needed where another model already explains the tracks
-        and a poor fit is rejected anyway.
     goal : float
         A poor fit is abandoned as soon as it can no longer reach this ln L.
     watch : callable, optional
@@ -668,8 +664,7 @@ def refit(
             solution = solve_onward(predictor, before.solution, theta, fixed_terms, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
-    if led:
-        solution = solve_again(predictor, solution, fixed_terms, watch, thorough=thorough, goal=goal)
+    solution = solve_again(predictor, solution, fixed_terms, watch, thorough=thorough, goal=goal)
     predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, **how)
     fitted = assemble(
         predictor,

@@ -25,8 +25,6 @@ SENTENCES = {
     "misfit_remains": "a significant misfit remains once it is added",
     "too_weak_in_set": "{effect} reaches {sigmas:.1f} σ given the others, and {required:.1f} σ are required",
     "gain_within_chance": "its gain over the best smaller set is within chance",
-    "not_counted": "{label} would improve the fit by {sigma:.1f} σ, but it moves positions by only {moved_mm:.2g} mm, "
-    "less than their systematic errors, and does not lower the error on left-out conditions; it is not counted",
     "several_missing": "{count} effects are missing: none alone removes the misfit",
     "not_tried": "Not tried, because the sheet does not state what they need: {names}.",
     "excess_counted_as_noise": "the residuals exceed the noise of the trials, and the sizes count the excess as noise",
@@ -83,8 +81,6 @@ def sentence(code: str, facts: Mapping[str, Any]) -> str:
         shown["column"] = _NAMES[shown["column"]]
     elif code == "columns_partly_blank":
         shown["columns"] = "` and `".join(shown["columns"])
-    elif code == "not_counted":
-        shown["moved_mm"] = 1e3 * shown["moved_m"]
     elif code == "left_out_error_does_not_fall":
         shown |= {"without_mm": 1e3 * shown["without_m"], "with_mm": 1e3 * shown["with_m"]}
     elif code == "left_out_error_without":
