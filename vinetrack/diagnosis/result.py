@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from vinetrack.core.notebook import plot
+from vinetrack.core.problems import Remark, StoredRemark, in_words, remark
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.power import Power
-from vinetrack.diagnosis.remarks import Remark, StoredRemark, in_words, remark
 from vinetrack.inference.fit_result import Fit, Number, OrNaN
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ class Diagnosis:
     fits: tuple[Fit, ...] = ()
     ladder: pd.DataFrame | None = None
     drift: Sequence[Mapping[str, Any]] = ()
-    where: Sequence[str] = ()
+    where: Sequence[Remark | str] = ()  # A file holds the sentences, as of drifts
     next_experiment: Mapping[str, Any] | None = None
     missing_force: Mapping[str, Any] | None = None
     notes: Sequence[Remark | str] = ()  # A file holds their sentences
@@ -310,8 +310,8 @@ class Diagnosis:
             "rounds": [step.to_json() for step in self.rounds],
             "parameters": [number.to_json() for number in self.parameters],
             "cosines": first.get("cosines", {}),
-            "where": list(self.where),
-            "drift": [dict(row) for row in self.drift],
+            "where": [str(line) for line in self.where],
+            "drift": [{key: str(v) if isinstance(v, Remark) else v for key, v in row.items()} for row in self.drift],
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "missing_force": None if self.missing_force is None else dict(self.missing_force),
             "notes": [str(note) for note in self.notes],

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from vinetrack.core import published
-from vinetrack.core.problems import Problem
+from vinetrack.core.problems import Problem, Remark, remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.units import convert, number, or_nan
 from vinetrack.dynamics.model import Model, make_model
@@ -132,7 +132,7 @@ class Uncertainty:
     """
 
     name: str
-    words: str
+    why: Remark
     key: str
     sample: Sampler = field(repr=False, compare=False)
 
@@ -147,7 +147,7 @@ class Input:
     low: float
     median: float
     high: float
-    origin: str
+    origin: Remark
 
 
 @dataclass(frozen=True)
@@ -156,10 +156,10 @@ class PredictiveInputs:
 
     trial: Trial
     model: Model
-    origins: Mapping[str, str]
+    origins: Mapping[str, Remark]
     uncertainties: tuple[Uncertainty, ...]
     spreads: tuple[float, float]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
 
     @property
     def medians(self) -> dict[str, float]:
@@ -196,7 +196,7 @@ class PredictiveInputs:
         for name in dict.fromkeys([*first, *draws]):
             symbol, unit = named[name]
             low, median, high = (float(q) for q in np.quantile(draws[name], BAND))
-            bands.append(Input(name, symbol, unit, low, median, high, self.origins.get(name, "")))
+            bands.append(Input(name, symbol, unit, low, median, high, self.origins.get(name, Remark())))
         return bands
 
 
@@ -430,24 +430,28 @@ class _Sources:
         self.trial = trial if trial.vine else with_names([trial])[0]
         self.fit = fit
         self.values: dict[str, float] = {}
-        self.origins: dict[str, str] = {}
+        self.origins: dict[str, Remark] = {}
         self.uncertainties: list[Uncertainty] = []
-        self.notes: list[str] = []
+        self.notes: list[Remark] = []
         self.from_fit: dict[str, int] = {}
         """Inputs taken from the fit, and their indices in it."""
 
-    def set(self, name: str, value: float, origin: str) -> None:
-        self.values[name], self.origins[name] = value, origin
+    def set(self, name: str, value: float, origin: str, **facts: str) -> None:
+        self.values[name], self.origins[name] = value, remark(origin, **facts)
 
-    def set_fitted(self, name: str, place: int, factor: float = 1.0, origin: str = "fitted, {}") -> None:
+    def set_fitted(self, name: str, place: int, factor: float = 1.0, origin: str = "fitted", **facts: str) -> None:
         """Take an input from the fit, multiplied by a factor."""
         assert self.fit is not None
         mean = float(self.fit.mean[place])
         self.from_fit[name] = place
-        self.set(name, factor * (math.exp(mean) if self.fit.log[place] else mean), origin.format(self.fit.source))
+        value = factor * (math.exp(mean) if self.fit.log[place] else mean)
+        self.set(name, value, origin, source=self.fit.source, **facts)
 
-    def add_uncertainty(self, name: str, words: str, key: str, sample: Sampler) -> None:
-        self.uncertainties.append(Uncertainty(name, words, key, sample))
+    def set_printed(self, name: str, value: float) -> None:
+        self.set(name, value, "printed", source=published.SOURCE)
+
+    def add_uncertainty(self, name: str, key: str, sample: Sampler, why: str, **facts: object) -> None:
+        self.uncertainties.append(Uncertainty(name, remark(why, **facts), key, sample))
 
 
 def predictive_inputs(
@@ -517,43 +521,37 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
     if math.isfinite(stated.B):
         sources.set(DAMPING, stated.B, "given")
         if stated.B_error > 0:
-            words = f"B is given to {100 * stated.B_error:.2g} % (one standard deviation)"
-            sources.add_uncertainty("error of B", words, f"B given|{trial.vine}", scaled(DAMPING, stated.B_error))
+            sample = scaled(DAMPING, stated.B_error)
+            sources.add_uncertainty("error of B", f"B given|{trial.vine}", sample, "B_given", error=stated.B_error)
         return
     if fit is not None and place is not None and (is_same or fit.vines[place] == ""):
         sources.set_fitted(DAMPING, place)
         return
     if place is None and (scale := _printed_scale(trial)) is not None:
-        sources.set(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
-        words = f"the error of the printed B is not printed: assumed to be {100 * printed_error:.0f} %"
-        sources.add_uncertainty("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, printed_error))
+        sources.set_printed(DAMPING, published.DAMPING_B[scale])
+        sample = scaled(DAMPING, printed_error)
+        sources.add_uncertainty(
+            "error of B", f"B printed|{trial.vine}", sample, "B_printed", percent=100 * printed_error
+        )
         return
     # The scaling prior, from the nearest vine of the fit where there is one. Its uncertainties are the scatter of the
     # printed values about it, and the exponents of t against D.
     split, scatter = split_leverage(*size), damping_log_sigma(*size)
     if fit is None or place is None:
-        sources.set(DAMPING, damping_prior(*size), "guess: 6.44 (t/200 µm)(D/24 mm)^0.75")
+        sources.set(DAMPING, damping_prior(*size), "B_guessed")
     else:
         like = fit.sizes()[vine]
         factor = damping_prior(*size) / damping_prior(*like)
-        sources.set_fitted(DAMPING, place, factor, f"scaled from {vine} of {{}} as t·D^0.75: a guess")
-        sources.notes.append(
-            f"no vine of {fit.source} has this diameter and wall: B is carried over from {vine} by the scaling prior, "
-            "a guess"
-        )
+        sources.set_fitted(DAMPING, place, factor, "B_scaled", vine=vine)
+        sources.notes.append(remark("B_carried_over", source=fit.source, vine=vine))
         split -= split_leverage(*like)
-    words = (
-        f"the four printed B scatter by {100 * damping_scatter():.0f} % about it: {100 * scatter:.0f} % at this "
-        f"size (Student's t, {SCATTER_DOF} degrees of freedom)"
-    )
-    sources.add_uncertainty("guess of B", words, f"B scatter|{trial.vine}", scaled(DAMPING, scatter, SCATTER_DOF))
+    sample = scaled(DAMPING, scatter, SCATTER_DOF)
+    facts = {"printed": damping_scatter(), "here": scatter, "dof": SCATTER_DOF}
+    sources.add_uncertainty("guess of B", f"B scatter|{trial.vine}", sample, "printed_B_scatter", **facts)
     if abs(split) > 1e-9:
         split_sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
-        words = (
-            f"B is printed for one t/D only: exponents of t and D ±{split_sigma:g} against each other, "
-            f"{100 * abs(split) * split_sigma:.0f} % at this t/D"
-        )
-        sources.add_uncertainty("t against D", words, "B split", scaled(DAMPING, split * split_sigma))
+        facts, sample = {"sigma": split_sigma, "here": abs(split) * split_sigma}, scaled(DAMPING, split * split_sigma)
+        sources.add_uncertainty("t against D", "B split", sample, "one_t_over_D", **facts)
 
 
 def _printed_scale(trial: Trial) -> int | None:
@@ -567,14 +565,13 @@ def _exponent(sources: _Sources, stated: StatedValues) -> None:
     if math.isfinite(stated.n):
         sources.set(EXPONENT, stated.n, "given")
         if stated.n_error > 0:
-            words = f"n is given to {stated.n_error:.2g} (one standard deviation)"
-            sources.add_uncertainty("error of n", words, "n given", shifted(EXPONENT, stated.n_error))
+            sample = shifted(EXPONENT, stated.n_error)
+            sources.add_uncertainty("error of n", "n given", sample, "n_given", error=stated.n_error)
     elif place is not None:
         sources.set_fitted(EXPONENT, place)
     else:
-        sources.set(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
-        words = f"±{sigma:.2g}, from the printed R² of the fits"
-        sources.add_uncertainty("error of n", words, "n printed", shifted(EXPONENT, sigma))
+        sources.set_printed(EXPONENT, published.EXPONENT)
+        sources.add_uncertainty("error of n", "n printed", shifted(EXPONENT, sigma), "n_printed", error=sigma)
 
 
 def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
@@ -592,18 +589,18 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
     elif math.isfinite(stated):
         sources.set(YIELD, stated, "given")
         if sigma > 0:
-            words = f"stated to {sigma / 1e3:.2g} kPa"
-            sources.add_uncertainty("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
+            sample = shifted(YIELD, sigma)
+            sources.add_uncertainty("stated P_y", f"P_y stated|{trial.vine}", sample, "P_y_stated", kPa=sigma / 1e3)
     elif _printed_scale(trial) == 4:  # the vine whose yield pressure is printed
         rounding_Pa = 1000 / math.sqrt(12)
-        sources.set(YIELD, printed_Pa, f"printed, {published.SOURCE}")
-        words = f"printed to a whole number: ±{rounding_Pa / 1e3:.2g} kPa"
-        sources.add_uncertainty("printed P_y", words, "P_y printed", shifted(YIELD, rounding_Pa))
+        sources.set_printed(YIELD, printed_Pa)
+        sample = shifted(YIELD, rounding_Pa)
+        sources.add_uncertainty("printed P_y", "P_y printed", sample, "P_y_printed", kPa=rounding_Pa / 1e3)
     else:
-        sources.set(YIELD, printed_Pa, "guess: the one that is printed, for another vine")
-        words = f"{published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine; nine of ten others within a factor 3"
-        log_sigma = math.log(3.0) / float(ndtri(0.95))
-        sources.add_uncertainty("guess of P_y", words, "P_y guess", scaled(YIELD, log_sigma))
+        sources.set(YIELD, printed_Pa, "P_y_guessed")
+        # Nine of ten vines within a factor of 3
+        sample = scaled(YIELD, math.log(3.0) / float(ndtri(0.95)))
+        sources.add_uncertainty("guess of P_y", "P_y guess", sample, "P_y_guess", kPa=published.YIELD_PRESSURE_KPA)
 
 
 def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anchor: tuple[str, bool]) -> None:
@@ -619,18 +616,16 @@ def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anc
                 sources.set(name, size.middle, "given")
                 low, high = parameter.plausible or parameter.bounds
                 if size.low < low or size.high > high:
-                    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-                    sources.notes.append(
-                        f"{parameter.symbol} of {effect.name} is outside its plausible range, {low:g} to {high:g}{unit}"
-                    )
+                    facts = {"low": low, "high": high, "unit": "" if parameter.unit == "1" else f" {parameter.unit}"}
+                    sources.notes.append(remark("implausible", symbol=parameter.symbol, effect=effect.name, **facts))
                 if size.high > size.low:
-                    words = f"{parameter.symbol} of {effect.name} uniform between {size.low:g} and {size.high:g}"
-                    sources.add_uncertainty(f"{parameter.symbol} ({effect.name})", words, name, _uniform(name, size))
+                    title = f"{parameter.symbol} ({effect.name})"
+                    facts = {"symbol": parameter.symbol, "effect": effect.name, "low": size.low, "high": size.high}
+                    sources.add_uncertainty(title, name, _uniform(name, size), "uniform", **facts)
             elif place is not None:
                 sources.set_fitted(name, place)
             else:
-                fixed = "constant" if parameter.held else "typical size, without an error"
-                sources.set(name, parameter.default, fixed)
+                sources.set(name, parameter.default, "constant" if parameter.held else "typical_size")
 
 
 def _joint_draw_of_fit(sources: _Sources) -> None:
@@ -653,12 +648,10 @@ def _joint_draw_of_fit(sources: _Sources) -> None:
 
     symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
     shown = ", ".join(symbols.get(name, name) for name in names)
-    words = f"{shown} of {fit.source}, with their covariance ({fit.n_trials} trials)"
-    sources.uncertainties.insert(0, Uncertainty("fitted numbers", words, "fit", sample))
+    why = remark("with_covariance", names=shown, source=fit.source, count=fit.n_trials)
+    sources.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", sample))
     if fit.open:
-        sources.notes.append(
-            f"{fit.source} does not determine {', '.join(fit.open)}: kept at the fitted values, without an error"
-        )
+        sources.notes.append(remark("not_determined", source=fit.source, names=", ".join(fit.open)))
 
 
 def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[float, float]:
@@ -669,12 +662,12 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
     stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else pressure_spread
     pressure = stated if math.isfinite(stated) else pressure_spread
     dof: Mapping[str, float] = {}
-    damping, origin = damping_spread, "assumed:"
+    damping, origin = damping_spread, "assumed"
     if stated_values.spreads is not None:
-        (pressure, damping), origin = stated_values.spreads, "given:"
+        (pressure, damping), origin = stated_values.spreads, "given"
     elif fit is not None and fit.spreads:
         pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
-        origin, dof = f"estimated in {fit.source}:", fit.spread_dof
+        origin, dof = f"estimated in {fit.source}", fit.spread_dof
     sources.set(PRESSURE, trial.pressure_Pa, "set")
     dof_of_pressure = dof.get("pressure", math.inf)
     relative = _varied(PRESSURE, lambda P, draw: P * (1 + pressure * _deviates(draw, P.size, dof_of_pressure)))
@@ -683,8 +676,8 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
         ("B", damping, scaled(DAMPING, damping, dof.get("B", math.inf))),
     ):
         if spread > 0:
-            words = f"{origin} {100 * spread:.2g} %"
-            sources.add_uncertainty(f"{symbol} from trial to trial", words, f"{symbol} trial|{trial.vine}", sampler)
+            title, key = f"{symbol} from trial to trial", f"{symbol} trial|{trial.vine}"
+            sources.add_uncertainty(title, key, sampler, "spread", origin=origin, size=spread)
     return pressure, damping
 
 
