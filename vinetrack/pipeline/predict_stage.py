@@ -26,6 +26,7 @@ from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, p
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
 from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.planning.prediction import (
@@ -39,7 +40,7 @@ from vinetrack.planning.prediction import (
     chambers,
     design_checks,
     fastest,
-    final_m_s,
+    final_speeds,
     final_with,
     gauge_loss,
     neglected,
@@ -185,7 +186,7 @@ def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
 def _read_fit(results: Path, chosen: ChosenFit) -> tuple[FitNumbers, Mapping[str, Effect]]:
     """Read a fit of a results folder, and the user's own effects if its model contains any."""
     with planning_errors():
-        fit = fit_numbers(chosen.content, results.as_posix())
+        fit = fit_numbers(FitSummary.from_json(chosen.content), results.as_posix())
     own_names = [name for name in fit.model if name not in catalogue()]
     if not own_names:
         return fit, {}
@@ -593,7 +594,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
     yield from table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
     if inputs is not None:
-        steady = final_m_s(inputs, inputs.model, host_for(inputs.model), at_fraction)
+        (steady,) = final_speeds(inputs.model, [trial], at_fraction, host=host_for(inputs.model)).tolist()
         place = 1.0 if trial.payload_kg > 0 else at_fraction
         yield str(remark("speeds_at_medians", y_over_L=place, m_s=steady))
     yield str(remark("slow_and_fast"))

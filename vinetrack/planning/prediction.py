@@ -412,7 +412,7 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
     # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
     # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
     kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * 25e6 * trial.thickness_m)
-    without = final_m_s(inputs, inputs.model, host, at_fraction)
+    (without,) = final_speeds(inputs.model, [trial], at_fraction, host=host).tolist()
     neglected_effects = []
     # Effects that every vine has to some extent; the others of the catalogue may be absent.
     universal = ("air_drag", "fold_inertia", "gas_inertia", "inlet_loss", "payload_drag", "reservoir_depletion")
@@ -424,17 +424,12 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
         sizes = {p: kappa if name == "wall_stretch" else p.default for p in effect.parameters}
         model = (inputs.model + effect).with_values({f"{name}.{p.name}": value for p, value in sizes.items()})
         try:
-            final = final_m_s(inputs, model, host, at_fraction)
+            (final,) = final_speeds(model, [trial], at_fraction, host=host).tolist()
         except EffectError:
             continue
         words = [f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in sizes.items()]
         neglected_effects.append(Neglected(name, ", ".join(words), final, without))
     return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
-
-
-def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
-    """Return the final speed at the medians under this model, m/s, see `final_speeds`."""
-    return float(final_speeds(model, [inputs.trial], at_fraction, host=host)[0])
 
 
 # ------------------------------------------------------------------------------
@@ -628,7 +623,7 @@ def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fra
     """Return the final speed at the medians with a closed chamber of this volume, m/s; see `VinePrediction.final`."""
     model = _with(inputs.model, "reservoir_depletion", gamma=gamma)
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
-    return final_m_s(replace(inputs, trial=trial, model=model), model, host_for(inputs.model), at_fraction)
+    return float(final_speeds(model, [trial], at_fraction, host=host_for(inputs.model))[0])
 
 
 def _with(model: Model, name: str, **values: float) -> Model:

@@ -12,7 +12,7 @@ import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
@@ -20,16 +20,13 @@ from scipy.special import ndtri
 from vinetrack.core import published
 from vinetrack.core.problems import Problem, Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.units import convert, number, or_nan
+from vinetrack.core.units import convert, number
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE
-
-if TYPE_CHECKING:
-    from vinetrack.inference.fit_result import Fit
-
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
+from vinetrack.inference.fit_summary import FitSummary
 
 # ------------------------------------------------------------------------------
 # Scaling priors for vines that have not been measured, each with a standard error.
@@ -275,7 +272,7 @@ def _uniform(name: str, size: Size) -> Sampler:
 # ------------------------------------------------------------------------------
 # Fitted parameters in the form from which predictions draw: means, covariance, between-trial standard deviations.
 #
-# They come from a `Fit` or from `fit.json`. B is held as its logarithm, as in the fit.
+# B is held as its logarithm, as in the fit.
 
 
 @dataclass(frozen=True)
@@ -309,62 +306,44 @@ class FitNumbers:
         return {m[0]: (float(m[1]) / 1e3, float(m[2]) / 1e6) for m in named if m}
 
 
-def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
-    """Read the parameters of a fit from the content of `fit.json`."""
-    if content.get("refused"):
-        raise FitError(f"{source} holds no fit to predict from: {content['refused']}")
-    numbers = content["numbers"]
-    if not numbers:
+def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
+    """Read the parameters of a fit, in memory or from `fit.json`."""
+    if isinstance(fit, FitSummary) and fit.refused:
+        raise FitError(f"{source} holds no fit to predict from: {fit.refused}")
+    if not fit.numbers:
         raise FitError(f"{source} holds a fit without numbers: there is nothing to predict from.")
-    covariance = np.array([[or_nan(cell) for cell in row] for row in content["covariance"]], dtype=float)
-    values = np.array([number["value"] for number in numbers], dtype=float)
-    log = np.array([number["parameter"] == DAMPING and number["value"] > 0 for number in numbers], dtype=bool)
+    values = np.array([number.value for number in fit.numbers])
+    log = np.array([number.key == DAMPING and number.value > 0 for number in fit.numbers])
     slopes = np.where(log, 1 / np.where(log, values, 1.0), 1.0)
-    widening = np.array([_widening(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)])
-    between = np.array([[or_nan(cell) for cell in row] for row in content.get("between_trials") or ()], dtype=float)
-    is_known = np.isfinite(np.diag(covariance))
-    if between.shape == covariance.shape:
+    widening = np.array([_widening(number, bool(is_log)) for number, is_log in zip(fit.numbers, log, strict=True)])
+    covariance, is_known = fit.covariance, np.isfinite(np.diag(fit.covariance))
+    if fit.between is not None and fit.between.shape == covariance.shape:
         # A prediction is of one trial, whose parameters differ from the shared ones.
-        covariance = covariance + np.nan_to_num(between)
-    dof = float(max(len(content["trials"]) - len(numbers), 3))  # t of fewer degrees of freedom has no variance
+        covariance = covariance + np.nan_to_num(fit.between)
+    dof = float(max(len(fit.trials) - len(fit.numbers), 3))  # t of fewer degrees of freedom has no variance
     scale = np.where(is_known, slopes * widening, 0.0)
     return FitNumbers(
         source=source,
-        model=tuple(content["model"]),
-        keys=tuple(number["parameter"] for number in numbers),
-        vines=tuple(number["vine"] for number in numbers),
+        model=fit.names,
+        keys=tuple(number.key for number in fit.numbers),
+        vines=tuple(number.vine for number in fit.numbers),
         log=log,
         mean=np.where(log, np.log(np.where(log, values, 1.0)), values),
         covariance=np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale,
-        open=tuple(number["symbol"] for number, known in zip(numbers, is_known, strict=True) if not known),
-        spreads={name: float(spread["value"]) for name, spread in content["spreads"].items()},
-        spread_dof={name: dof if spread["estimated"] else math.inf for name, spread in content["spreads"].items()},
-        n_trials=len(content["trials"]),
+        open=tuple(number.symbol for number, known in zip(fit.numbers, is_known, strict=True) if not known),
+        spreads={name: spread.value for name, spread in fit.spreads.items()},
+        spread_dof={name: dof if spread.estimated else math.inf for name, spread in fit.spreads.items()},
+        n_trials=len(fit.trials),
     )
 
 
-def _widening(number: Mapping[str, Any], log: bool) -> float:
+def _widening(number: Number, log: bool) -> float:
     """Ratio of the fit's 95 % interval to that of a normal distribution, at least 1; 1 where a bound determines it."""
-    low, high, sigma = (or_nan(number[key]) for key in ("low_95", "high_95", "sigma"))
-    if number["interval"] != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
+    low, high, sigma = number.low, number.high, number.sigma
+    if number.method != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
         return 1.0
     half = (math.log(high / low) if log else high - low) / 2
-    return max(half / (float(ndtri(0.975)) * (sigma / number["value"] if log else sigma)), 1.0)
-
-
-def numbers_of(fit: Fit) -> FitNumbers:
-    """Return the parameters of a fit as `vinetrack.fit` returns it."""
-    content = {
-        "model": fit.model.names,
-        "numbers": [number.to_json() for number in fit.numbers],
-        "covariance": fit.covariance,
-        "between_trials": None if fit.between is None else fit.between.tolist(),
-        "spreads": {
-            name: {"value": spread.value, "estimated": spread.estimated} for name, spread in fit.spreads.items()
-        },
-        "trials": {trial.name: None for trial in fit.trials},
-    }
-    return fit_numbers(content, "the fit")
+    return max(half / (float(ndtri(0.975)) * (sigma / number.value if log else sigma)), 1.0)
 
 
 def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
@@ -488,7 +467,7 @@ def predictive_inputs(
     stated = stated or StatedValues()
     if fit is not None and not isinstance(fit, FitNumbers):
         stated = replace(stated, user_effects={**{effect.name: effect for effect in fit.model}, **stated.user_effects})
-        fit = numbers_of(fit)
+        fit = fit_numbers(fit)
     sources = _Sources(trial, fit)
     names = [*(fit.model if fit else stated.model), *stated.effects]
     model = make_model(dict.fromkeys(names), stated.user_effects)
