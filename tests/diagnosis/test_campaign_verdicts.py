@@ -17,6 +17,7 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
+from vinetrack.core.problems import Remark
 from vinetrack.core.records import Trial
 from vinetrack.core.units import with_error
 from vinetrack.diagnosis import likelihood_ratio
@@ -26,7 +27,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     film_gain,
 )
 from vinetrack.diagnosis.misfit_tests import noise_in_motion_p
-from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.score_test import (
     RANGE_SHARE_BESIDE_SLIP,

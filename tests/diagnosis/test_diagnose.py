@@ -20,13 +20,13 @@ from tube.models import fit_tubes, models, threshold_kPa
 from tube.recordings import read_recordings, thresholds
 
 import vinetrack as vt
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
 from vinetrack.diagnosis.missing_force import RankedLaw
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.replicates import LostFrames, with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.selection import contradictions

@@ -86,7 +86,7 @@ def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_larg
     nuisances = [{}, {}, {"noise_correlation": 0.6}, {"damping_scatter": 0.005, "pressure_scatter": 0.002}]
     fits = [fitted(pairs_of(grown(sheet(), 72 + k, **more))) for k, more in enumerate(nuisances)]
     for found in map(drift, fits):
-        assert found.sentences == ()
+        assert found.remarks == ()
         assert found.table["z"].max() < 3
     complete = [locate(fit) for fit in fits]
     assert not any(found.fails for found in complete)

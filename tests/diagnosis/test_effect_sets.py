@@ -13,10 +13,10 @@ from hidden_truth import grown, sheet
 from scipy.stats import chi2, norm
 
 import vinetrack as vt
+from vinetrack.core.problems import Remark
 from vinetrack.diagnosis import selection
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
-from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.diagnosis.score_test import FamilyTest
 from vinetrack.diagnosis.selection import EffectSets

@@ -13,9 +13,9 @@ from lsoda_vine import grown_position, vine_trial
 from vine_truth import make_track
 
 import vinetrack.diagnosis.replicates as odd_trials_module
+from vinetrack.core.problems import remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
-from vinetrack.diagnosis.remarks import remark
 from vinetrack.diagnosis.replicates import OddTrial, odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import FitError, prepare

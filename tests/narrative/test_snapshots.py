@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from hand_diagnosis import diagnosis
 
+from vinetrack.core.problems import remark
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
-from vinetrack.diagnosis.remarks import remark
 from vinetrack.diagnosis.result import VERDICTS, Diagnosis
 from vinetrack.narrative.diagnosis_text import further_lines
 from vinetrack.narrative.verdict_text import summary_facts, verdict_meaning, verdict_sentence

@@ -1,14 +1,18 @@
 """Problems of the user's input, each with its location, the value, what is allowed, and the remedy.
 
-Reading an experiment collects all problems before it stops, so that a sheet can be corrected in one pass.
+Reading an experiment collects all problems before it stops, so that a sheet can be corrected in one pass. At the end,
+remarks on results: a reason, a warning or a note as a code with its numbers; `vinetrack.narrative` makes sentences.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from importlib import import_module
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, PlainSerializer
 
 CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
 
@@ -123,3 +127,51 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 def _one_line(text: str) -> str:
     """Replace line breaks and control characters, so that a cell cannot forge further lines of output."""
     return "".join(char if char.isprintable() else " " for char in text)
+
+
+# ------------------------------------------------------------------------------
+# A reason, a warning or a note as a code with its numbers.
+
+
+def in_words(told: Any) -> str:
+    """Return a remark or a result in words."""
+    # "vinetrack.narrative": room whose function `in_words(object)` makes sentences; it lies above, and is
+    # imported when words are requested
+    words: str = import_module("vinetrack.narrative").in_words(told)
+    return words
+
+
+def joined(names: Sequence[str], last: str = "and") -> str:
+    """Return names as a sentence lists them; blank for none."""
+    return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
+
+
+@dataclass(frozen=True)
+class Remark:
+    """A code, and the names and numbers (SI) that belong to it. Blank and false without a code; as text, a sentence."""
+
+    code: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.code)
+
+    def __str__(self) -> str:
+        return in_words(self) if self.code else ""
+
+    def to_json(self) -> dict[str, Any] | None:
+        """The code and its facts; None without a code."""
+        return {"code": self.code, **self.facts} if self.code else None
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any] | None) -> Remark:
+        """Read what `to_json` wrote."""
+        return cls(content["code"], {k: v for k, v in content.items() if k != "code"}) if content else cls()
+
+
+StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)]
+
+
+def remark(code: str, **facts: Any) -> Remark:
+    """Return a remark with these facts."""
+    return Remark(code, facts)

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.likelihood_ratio import (
     Difference,
@@ -30,7 +31,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     with_shared_errors,
     with_trace_errors,
 )
-from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
     BETWEEN_TRIALS,

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vinetrack.core.problems import Remark
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.power import Rate, SimulatedRates
-from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.score_test import testable
 from vinetrack.dynamics.model import Model, host_for

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.between_trials import between_candidates
@@ -21,7 +22,6 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.diagnosis.replicates import (
     correct_dropped_frames,
     dropped_frames_in,
@@ -350,7 +350,7 @@ def _located(result: Diagnosis, report: Report) -> Diagnosis:
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
         return replace(result, notes=(*result.notes, remark("not_located", error=str(error))))
     drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
-    return replace(result, failure=failure, where=failure.sentences(), drift=drift)
+    return replace(result, failure=failure, where=failure.remarks(), drift=drift)
 
 
 def _with_missing_force(result: Diagnosis, report: Report) -> Diagnosis:

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.units import decimals, display_unit
 from vinetrack.diagnosis.force_inversion import FittedMotion, acceleration_sensitivities, motions_of
 from vinetrack.diagnosis.ladder import in_sample
 from vinetrack.diagnosis.replicates import (
@@ -162,27 +162,14 @@ FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine
 LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scatter of pressure and B (chosen)
 
 
-@dataclass(frozen=True)
-class Covariate:
-    """A condition on which a parameter should not depend: the attribute of a trial, and how it is displayed."""
-
-    column: str
-    label: str
-    unit: str
-    factor: float
-    logarithmic: bool
-
-    def level(self, trial: Trial) -> float:
-        """The nominal value for a trial, SI."""
-        return float(getattr(trial, self.column))
-
-    def coordinate(self, levels: Floats) -> Floats:
-        """The coordinate in which a trend is linear. Shapes: levels (n_trials,) → (n_trials,)."""
-        return np.log(levels) if self.logarithmic and np.all(levels > 0) else levels
-
-    def formatted(self, level: float) -> str:
-        """A level with its unit."""
-        return f"{level * self.factor:.3g} {self.unit}"
+# Conditions on which a parameter should not depend: attributes of a trial, and whether a trend is one of the logarithm
+COVARIATES = {
+    "pressure_Pa": True,
+    "payload_kg": False,
+    "growth_angle_rad": False,
+    "chamber_m3": True,
+    "inlet_m": True,
+}
 
 
 @dataclass(frozen=True)
@@ -293,16 +280,18 @@ def _tested(
     z: float,
     dof: float,
     n_trials: int,
-    sentence: str,
     relative: bool = False,
     z_constancy: float = math.nan,
     groups: Sequence[dict[str, object]] = (),
+    **told: object,
 ) -> ConstancyTest:
-    """A test as a row of the table: levels from and to, the change between them and its standard error."""
+    """A test as a row of the table: levels from and to, the change between them and its standard error; `told` is what
+    the sentence about it needs besides.
+    """
     of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
     numbers = (*levels, *change, relative, z, z if math.isnan(z_constancy) else z_constancy, dof, n_trials)
-    columns = [name for name in DRIFT_COLUMNS if name != "significant"]
-    return ConstancyTest(dict(zip(columns, (*of_parameter, *numbers, sentence), strict=True)), p, list(groups))
+    row = dict(zip(DRIFT_COLUMNS, (*of_parameter, *numbers), strict=False))
+    return ConstancyTest({**row, "sentence": remark("drifts", row=row, **told)}, p, list(groups))
 
 
 def _group(
@@ -414,8 +403,6 @@ def _difference_test(
             with_error = ratio, ratio * sigma / math.sqrt(2)
             value = base * with_error[0], base * with_error[1]
             groups.append(_group(estimates, vine, "growth", level, value, with_error, int(chosen.size)))
-    where = ("first", "second") if mean >= 0 else ("second", "first")
-    digits = max(decimals(100 * error) - 1, 0)
     return _tested(
         estimates,
         vine,
@@ -427,11 +414,6 @@ def _difference_test(
         z=normal_deviate(p),
         dof=dof,
         n_trials=int(chosen.size),
-        sentence=(
-            f"{f'B of {vine}' if vine else 'B'} would have to be {100 * change:.{digits}f} ± {100 * error:.{digits}f} %"
-            f" larger in the {where[1]} half of the growth than in the {where[0]} ({normal_deviate(p):.1f} σ), though"
-            " it should not change along the growth."
-        ),
         groups=groups,
     )
 
@@ -469,10 +451,7 @@ def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
             z=z,
             dof=math.inf,
             n_trials=sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
-            sentence=(
-                f"{number.symbol} of {number.vine} is pulled from the {free.start / 1e3:.2f} ±"
-                f" {free.prior_sd / 1e3:.2f} kPa of the sheet to {number.value / 1e3:.2f} kPa ({z:.1f} σ)."
-            ),
+            stated_sigma_Pa=free.prior_sd,
         )
 
 
@@ -492,11 +471,11 @@ class Drift:
 
     table: pd.DataFrame
     groups: pd.DataFrame
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
 
     @property
-    def sentences(self) -> tuple[str, ...]:
-        """One sentence for each parameter and condition with a significant drift, of the most significant row."""
+    def remarks(self) -> tuple[Remark, ...]:
+        """One remark for each parameter and condition with a significant drift, on the most significant row."""
         significant = self.table[self.table["significant"]].drop_duplicates(["parameter", "against"])
         return tuple(significant["sentence"])
 
@@ -505,7 +484,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
     """Test every parameter for drift with pressure, payload, angle, chamber, inlet, vine or along the growth."""
     import pandas as pd
 
-    notes: list[str] = []
+    notes: list[Remark] = []
     scatter = scatter or replicate_scatter(fit, residual_courses(fit)[0])
     tests = list(_tests(fit, scatter, notes))
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
@@ -532,23 +511,17 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
     return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
 
 
-def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTest]:
+def _tests(fit: Fit, scatter: Scatter, notes: list[Remark]) -> Iterator[ConstancyTest]:
     keys = [key for key in fit.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
     aligned, damping = align_trials(fit), None
     for key in keys:
         try:
             estimates = per_trial_estimates(fit, key, aligned)
         except SimulationError:
-            notes.append(f"{key} could not be fitted to single trials: the simulation fails there.")
+            notes.append(remark("not_fitted_to_trials", key=key))
             continue
         damping = estimates if key == DAMPING else damping
-        for against in (
-            Covariate("pressure_Pa", "pressure", "kPa", 1e-3, True),
-            Covariate("payload_kg", "payload", "g", 1e3, False),
-            Covariate("growth_angle_rad", "growth angle", "°", 180 / math.pi, False),
-            Covariate("chamber_m3", "chamber volume", "l", 1e3, True),
-            Covariate("inlet_m", "inlet", "mm", 1e3, True),
-        ):
+        for against in COVARIATES:
             yield from _against(estimates, against)
     yield from _between_vines(fit, scatter)
     yield from against_the_sheet(fit)
@@ -556,12 +529,12 @@ def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTe
         try:
             yield from along_growth(fit, aligned, damping)
         except SimulationError:
-            notes.append("B along the growth could not be estimated: the simulation fails there.")
+            notes.append(remark("not_fitted_along_growth"))
 
 
-def _against(estimates: PerTrialEstimates, against: Covariate) -> Iterator[ConstancyTest]:
+def _against(estimates: PerTrialEstimates, against: str) -> Iterator[ConstancyTest]:
     """Tests of one parameter against one condition: each vine alone where the parameter is per vine, and all."""
-    levels = np.array([against.level(trial) for trial in estimates.trials])
+    levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
     usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
     vines = np.array([trial.vine for trial in estimates.trials])
     varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
@@ -575,16 +548,21 @@ def _against(estimates: PerTrialEstimates, against: Covariate) -> Iterator[Const
     else:
         choices = [("", usable)]
     for vine, chosen in choices:
-        sums = blocked_deviations(estimates, against.coordinate(levels), levels, chosen)
+        sums = blocked_deviations(estimates, _coordinate(against, levels), levels, chosen)
         if sums is None:
             continue
         shown = [] if estimates.per_vine and not vine else _groups(estimates, against, levels, chosen, sums, vine)
         yield _slope(estimates, against, levels[chosen], sums, vine, shown)
 
 
+def _coordinate(against: str, levels: Floats) -> Floats:
+    """The coordinate in which a trend is linear. Shapes: levels (n_trials,) → (n_trials,)."""
+    return np.log(levels) if COVARIATES[against] and np.all(levels > 0) else levels
+
+
 def _slope(
     estimates: PerTrialEstimates,
-    against: Covariate,
+    against: str,
     levels: Floats,
     sums: BlockedDeviations,
     vine: str,
@@ -596,31 +574,17 @@ def _slope(
     slope = float(np.sum(sums.weight * sums.x * sums.d)) / square
     sigma = math.sqrt(sums.variance / square)
     low, high = float(levels.min()), float(levels.max())
-    reach = float(np.diff(against.coordinate(np.array([low, high])))[0])
+    reach = float(np.diff(_coordinate(against, np.array([low, high])))[0])
     start, stop = (low, high) if slope >= 0 else (high, low)
     change, error = abs(slope) * reach, sigma * reach
     if estimates.logarithmic:
         change, error = math.expm1(change), math.exp(change) * error
     p = float(2 * student.sf(abs(slope) / sigma, sums.dof))
     p_groups, z_constancy = constancy_p_value(sums)
-    who = f"{estimates.symbol} of {vine}" if vine else estimates.symbol
-    if p <= p_groups:
-        unit, factor = ("%", 100.0) if estimates.logarithmic else display_unit(estimates.unit)
-        digits = max(decimals(error * factor) - 1, 0)
-        amount = f"{change * factor:.{digits}f} ± {error * factor:.{digits}f} {unit}".rstrip()
-        sentence = (
-            f"{who} rises by {amount} from {against.formatted(start)} to {against.formatted(stop)} of {against.label}"
-            f" ({normal_deviate(p):.1f} σ), though it should not depend on the {against.label}."
-        )
-    else:
-        sentence = (
-            f"{who} is not the same at every {against.label} ({z_constancy:.1f} σ), without rising or falling steadily"
-            f" from {against.formatted(low)} to {against.formatted(high)}."
-        )
     return _tested(
         estimates,
         vine,
-        against.column,
+        against,
         (start, stop),
         (change, error),
         relative=estimates.logarithmic,
@@ -629,14 +593,14 @@ def _slope(
         z_constancy=z_constancy,
         dof=sums.dof,
         n_trials=int(sums.x.size),
-        sentence=sentence,
         groups=groups,
+        steady=p <= p_groups,
     )
 
 
 def _groups(
     estimates: PerTrialEstimates,
-    against: Covariate,
+    against: str,
     levels: Floats,
     chosen: NDArray[np.bool_],
     sums: BlockedDeviations,
@@ -656,7 +620,7 @@ def _groups(
         else:
             value = base + mean, sigma
             ratio = (value[0] / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
-        rows.append(_group(estimates, vine, against.column, float(level), value, ratio, int(k.size)))
+        rows.append(_group(estimates, vine, against, float(level), value, ratio, int(k.size)))
     return rows
 
 
@@ -697,15 +661,9 @@ def _compare_vines(common: Number, estimates: Sequence[tuple[str, Number, int]])
     value, sigma = (np.array([getattr(number, name) for _, number, _ in estimates]) for name in ("value", "sigma"))
     mean = float(np.average(value, weights=1 / sigma**2))
     p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(estimates) - 1))
-    z = normal_deviate(p)
     scale = common.value or math.nan
     ordered = sorted(estimates, key=lambda estimate: estimate[1].value)
     (_, low, _), (_, high, _) = ordered[0], ordered[-1]
-    unit, factor = display_unit(common.unit)
-    ends = " and ".join(
-        f"{number.value * factor:.3g} ± {number.sigma * factor:.1g} {unit}".rstrip() + f" ({vine})"
-        for vine, number, _ in (ordered[0], ordered[-1])
-    )
     return _tested(
         common,
         "",
@@ -713,12 +671,10 @@ def _compare_vines(common: Number, estimates: Sequence[tuple[str, Number, int]])
         (math.nan, math.nan),
         (high.value - low.value, math.hypot(high.sigma, low.sigma)),
         p=p,
-        z=z,
+        z=normal_deviate(p),
         dof=math.inf,
         n_trials=sum(count for _, _, count in estimates),
-        sentence=(
-            f"{common.symbol} differs between the vines ({z:.1f} σ), though one value should describe all: {ends}."
-        ),
+        ends=[(vine, number) for vine, number, _ in (ordered[0], ordered[-1])],
         groups=[
             _group(
                 number,

@@ -15,9 +15,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import N_NONZERO, FittedMotion, nonzero_splines, uniform_knots
-from vinetrack.diagnosis.remarks import remark
 
 PATCH_CENTRES = 16  # Number of positions of a local force (chosen)
 

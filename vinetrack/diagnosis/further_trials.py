@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials, Power
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError

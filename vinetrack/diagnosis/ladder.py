@@ -10,6 +10,7 @@ model improves, but the excess √(rms² − floor²) does.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,9 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.notebook import plot
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.replicates import Replicates, align_replicates, first_that_counts, replicates_of
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
@@ -292,7 +293,7 @@ class Errors:
     """Predictions of trials, and the reason for each trial that cannot be predicted, by name."""
 
     trials: tuple[TrialFit, ...]
-    not_predicted: Mapping[str, str]
+    not_predicted: Mapping[str, Remark | str]
 
     @property
     def rms_m(self) -> float:
@@ -402,7 +403,7 @@ def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
     undetermined = {vine for vine in undetermined if _has_own_parameters(fit, vine)}
     predictable = [trial_data for trial_data in data if trial_data.trial.vine not in undetermined]
     not_predicted = {
-        trial_data.trial.name: f"no other condition of the vine {trial_data.trial.vine} determines its parameters"
+        trial_data.trial.name: remark("undetermined_vine", vine=trial_data.trial.vine)
         for trial_data in data
         if trial_data.trial.vine in undetermined
     }
@@ -433,9 +434,7 @@ def _combined(parts: Sequence[Errors]) -> Errors:
 
 
 def _notes(left_out: str, errors: Errors) -> list[Remark]:
-    reasons: dict[str, int] = {}
-    for reason in errors.not_predicted.values():
-        reasons[reason] = reasons.get(reason, 0) + 1
+    reasons = Counter(map(str, errors.not_predicted.values()))
     return [
         remark("left_out_error_without", left_out=left_out, count=count, reason=reason)
         for reason, count in reasons.items()

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
     CONVERGENCE_TOLERANCE,
@@ -42,7 +43,6 @@ from vinetrack.diagnosis.force_laws import (
     standard_error,
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
-from vinetrack.diagnosis.remarks import joined
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -199,18 +199,11 @@ def variable_weights(choices: Sequence[VariableChoice], error: float) -> dict[st
 
 
 # ------------------------------------------------------------------------------
-# Which variables a learned force may depend on when the trials cannot tell, and the sentences about it.
+# Which variables a learned force may depend on when the trials cannot tell.
 #
 # Where speeds are steady, growth, speed and time are hardly three separate variables: a surface over two of them can
 # be written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the
 # prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
-
-
-def variables_in_words(name: str) -> str:
-    """A choice of variables in words."""
-    words = {"growth": "the growth", "speed": "the speed of the tail", "time": "the time since release",
-             "pressure": "the pressure"}  # fmt: skip
-    return " and ".join(words[variable] for variable in name.split("+"))
 
 
 def not_excluded(
@@ -232,90 +225,6 @@ def not_excluded(
     return sorted(names, key=lambda name: -weights[name])
 
 
-def dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[str]) -> str:
-    """What the force depends on and how certain that is: a sentence without its full stop."""
-    subject = "Learned as a smooth function inside the fit, the missing force"
-    if not alternatives:
-        # 0.95: weight from which a choice counts as certain (chosen)
-        likely = "is described" if weights[name] >= 0.95 else "is most likely described"
-        return f"{subject} {likely} by {variables_in_words(name)} (posterior weight {weights[name]:.0%})"
-    choices = [tuple(choice.split("+")) for choice in (name, *alternatives)]
-    common = [variable for variable in choices[0] if all(variable in choice for choice in choices)]
-    shares = [f" ({weights[choice]:.0%})" if choice in weights else "" for choice in (name, *alternatives)]
-    remaining = ["+".join(variable for variable in choice if variable not in common) for choice in choices]
-    if common and all(remaining):
-        listed = joined(
-            [f"{variables_in_words(variables)}{share}" for variables, share in zip(remaining, shares, strict=True)],
-            "or",
-        )
-        shared = variables_in_words("+".join(common))
-        return f"{subject} is described by {shared}, and by {listed}: these trials do not tell which"
-    listed = joined(
-        [f"{variables_in_words(choice)}{share}" for choice, share in zip((name, *alternatives), shares, strict=True)],
-        "or by",
-    )
-    return f"{subject} is described by {listed}: these trials do not tell which"
-
-
-def reference(domain: Domain, at_start: str, undecided_N: float) -> str:
-    """From where the force is measured, and which part of it the trials do not determine: whole sentences."""
-    if domain.start_axis < 0:
-        return "These trials do not decide how much of it belongs to B, n and P_y; it is drawn as small as they allow."
-    if at_start == FREE_AT_START:
-        return (
-            "It is not zero where growth begins, because B, n and P_y cannot account for all that acts there; they"
-            f" could account for a part of it that is the same all along the growth, ±{undecided_N:.2f} N."
-        )
-    constant = (
-        ", except for a constant, which P_y cannot account for within its error"
-        if at_start == CONSTANT_AT_START
-        else ""
-    )
-    competitors = f" (±{undecided_N:.2f} N), which B, n and P_y" if undecided_N else ", which P_y"
-    return (
-        f"It is measured from where growth begins{constant}: B, n and P_y are those of the vine there. The trials"
-        " determine how it changes from there on, but not a part that is the same all along the"
-        f" growth{competitors} could account for as well."
-    )
-
-
-def force_sentence(
-    best: ForcePosterior,
-    weights: Mapping[str, float],
-    alternatives: Sequence[str],
-    explained: float,
-    table: pd.DataFrame,
-    undecided_N: float,
-) -> str:
-    """The variables of the force and how sure they are, its range and error, and from where it is measured."""
-    visited = table[(table["condition"] == "") & (table["trials"] > 0)]
-    low, high, sigma = (
-        float(value) for value in (visited["force_N"].min(), visited["force_N"].max(), visited["sigma_N"].median())
-    )
-    name = best.domain.name
-    subject = f" As a function of {variables_in_words(name)} it" if alternatives else " It"
-    return (
-        f"{dependence(name, weights, alternatives)}.{subject} ranges from {low:.2f} to {high:.2f} N where there are"
-        f" trials, with a standard error of {sigma:.2f} N, and takes away {explained:.0%} of the misfit."
-        f" {reference(best.domain, best.at_start, undecided_N)} A law over other variables may fit the tracks as well."
-    ).replace("-", "−")
-
-
-def remarks(replicates: int, domains: Sequence[Domain], alternatives: Sequence[str]) -> list[str]:
-    """What limits the result, and which trials would help."""
-    sentences = []
-    if not replicates:
-        sentences.append("No condition was repeated: how sure this is rests on the scatter that the fit assumes.")
-    if not any("pressure" in domain.variables for domain in domains):
-        sentences.append("All trials had one pressure, so they do not show whether the force depends on it.")
-    if alternatives:
-        sentences.append(
-            "Trials that reach the same growth at another speed or time, by another pressure or payload, would tell"
-            " them apart."
-        )
-    return sentences
-
-
 LEARNED_COLUMNS = (*VARIABLES.values(), "force_N", "sigma_N", "trials", "condition")
 
 
@@ -335,7 +244,7 @@ class LearnedForce:
     log_bayes_factor: float
     explained: float
     table: pd.DataFrame
-    sentence: str
+    sentence: Remark
     undecided_N: float = 0.0
 
     @property
@@ -355,7 +264,7 @@ class LearnedForce:
             "explained": self.explained,
             "begins": self.best.at_start,
             "undecided_N": self.undecided_N,
-            "sentence": self.sentence,
+            "sentence": str(self.sentence),
         }
 
 
@@ -396,7 +305,7 @@ def learned_force(problem: ForceProblem) -> LearnedForce | None:
     }
     alternatives = not_excluded(best.domain, weights, losses, ANSWER_SET_DELTA_CHI2 * error, seen.domains)
     table, explained = _table(best, seen.point.motions), min(explained, 1.0)
-    sentence = force_sentence(best, weights, alternatives, explained, table, choice.undecided_N)
+    visited = table[(table["condition"] == "") & (table["trials"] > 0)]
     return LearnedForce(
         best=best,
         motions=seen.point.motions,
@@ -405,7 +314,19 @@ def learned_force(problem: ForceProblem) -> LearnedForce | None:
         log_bayes_factor=log_bayes_factors[best.domain.name],
         explained=explained,
         table=table,
-        sentence=" ".join([sentence, *remarks(problem.scatter.dof, seen.domains, alternatives)]),
+        sentence=remark(
+            "learned_force",
+            name=best.domain.name,
+            weights=weights,
+            alternatives=alternatives,
+            begins=best.at_start if best.domain.start_axis >= 0 else "",
+            range_N=(float(visited["force_N"].min()), float(visited["force_N"].max())),
+            sigma_N=float(visited["sigma_N"].median()),
+            undecided_N=choice.undecided_N,
+            explained=explained,
+            is_repeated=bool(problem.scatter.dof),
+            has_pressures=any("pressure" in domain.variables for domain in seen.domains),
+        ),
         undecided_N=choice.undecided_N,
     )
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER, N_BY_VINE
 from vinetrack.diagnosis.score_test import is_plausible, plausible_range, slip_of
 from vinetrack.dynamics.simulate import SimulationError

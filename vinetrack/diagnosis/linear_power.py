@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import END_FRACTION, Floats
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
 from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.score_test import (
     CandidateShape,
     Products,

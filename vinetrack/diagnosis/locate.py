@@ -9,14 +9,14 @@ depend (`vinetrack.diagnosis.drift`). A prediction has its own release and origi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
-from vinetrack.core.units import decimals
 from vinetrack.diagnosis.drift import (
     Drift,
     ResidualCourse,
@@ -80,9 +80,9 @@ class Failure:
         """Whether the worst condition, or all together, deviate by more than the scatter of replicates."""
         return _fail(self.by_condition["z"].to_numpy(float))
 
-    def sentences(self) -> tuple[str, ...]:
-        """Where the model fails most, by how much, and what drifts, in words."""
-        return (*_where(self.by_condition, self.fails), *self.drift.sentences)
+    def remarks(self) -> tuple[Remark, ...]:
+        """Where the model fails most, by how much, and what drifts."""
+        return (*_where(self.by_condition, self.fails), *self.drift.remarks)
 
 
 def locate(fit: Fit) -> Failure:
@@ -197,69 +197,29 @@ def _fail(z: Floats) -> bool:
     return bool(p.min() < level / z.size or together < level)
 
 
-def _where(table: pd.DataFrame, fails: bool) -> list[str]:
-    """Sentences about conditions; the table has the worst first."""
-    # 2.0: significance, in standard deviations, from which it is said to fail in a condition
-    failing = table[table["z"] > min(2.0, float(table["z"].max()) - 1e-9)]
+def _where(table: pd.DataFrame, fails: bool) -> Iterator[Remark]:
+    """Remarks about conditions; the table has the worst first."""
     if not fails:
         worst = table.sort_values("z").iloc[-1]
-        return [
-            "In no condition does the mean of the replicates deviate from the model by more than their scatter explains"
-            f" (at most {max(float(worst['z']), 0.0):.1f} σ, at {_named(worst, table)})."
-        ]
+        yield remark("fails_nowhere", z=max(float(worst["z"]), 0.0), condition=_named(worst, table))
+        return
     worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
-    scatter = (
-        f"where replicates scatter by {_mm(worst['floor_m'])}"
-        if math.isfinite(worst["floor_m"])
-        else "without replicates"
-    )
-    ahead = "ahead of" if worst["worst_residual_m"] > 0 else "behind"
-    places = [
-        f"The model fails most at {_named(worst, table)}: root mean square {_mm(worst['rms_m'])} {scatter}; there the"
-        f" vine is {_off(worst)} {ahead} the model"
-        f" ({worst['z']:.1f} σ in all)."
-    ]
-    where = "every condition" if len(failing) == len(table) else f"{len(failing)} of {len(table)} conditions"
-    places.append(f"It fails in {where} by more than the scatter of replicates.")
-    return places + _trend(table)
-
-
-def _trend(table: pd.DataFrame) -> list[str]:
-    """Say whether the misfit grows with pressure or payload."""
-    trends = []
-    for column, words, low, high in (
-        ("pressure_Pa", "pressure", "lower", "higher"),
-        ("payload_kg", "payload", "smaller", "larger"),
-    ):
+    numbers = {name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")}
+    yield remark("fails_most", condition=_named(worst, table), **numbers)
+    # 2.0: significance, in standard deviations, from which it is said to fail in a condition
+    failing = table["z"] > min(2.0, float(table["z"].max()) - 1e-9)
+    yield remark("fails_in", count=int(failing.sum()), total=len(table))
+    for column in ("pressure_Pa", "payload_kg"):
         usable = table[np.isfinite(table["ratio"])]
         steps = [group.sort_values(column)["ratio"].to_numpy(float) for _, group in usable.groupby("vine")]
         steps = [step for step in steps if step.size > 2]
-        if not steps or len(set(usable[column])) < 3:
-            continue
-        ranks = [np.corrcoef(np.arange(step.size), np.argsort(np.argsort(step)))[0, 1] for step in steps]
-        if all(rank > 0.75 for rank in ranks):
-            trends.append(f"The {high} the {words}, the larger the misfit.")
-        elif all(rank < -0.75 for rank in ranks):
-            trends.append(f"The {low} the {words}, the larger the misfit.")
-    return trends
+        if steps and len(set(usable[column])) >= 3:
+            ranks = [np.corrcoef(np.arange(step.size), np.argsort(np.argsort(step)))[0, 1] for step in steps]
+            if min(ranks) > 0.75 or max(ranks) < -0.75:
+                yield remark("misfit_rises" if ranks[0] > 0 else "misfit_falls", column=column)
 
 
-def _named(row: pd.Series, table: pd.DataFrame) -> str:
-    """A condition in words: pressure, and payload and vine where they vary."""
-    words = f"{row['pressure_Pa'] / 1e3:.3g} kPa"
-    if len(set(table["payload_kg"])) > 1:
-        words += f" with {row['payload_kg'] * 1e3:.3g} g"
-    if len(set(table["vine"])) > 1:
-        words += f" ({row['vine']})"
-    return words
-
-
-def _mm(metres: float) -> str:
-    return f"{1e3 * metres:.2g} mm"
-
-
-def _off(row: pd.Series) -> str:
-    """The largest mean residual with its standard error, mm."""
-    off, sigma = 1e3 * abs(row["worst_residual_m"]), 1e3 * row["worst_sigma_m"]
-    digits = decimals(sigma)
-    return f"{off:.{digits}f} ± {sigma:.{digits}f} mm"
+def _named(row: pd.Series, table: pd.DataFrame) -> dict[str, object]:
+    """What names a condition: its pressure, and payload and vine where they vary."""
+    varying = [name for name in ("payload_kg", "vine") if len(set(table[name])) > 1]
+    return {name: row[name] for name in ("pressure_Pa", *varying)}

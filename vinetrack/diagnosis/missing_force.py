@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
@@ -276,14 +277,14 @@ class MissingForce:
     table: pd.DataFrame
     laws: pd.DataFrame
     depends_on: Mapping[str, float]
-    sentence: str
+    sentence: Remark
     detected: tuple[DetectedLaw, ...] = ()
     learned: LearnedForce | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
         return {
-            "sentence": self.sentence,
+            "sentence": str(self.sentence),
             "laws": self.laws.head(6).to_dict("records"),
             "depends_on": dict(self.depends_on),
             "learned": None if self.learned is None else self.learned.to_json(),
@@ -318,7 +319,7 @@ def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
         table=_force_table(point.motions, curves),
         laws=_law_table(laws),
         depends_on=depends_on,
-        sentence=_sentence(laws, depends_on, reduction),
+        sentence=_remark(laws, depends_on, reduction),
         detected=tuple(_detected(law) for law in laws if law.is_detected),
         learned=_learned(problem) if learn else None,
     )
@@ -449,46 +450,24 @@ def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
 
 
-def _sentence(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_reduction: float) -> str:
-    """What the missing force looks like, in a sentence or two."""
+def _remark(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit_reduction: float) -> Remark:
+    """What the missing force looks like."""
     best = laws[0]
     if misfit_reduction < LEAST_MISFIT_REDUCTION:
-        return (
-            "No smooth force on the tail explains the misfit: a separate one in every condition takes away"
-            f" {max(misfit_reduction, 0.0):.0%} of it. Either it is no force, or the model is too far off to say."
-        )
-    if not best.is_detected and math.isfinite(misfit_reduction):
-        return "What is missing is no simple law of force that single trials agree on."
+        return remark("no_smooth_force", reduction=max(misfit_reduction, 0.0))
     if not best.is_detected:
-        return "No further force on the tail is significant beyond the scatter between trials."
+        return remark("no_law_agreed_on" if math.isfinite(misfit_reduction) else "no_further_force")
+    told = {"law": best.words, "explained": best.explained}
     if best.explained < LEAST_EXPLAINED_TO_NAME:
-        return _no_law_sentence(best, depends_on)
+        variable = max(depends_on, key=depends_on.__getitem__)
+        alone = depends_on[variable] if depends_on[variable] >= LEAST_EXPLAINED_TO_NAME else 0.0
+        return remark("like_no_law", **told, variable=variable, alone=alone)
     # Misfit that not even a free force takes away limits how well laws can be told apart.
     # 0.05: difference of the explained parts within which other laws are named with the best (chosen)
     margin = 0.05 + float(np.nan_to_num(1 - misfit_reduction))
     others = [
-        law
+        law.words
         for law in laws[1:]
         if law.is_detected and law.explained > best.explained - margin and law.law.n_shapes <= best.law.n_shapes
     ]
-    sentence = f"What is missing looks like {best.words}; that explains {best.explained:.0%} of what any force could."
-    if others:
-        sentence += f" These data fit nearly as well with: {'; '.join(other.words for other in others[:2])}."
-    return sentence
-
-
-def _no_law_sentence(best: RankedLaw, depends_on: Mapping[str, float]) -> str:
-    name, part = max(depends_on.items(), key=lambda each: each[1])
-    variable = {
-        "growth": "the growth",
-        "speed": "the speed",
-        "time": "the time",
-        "condition": "the condition, and not on what happens within a trial",
-    }
-    sentence = (
-        f"What is missing looks like none of the simple laws: the best, {best.words},"
-        f" explains {best.explained:.0%} of it."
-    )
-    if part >= LEAST_EXPLAINED_TO_NAME:
-        sentence += f" It depends on {variable[name]}: a force of that alone explains {part:.0%}."
-    return sentence
+    return remark("like_a_law", **told, others=others[:2])

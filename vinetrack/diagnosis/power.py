@@ -15,10 +15,10 @@ import numpy as np
 from pydantic import Field
 
 from vinetrack.core.notebook import plot
+from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import or_nan
-from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.inference.fit_result import OrNaN, or_open
 

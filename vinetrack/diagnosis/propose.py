@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.candidate_fits import (
@@ -31,7 +32,7 @@ from vinetrack.diagnosis.candidate_fits import (
 from vinetrack.diagnosis.force_inversion import uniform_splines
 from vinetrack.diagnosis.force_laws import FORMS, VARIABLES, Domain
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
-from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce, variables_in_words
+from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -41,7 +42,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
 )
 from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, learn_missing_force, missing_force
-from vinetrack.diagnosis.remarks import Remark, joined, remark
 from vinetrack.diagnosis.score_test import shapes_of
 from vinetrack.dynamics.model import Model, check_needs, make_model
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
@@ -132,42 +132,16 @@ def table_name(learned: LearnedForce) -> str:
     return "_".join(["learned", *learned.domain.variables])
 
 
-def table_text(learned: LearnedForce, remark: str = "") -> str:
+def table_text(learned: LearnedForce, origin: str = "") -> str:
     """Source of an effect file that holds a learned force: docstring, table, parameter, function and a
     worked example.
     """
     domain = learned.domain
     table = uniform_table(domain, learned.best.mean)
-    variables = variables_in_words(domain.name)
-    symbols = ", ".join({"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}[name] for name in domain.variables)
-    unit_of = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
-    units = [unit_of[name] for name in domain.variables]
-    ranges = joined(
-        [
-            f"{variables_in_words(name)} from {low * factor:.3g} to {high * factor:.3g} {unit}"
-            for name, low, high, (unit, factor) in zip(domain.variables, domain.low, domain.high, units, strict=True)
-        ]
-    )
     state, worked = _worked_example(learned)
     axes = [line for k in range(len(domain.variables)) for line in _axis_code(domain, k)]
-    counts = " × ".join(str(count) for count in domain.counts)
     parts = [
-        f'"""Learned force: a table over {variables}, no law.\n',
-        *textwrap.wrap(remark, 118),
-        "" if remark else None,
-        *textwrap.wrap(learned.sentence, 118),
-        "",
-        *textwrap.wrap(
-            f"It is valid for {ranges}, the range that trials visited; outside, it keeps its value at the edge, which"
-            " has no meaning. Forces are positive along the growth, so that a friction is negative. The table"
-            " reproduces these trials but explains nothing: look at its figure, and find the formula.",
-            118,
-        ),
-        "",
-        f"    tail force a T({symbols}), T the sum of {counts} cubic splines on even steps",
-        "",
-        "Make trials that differ in the variables it depends on, and compare new trials with its prediction.",
-        '"""\n',
+        f'"""{remark("learned_file", learned=learned, origin=origin)}"""\n',
         "import numpy as np\n",
         "from vinetrack.effects import Parameter, Worked\n",
         *_table_lines(table),
@@ -189,7 +163,7 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
         "    ),",
         ")",
     ]
-    return "\n".join(part for part in parts if part is not None) + "\n"
+    return "\n".join(parts) + "\n"
 
 
 def _sum_code(axes: int) -> list[str]:
@@ -284,15 +258,6 @@ class ProposedTable:
     ratio: LikelihoodRatio
     rms_left_out_m: float
 
-    def sentences(self, before: Fit) -> list[str]:
-        """How much of the misfit the table explains."""
-        after = self.ratio.fit
-        return [
-            f"No formula in the list reproduces the learned force. As a table ({self.effect.name}) it reduces χ² per"
-            f" point from {before.chi2_per_dof:.1f} to {after.chi2_per_dof:.1f}; the error on left-out conditions, with"
-            f" the table itself learned from all trials, is {1e3 * self.rms_left_out_m:.2f} mm."
-        ]
-
 
 def proposed_table(
     model: Model, before: Fit, laws: Sequence[Fit], report: Callable[[str], None]
@@ -359,29 +324,6 @@ class Proposal:
     tied: tuple[ProposedLaw, ...]
     reason: Remark = field(default_factory=Remark)
     table: ProposedTable | None = None
-
-    def sentences(self) -> list[str]:
-        """What was fitted and what resulted, a line a sentence."""
-        return [*self._of_laws(), *([] if self.table is None else self.table.sentences(self.before))]
-
-    def _of_laws(self) -> list[str]:
-        if not self.tied:
-            return [f"{self.reason}." if self.table else f"{self.reason}; nothing is proposed."]
-        best = self.tied[0]
-        lines = [
-            f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
-            + (
-                f", error on left-out conditions {1e3 * self.rms_left_out_m:.2f} → {1e3 * law.rms_left_out_m:.2f} mm"
-                if math.isfinite(law.rms_left_out_m)
-                else ""
-            )
-            + (" (not excluded)" if law in self.tied and law is not best else "")
-            for law in self.laws
-        ]
-        lines.append(f"Proposed: {best.words}.")
-        if len(self.tied) > 1:
-            lines.append(f"These data fit nearly as well with {joined([law.words for law in self.tied[1:]])}.")
-        return lines
 
 
 @in_one_blas_thread
@@ -461,7 +403,7 @@ def _loaded(law: DetectedLaw, folder: Path) -> Effect:
     return load_effect(path)
 
 
-def effect_text(detected: DetectedLaw, remark: str = "") -> str:
+def effect_text(detected: DetectedLaw, origin: str = "") -> str:
     """Source of an effect file that holds a law: docstring, parameters with units and bounds, function,
     worked example.
     """
@@ -485,14 +427,7 @@ def effect_text(detected: DetectedLaw, remark: str = "") -> str:
         " A/A₀, A₀ the mean cross-section of these vines" if area else ""
     )
     parts = [
-        f'"""Proposed law: {detected.words}.\n',
-        *textwrap.wrap(remark, 118),
-        "" if remark else None,
-        "It describes these data but explains nothing: its physical cause is for you to find. Forces are positive",
-        "along the growth, so that a friction is negative.\n",
-        f"    {formula}\n",
-        "Make trials that differ in the variables it depends on, and compare new trials with its prediction.",
-        '"""\n',
+        f'"""{remark("law_file", law=detected.words, formula=formula, origin=origin)}"""\n',
         "import numpy as np\n",
         "from vinetrack.effects import Parameter, Worked\n",
         f"AREA = {law.reference_area_m2:.6g}  # m²\n" if area else None,

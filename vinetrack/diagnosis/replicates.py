@@ -16,9 +16,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Track, Trial, plain_track, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.result import ADEQUATE, ARTEFACT, DROPPED_FRAMES, UNEXPLAINED, Diagnosis, Round
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter

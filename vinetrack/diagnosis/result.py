@@ -7,17 +7,16 @@ while the verdict is `missing`, the effect is added and the next round tests the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
 from vinetrack.core.notebook import plot
+from vinetrack.core.problems import Remark, StoredRemark, in_words, remark
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.power import Power
-from vinetrack.diagnosis.remarks import Remark, StoredRemark, in_words, remark
 from vinetrack.inference.fit_result import Fit, Number, OrNaN
 
 if TYPE_CHECKING:
@@ -32,57 +31,22 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Confounder:
+class Confounder(JsonRecord):
     """Another effect that a fitted size may include."""
 
-    number: Number
+    number: Annotated[Number, Field(exclude=True)]
     effect: str
     symbol: str
     unit: str
-    limit: float
-    value: float
-    low_95: float
-    high_95: float
-
-    def to_json(self) -> dict[str, object]:
-        """Return it as an entry of `confounded_by`."""
-        return {
-            "parameter": self.number.key,
-            "vine": self.number.vine,
-            "effect": self.effect,
-            "symbol": self.symbol,
-            "unit": self.unit,
-            "limit_95": self.limit,
-            "value_at_limit": self.value,
-            "low_95": self.low_95,
-            "high_95": self.high_95,
-        }
+    limit: Annotated[OrNaN, Field(alias="limit_95")]
+    value: Annotated[OrNaN, Field(alias="value_at_limit")]
+    low_95: OrNaN
+    high_95: OrNaN
 
 
 def left_open(alike: Sequence[Confounder]) -> tuple[float, float]:
     """The 95 % interval of a size with each of these effects left free (hull). Returns low, high : SI."""
     return min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
-
-
-def read_confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Number]) -> tuple[Confounder, ...]:
-    """Read confounders from a file, each with the size that it concerns. Returns without those whose size is missing
-    from `numbers`.
-    """
-    of = {(number.key, number.vine): number for number in numbers}
-    return tuple(
-        Confounder(
-            number=of[entry["parameter"], entry["vine"]],
-            effect=str(entry["effect"]),
-            symbol=str(entry["symbol"]),
-            unit=str(entry["unit"]),
-            limit=or_nan(entry.get("limit_95")),
-            value=or_nan(entry.get("value_at_limit")),
-            low_95=or_nan(entry.get("low_95")),
-            high_95=or_nan(entry.get("high_95")),
-        )
-        for entry in entries
-        if (entry["parameter"], entry["vine"]) in of
-    )
 
 
 ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
@@ -144,7 +108,7 @@ class Candidate(JsonRecord):
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
-        confounders = [confounder.to_json() for confounder in self.confounded_by]
+        confounders = [{"parameter": c.number.key, "vine": c.number.vine, **c.to_json()} for c in self.confounded_by]
         entry = super().to_json()
         return {**entry, "reason": str(self.reason), "reason_code": entry["reason"], "confounded_by": confounders}
 
@@ -152,57 +116,48 @@ class Candidate(JsonRecord):
     def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
         """Read an entry of `ranking`; absent keys take their defaults."""
         read = super().from_json({**entry, "reason": entry.get("reason_code"), "confounded_by": ()})
-        return replace(read, confounded_by=read_confounders(entry.get("confounded_by") or (), read.numbers))
+        number_of = {(number.key, number.vine): number for number in read.numbers}
+        confounders = tuple(
+            Confounder.from_json({**stored, "number": number_of[place]})
+            for stored in entry.get("confounded_by") or ()
+            if (place := (stored["parameter"], stored["vine"])) in number_of
+        )
+        return replace(read, confounded_by=confounders)
 
 
-@dataclass(frozen=True)
-class Round:
+StoredCandidate = Annotated[Candidate, BeforeValidator(Candidate.from_json), PlainSerializer(Candidate.to_json)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round(JsonRecord):
     """One model and its tests against all candidates. `ranking` has the best candidate first, those not testable last.
     `cosines` are the correlations of the candidates' scores, with the fitted parameters projected off: names, and a
     matrix in their order.
     """
 
-    model: tuple[str, ...]
+    model: tuple[str, ...] = ()
     verdict: str
-    answer_set: tuple[str, ...]
-    ranking: tuple[Candidate, ...]
-    explanation: str
-    cosine_names: tuple[str, ...] = ()
-    cosines: Sequence[Sequence[float]] = ()
-    fit: Fit | None = None
-    fits: Mapping[str, Fit] = field(default_factory=dict)
+    answer_set: tuple[str, ...] = ()
     sets: tuple[tuple[str, ...], ...] = ()
-    partial: tuple[Candidate, ...] = ()
-    partial_fits: tuple[Fit, ...] = ()
+    partial: tuple[StoredCandidate, ...] = ()
+    explanation: str = ""
+    ranking: tuple[StoredCandidate, ...] = ()
+    cosine_names: Annotated[tuple[str, ...], Field(alias="effects")] = ()
+    cosines: Annotated[Sequence[Sequence[OrNaN]], Field(alias="matrix")] = ()
+    fit: Annotated[InstanceOf[Fit] | None, Field(exclude=True)] = None
+    fits: Annotated[Mapping[str, InstanceOf[Fit]], Field(exclude=True)] = field(default_factory=dict)
+    partial_fits: Annotated[tuple[InstanceOf[Fit], ...], Field(exclude=True)] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `rounds`."""
-        return {
-            "model": list(self.model),
-            "verdict": self.verdict,
-            "answer_set": list(self.answer_set),
-            "sets": [list(names) for names in self.sets],
-            "partial": [step.to_json() for step in self.partial],
-            "explanation": self.explanation,
-            "ranking": [candidate.to_json() for candidate in self.ranking],
-            "cosines": {"effects": list(self.cosine_names), "matrix": [list(row) for row in self.cosines]},
-        }
+        entry = super().to_json()
+        cosines = {name: entry.pop(name) for name in ("effects", "matrix")}
+        return {**entry, "cosines": cosines}
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Round:
         """Read an entry of `rounds`, which holds no fits."""
-        cosines = entry.get("cosines") or {}
-        return cls(
-            model=tuple(entry.get("model") or ()),
-            verdict=str(entry["verdict"]),
-            answer_set=tuple(entry.get("answer_set") or ()),
-            ranking=tuple(Candidate.from_json(candidate) for candidate in entry.get("ranking") or ()),
-            explanation=str(entry.get("explanation") or ""),
-            cosine_names=tuple(cosines.get("effects") or ()),
-            cosines=tuple(tuple(or_nan(value) for value in row) for row in cosines.get("matrix") or ()),
-            sets=tuple(tuple(names) for names in entry.get("sets") or ()),
-            partial=tuple(Candidate.from_json(step) for step in entry.get("partial") or ()),
-        )
+        return super().from_json({**entry, **(entry.get("cosines") or {})})
 
 
 @dataclass(frozen=True, repr=False)
@@ -217,7 +172,7 @@ class Diagnosis:
     fits: tuple[Fit, ...] = ()
     ladder: pd.DataFrame | None = None
     drift: Sequence[Mapping[str, Any]] = ()
-    where: Sequence[str] = ()
+    where: Sequence[Remark | str] = ()  # A file holds the sentences, as of drifts
     next_experiment: Mapping[str, Any] | None = None
     missing_force: Mapping[str, Any] | None = None
     notes: Sequence[Remark | str] = ()  # A file holds their sentences
@@ -310,8 +265,8 @@ class Diagnosis:
             "rounds": [step.to_json() for step in self.rounds],
             "parameters": [number.to_json() for number in self.parameters],
             "cosines": first.get("cosines", {}),
-            "where": list(self.where),
-            "drift": [dict(row) for row in self.drift],
+            "where": [str(line) for line in self.where],
+            "drift": [{key: str(v) if isinstance(v, Remark) else v for key, v in row.items()} for row in self.drift],
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "missing_force": None if self.missing_force is None else dict(self.missing_force),
             "notes": [str(note) for note in self.notes],

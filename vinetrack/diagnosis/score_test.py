@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.dynamics.model import Model, check_needs, stated
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.candidate_fits import (
@@ -50,7 +51,6 @@ from vinetrack.diagnosis.misfit_tests import (
     has_excess_scatter,
     misfit_tests,
 )
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
 from vinetrack.diagnosis.score_test import levers_of, plausible_range
 from vinetrack.dynamics.simulate import SimulationError

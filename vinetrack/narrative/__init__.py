@@ -5,28 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from vinetrack.diagnosis.remarks import joined
-
 # A sentence of each remark; longer ones are functions in `diagnosis_text.REMARKS`
 SENTENCES = {
     "in_measured_pressure": "the measured pressure already includes it",
     "no_measured_pressure": "it needs a pressure measured during growth, and no trial has one",
     "column_blank": "it needs `{column}`, which is blank or zero for every trial",
-    "columns_partly_blank": "it needs `{columns}`, which the sheet leaves blank for some trials",
-    "no_tube": "it acts on {column}, and a body that moves as a whole has none",
     "no_response": "no trial responds to it at any plausible size",
     "too_weak_here": "in these conditions the largest plausible size would not be detected",
     "contains": "it contains {name} as a limit",
     "contains_and_fits_no_better": "it contains {name} as a limit and fits no better",
     "behind_in_one_trial_each": "fitted to one trial of every condition, worse by Δχ² = {delta_chi2:.0f}",
     "size_may_be_zero": "its size, {symbol} = {value:.2g} ± {sigma:.2g}, is compatible with none",
-    "implausible_size": "it would need {symbol} = {value:.3g}{unit}, and {low:.3g} to {high:.3g} is plausible",
     "outside_plausible_range": "its size lies outside the plausible range",
     "misfit_remains": "a significant misfit remains once it is added",
     "too_weak_in_set": "{effect} reaches {sigmas:.1f} σ given the others, and {required:.1f} σ are required",
     "gain_within_chance": "its gain over the best smaller set is within chance",
-    "several_missing": "{count} effects are missing: none alone removes the misfit",
-    "not_tried": "Not tried, because the sheet does not state what they need: {names}.",
     "excess_counted_as_noise": "the residuals exceed the noise of the trials, and the sizes count the excess as noise",
     "no_law_detected": "No simple law of force is detected in the misfit of the model",
     "no_law_predicts_better": "No simple law of force both explains the misfit and predicts left-out conditions better",
@@ -34,24 +27,59 @@ SENTENCES = {
     "no_next_experiment": "No next experiment could be computed: {error}",
     "not_located": "Where the model fails could not be computed: {error}",
     "no_missing_force": "The missing force could not be computed: {error}",
-    "left_out_error_does_not_fall": "Against this verdict: The error on left-out conditions does not fall with {name}: "
-    "{without_mm:.2f} mm without it, {with_mm:.2f} mm with it. The data support {name} by the shape of the motion "
-    "alone.",
-    "still_drifts": "Against this verdict: With {model}: {drift}",
-    "left_out_error_without": "The error on {left_out} is without {trials}, unlike that in sample: {reason}",
+    "undetermined_vine": "no other condition of the vine {vine} determines its parameters",
+    "not_fitted_to_trials": "{key} could not be fitted to single trials: the simulation fails there.",
+    "not_fitted_along_growth": "B along the growth could not be estimated: the simulation fails there.",
+    "no_smooth_force": "No smooth force on the tail explains the misfit: a separate one in every condition takes away "
+    "{reduction:.0%} of it. Either it is no force, or the model is too far off to say.",
+    "no_law_agreed_on": "What is missing is no simple law of force that single trials agree on.",
+    "no_further_force": "No further force on the tail is significant beyond the scatter between trials.",
+    # Origins of the inputs of a prediction, and why they are uncertain
+    "given": "given",
+    "set": "set",
+    "constant": "constant",
+    "fitted": "fitted, {source}",
+    "printed": "printed, {source}",
+    "typical_size": "typical size, without an error",
+    "B_guessed": "guess: 6.44 (t/200 µm)(D/24 mm)^0.75",
+    "B_scaled": "scaled from {vine} of {source} as t·D^0.75: a guess",
+    "P_y_guessed": "guess: the one that is printed, for another vine",
+    "B_printed": "the error of the printed B is not printed: assumed to be {percent:.0f} %",
+    "n_given": "n is given to {error:.2g} (one standard deviation)",
+    "n_printed": "±{error:.2g}, from the printed R² of the fits",
+    "P_y_stated": "stated to {kPa:.2g} kPa",
+    "P_y_printed": "printed to a whole number: ±{kPa:.2g} kPa",
+    "P_y_guess": "{kPa:g} kPa is printed for one vine; nine of ten others within a factor 3",
+    "uniform": "{symbol} of {effect} uniform between {low:g} and {high:g}",
+    "with_covariance": "{names} of {source}, with their covariance ({count} trials)",
+    # Warnings about a vine not yet built
+    "B_carried_over": "no vine of {source} has this diameter and wall: B is carried over from {vine} by the scaling "
+    "prior, a guess",
+    "not_determined": "{source} does not determine {names}: kept at the fitted values, without an error",
+    "implausible": "{symbol} of {effect} is outside its plausible range, {low:g} to {high:g}{unit}",
+    "bursts": "the vine would burst: its hoop stress PD/2t is {MPa:.3g} MPa, film is guessed to burst at {burst_MPa:g} "
+    "MPa, so at {burst_kPa:.3g} kPa; lower the pressure or thicken the wall",
+    "nearly_bursts": "the vine is about to burst: its hoop stress PD/2t is {MPa:.3g} MPa, film is guessed to burst at "
+    "{burst_MPa:g} MPa, so at {burst_kPa:.3g} kPa (a guess from one vine)",
+    "below_yield": "{kPa:g} kPa lies below the yield pressure, {yield_kPa:.3g} kPa ({low_kPa:.2g} to {high_kPa:.2g}): "
+    "nothing would evert; raise the pressure",
+    "stalls": "in {share:.0%} of the draws the vine does not grow to its end; raise the pressure or measure its yield "
+    "pressure",
+    "rule": "{words}",
+    "fit_not_diagnosed": "{folder} has no diagnosis: it is unknown whether this model describes the trials",
+    "from_final_model": "predicted from the final model of the diagnosis, with {added} added",
+    "from_refuted_model": "the following is nevertheless predicted from {model}",
+    "final_speed": "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine",
+    "film_uncertain": "the choice of film is uncertain: {um:g} µm is the fastest in only {odds:.0%} of the draws; "
+    "measuring B and P_y of the first two films would decide it",
+    "budget_of_fastest": "uncertainty budget of the fastest, {trial}: final speed by each input alone",
+    "not_in_budget": "not included: the burst stress, a guess from one vine, and effects not in the model (`vinetrack "
+    "predict`)",
+    "supply_needs_wall": "--supply-s needs --thickness-um: how fast the vine takes up gas depends on its wall",
+    "keeps_pressure": "closed chamber that keeps the gauge pressure within {percent:g} %, by the gas law in absolute "
+    "pressure",
+    "slow_and_fast": "slow: γ = 1, isothermal; fast: γ = 1.4, adiabatic, as within milliseconds",
     "with_corrected_times": "With corrected times: {verdict}. {explanation}",
-}
-# What facts are called in a sentence
-_NAMES: dict[Any, str] = {
-    "chamber_l": "the gas of a chamber",
-    "inlet_mm": "the gas of a chamber",
-    "yield_pressure_kPa": "a tube under pressure",
-    "conditions": "left-out conditions",
-    "highest_pressure": "the left-out highest pressure",
-    2: "two",
-    3: "three",
-    4: "four",
-    5: "five",
 }
 
 
@@ -74,24 +102,4 @@ def sentence(code: str, facts: Mapping[str, Any]) -> str:
     """Return the sentence of a remark."""
     from vinetrack.narrative.diagnosis_text import REMARKS
 
-    if code in REMARKS:
-        return REMARKS[code](**facts)
-    shown = dict(facts)
-    if code == "no_tube":
-        shown["column"] = _NAMES[shown["column"]]
-    elif code == "columns_partly_blank":
-        shown["columns"] = "` and `".join(shown["columns"])
-    elif code == "left_out_error_does_not_fall":
-        shown |= {"without_mm": 1e3 * shown["without_m"], "with_mm": 1e3 * shown["with_m"]}
-    elif code == "left_out_error_without":
-        count = shown["count"]
-        shown |= {"left_out": _NAMES[shown["left_out"]], "trials": f"{count} trial{'s' if count > 1 else ''}"}
-    elif code == "several_missing":
-        shown["count"] = _NAMES[shown["count"]]
-    elif code == "still_drifts":
-        shown["model"] = " + ".join(shown["model"])
-    elif code == "not_tried":
-        shown["names"] = joined(shown["names"])
-    elif code == "implausible_size":
-        shown["unit"] = f" {shown['unit']}" if shown["unit"] else ""
-    return SENTENCES[code].format_map(shown)
+    return REMARKS[code](**facts) if code in REMARKS else SENTENCES[code].format_map(facts)

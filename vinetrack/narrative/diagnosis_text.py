@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.notebook import html_table
-from vinetrack.core.units import decimals, display_unit, number, with_error, with_interval
-from vinetrack.diagnosis.remarks import joined
+from vinetrack.core.problems import joined
+from vinetrack.core.units import PREDICTION_UNITS, decimals, display_unit, number, with_error, with_interval
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -45,11 +46,15 @@ from vinetrack.narrative.verdict_text import (
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.core.problems import Remark
+    from vinetrack.core.records import Trial
     from vinetrack.diagnosis.force_laws import Law
     from vinetrack.diagnosis.further_trials import InformativeTrials
+    from vinetrack.diagnosis.learned_force import LearnedForce
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
-    from vinetrack.diagnosis.remarks import Remark
-    from vinetrack.inference.fit_result import Fit
+    from vinetrack.diagnosis.propose import Proposal
+    from vinetrack.inference.fit_result import Fit, Number
+    from vinetrack.planning.prediction import Contribution
 
 
 # ------------------------------------------------------------------------------
@@ -458,7 +463,7 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     if diagnosis.ladder is not None and len(diagnosis.ladder) > 1:
         lines += ["", "position error", *_ladder_table(diagnosis.ladder)]
     if diagnosis.where:
-        lines += ["", *diagnosis.where]
+        lines += ["", *map(str, diagnosis.where)]
     if diagnosis.next_experiment:
         lines += ["", str(diagnosis.next_experiment.get("text", ""))]
     lines += [f"! {note}" for note in diagnosis.notes]
@@ -662,8 +667,346 @@ def _force_text(value_N: float, sigma_N: float) -> str:
     return f"{value_N:.{digits}f} ± {sigma_N:.{digits}f} N"
 
 
+# ------------------------------------------------------------------------------
+# Where a model fails, what drifts, and the force that it lacks.
+
+
+def _condition_text(pressure_Pa: float, payload_kg: float | None = None, vine: str = "") -> str:
+    """Return what names a condition: pressure, and payload and vine where they vary."""
+    load = "" if payload_kg is None else f" with {1e3 * payload_kg:.3g} g"
+    return f"{pressure_Pa / 1e3:.3g} kPa{load}{f' ({vine})' if vine else ''}"
+
+
+def fails_most_text(
+    condition: Mapping[str, Any], rms_m: float, floor_m: float, worst_residual_m: float, worst_sigma_m: float, z: float
+) -> str:
+    """Return where a model fails most, and by how much."""
+    scatter = "without replicates"
+    if math.isfinite(floor_m):
+        scatter = f"where replicates scatter by {1e3 * floor_m:.2g} mm"
+    digits = decimals(1e3 * worst_sigma_m)
+    off = f"{1e3 * abs(worst_residual_m):.{digits}f} ± {1e3 * worst_sigma_m:.{digits}f} mm"
+    return (
+        f"The model fails most at {_condition_text(**condition)}: root mean square {1e3 * rms_m:.2g} mm {scatter};"
+        f" there the vine is {off} {'ahead of' if worst_residual_m > 0 else 'behind'} the model ({z:.1f} σ in all)."
+    )
+
+
+def drift_text(
+    row: Mapping[str, Any],
+    steady: bool = True,
+    stated_sigma_Pa: float = math.nan,
+    ends: Sequence[tuple[str, Number]] = (),
+) -> str:
+    """Return how a parameter drifts: a row of the table of drifts, whether it rises steadily, the error of the sheet,
+    and the lowest and highest value among vines.
+    """
+    against, z, start, stop = (row[name] for name in ("against", "z", "from_level", "to_level"))
+    who = f"{row['symbol']} of {row['vine']}" if row["vine"] else row["symbol"]
+    unit, factor = ("%", 100.0) if row["relative"] else display_unit(row["unit"])
+    if against == "sheet":
+        return (
+            f"{who} is pulled from the {start / 1e3:.2f} ± {stated_sigma_Pa / 1e3:.2f} kPa of the sheet to"
+            f" {stop / 1e3:.2f} kPa ({z:.1f} σ)."
+        )
+    if against == "vine":
+        values = [
+            f"{one.value * factor:.3g} ± {one.sigma * factor:.1g} {unit}".rstrip() + f" ({vine})" for vine, one in ends
+        ]
+        return f"{who} differs between the vines ({z:.1f} σ), though one value should describe all: {joined(values)}."
+    change, error = factor * row["change"], factor * row["change_sigma"]
+    digits = max(decimals(error) - 1, 0)
+    amount = f"{change:.{digits}f} ± {error:.{digits}f} {unit}".rstrip()
+    if against == "growth":
+        larger, smaller = ("second", "first") if stop > start else ("first", "second")
+        return (
+            f"{who} would have to be {amount} larger in the {larger} half of the growth than in the {smaller}"
+            f" ({z:.1f} σ), though it should not change along the growth."
+        )
+    # Conditions that a parameter may drift with: name, unit, and factor from SI
+    name, shown, times = {
+        "pressure_Pa": ("pressure", "kPa", 1e-3),
+        "payload_kg": ("payload", "g", 1e3),
+        "growth_angle_rad": ("growth angle", "°", 180 / math.pi),
+        "chamber_m3": ("chamber volume", "l", 1e3),
+        "inlet_m": ("inlet", "mm", 1e3),
+    }[against]
+    if steady:
+        return (
+            f"{who} rises by {amount} from {start * times:.3g} {shown} to {stop * times:.3g} {shown} of {name}"
+            f" ({z:.1f} σ), though it should not depend on the {name}."
+        )
+    low, high = sorted((start * times, stop * times))
+    return (
+        f"{who} is not the same at every {name} ({row['z_constancy']:.1f} σ), without rising or falling steadily from"
+        f" {low:.3g} {shown} to {high:.3g} {shown}."
+    )
+
+
+def like_no_law_text(law: str, explained: float, variable: str, alone: float) -> str:
+    """Return that no simple law describes the missing force, and the variable that a force of it alone explains it."""
+    variables = {
+        "growth": "the growth",
+        "speed": "the speed",
+        "time": "the time",
+        "condition": "the condition, and not on what happens within a trial",
+    }
+    text = f"What is missing looks like none of the simple laws: the best, {law}, explains {explained:.0%} of it."
+    depends = f" It depends on {variables[variable]}: a force of that alone explains {alone:.0%}."
+    return text + depends if alone else text
+
+
+def like_a_law_text(law: str, explained: float, others: Sequence[str]) -> str:
+    """Return the law that the missing force looks like, and others that fit nearly as well."""
+    text = f"What is missing looks like {law}; that explains {explained:.0%} of what any force could."
+    return f"{text} These data fit nearly as well with: {'; '.join(others)}." if others else text
+
+
+def _variables_text(name: str) -> str:
+    """Return a choice of variables in words."""
+    words = {"growth": "the growth", "speed": "the speed of the tail", "time": "the time since release",
+             "pressure": "the pressure"}  # fmt: skip
+    return " and ".join(words[variable] for variable in name.split("+"))
+
+
+def learned_force_text(
+    name: str,
+    weights: Mapping[str, float],
+    alternatives: Sequence[str],
+    begins: str,
+    range_N: tuple[float, float],
+    sigma_N: float,
+    undecided_N: float,
+    explained: float,
+    is_repeated: bool,
+    has_pressures: bool,
+) -> str:
+    """Return the variables of the learned force and how certain they are, its range and error, from where it is
+    measured, what limits the result, and which trials would help.
+    """
+    low, high = range_N
+    subject = f" As a function of {_variables_text(name)} it" if alternatives else " It"
+    text = (
+        f"Learned as a smooth function inside the fit, the missing force {_dependence(name, weights, alternatives)}."
+        f"{subject} ranges from {low:.2f} to {high:.2f} N where there are trials, with a standard error of"
+        f" {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit. {_begins_text(begins, undecided_N)} A law"
+        " over other variables may fit the tracks as well."
+    ).replace("-", "−")
+    if not is_repeated:
+        text += " No condition was repeated: how sure this is rests on the scatter that the fit assumes."
+    if not has_pressures:
+        text += " All trials had one pressure, so they do not show whether the force depends on it."
+    if alternatives:
+        text += (
+            " Trials that reach the same growth at another speed or time, by another pressure or payload, would tell"
+            " them apart."
+        )
+    return text
+
+
+def _dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[str]) -> str:
+    """Return what the force depends on and how certain that is."""
+    if not alternatives:
+        # 0.95: weight from which a choice counts as certain (chosen)
+        likely = "is" if weights[name] >= 0.95 else "is most likely"
+        return f"{likely} described by {_variables_text(name)} (posterior weight {weights[name]:.0%})"
+    names = [name, *alternatives]
+    shares = [f" ({weights[one]:.0%})" if one in weights else "" for one in names]
+    choices = [one.split("+") for one in names]
+    common = [variable for variable in choices[0] if all(variable in choice for choice in choices)]
+    remaining = ["+".join(variable for variable in choice if variable not in common) for choice in choices]
+    shared, last = "", "or by"
+    if common and all(remaining):
+        names, shared, last = remaining, f"{_variables_text('+'.join(common))}, and by ", "or"
+    listed = joined([f"{_variables_text(one)}{share}" for one, share in zip(names, shares, strict=True)], last)
+    return f"is described by {shared}{listed}: these trials do not tell which"
+
+
+def _begins_text(begins: str, undecided_N: float) -> str:
+    """Return from where the force is measured, and which part of it the trials do not determine."""
+    from vinetrack.diagnosis.force_laws import CONSTANT_AT_START, FREE_AT_START
+
+    if not begins:
+        return "These trials do not decide how much of it belongs to B, n and P_y; it is drawn as small as they allow."
+    if begins == FREE_AT_START:
+        return (
+            "It is not zero where growth begins, because B, n and P_y cannot account for all that acts there; they"
+            f" could account for a part of it that is the same all along the growth, ±{undecided_N:.2f} N."
+        )
+    constant = ", except for a constant, which P_y cannot account for within its error"
+    competitors = f" (±{undecided_N:.2f} N), which B, n and P_y" if undecided_N else ", which P_y"
+    return (
+        f"It is measured from where growth begins{constant if begins == CONSTANT_AT_START else ''}: B, n and P_y are"
+        " those of the vine there. The trials determine how it changes from there on, but not a part that is the same"
+        f" all along the growth{competitors} could account for as well."
+    )
+
+
+def proposal_lines(proposal: Proposal) -> list[str]:
+    """Return which laws of force were fitted and what resulted, a line a sentence."""
+    lines = []
+    for law in proposal.laws if proposal.tied else ():
+        line = f"{law.law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
+        if math.isfinite(law.rms_left_out_m):
+            errors_mm = 1e3 * proposal.rms_left_out_m, 1e3 * law.rms_left_out_m
+            line += ", error on left-out conditions {:.2f} → {:.2f} mm".format(*errors_mm)
+        lines.append(line + " (not excluded)" * (law in proposal.tied[1:]))
+    if proposal.tied:
+        best, *others = [law.law.words for law in proposal.tied]
+        lines.append(f"Proposed: {best}.")
+        lines += [f"These data fit nearly as well with {joined(others)}."] if others else []
+    else:
+        lines.append(f"{proposal.reason}{'' if proposal.table else '; nothing is proposed'}.")
+    if (table := proposal.table) is not None:
+        lines.append(
+            f"No formula in the list reproduces the learned force. As a table ({table.effect.name}) it reduces χ² per"
+            f" point from {proposal.before.chi2_per_dof:.1f} to {table.ratio.fit.chi2_per_dof:.1f}; the error on"
+            f" left-out conditions, with the table itself learned from all trials, is {1e3 * table.rms_left_out_m:.2f}"
+            " mm."
+        )
+    return lines
+
+
+def _file_text(title: str, paragraphs: Sequence[str], formula: str) -> str:
+    """Return the docstring of an effect file that was proposed."""
+    wrapped = [textwrap.fill(paragraph, 118) for paragraph in paragraphs if paragraph]
+    last = "Make trials that differ in the variables it depends on, and compare new trials with its prediction."
+    return "\n\n".join([title, *wrapped, f"    {formula}", last]) + "\n"
+
+
+def law_file_text(law: str, formula: str, origin: str) -> str:
+    """Return the docstring of an effect file that holds a law."""
+    caution = (
+        "It describes these data but explains nothing: its physical cause is for you to find. Forces are positive along"
+        " the growth, so that a friction is negative."
+    )
+    return _file_text(f"Proposed law: {law}.", [origin, caution], formula)
+
+
+def learned_file_text(learned: LearnedForce, origin: str) -> str:
+    """Return the docstring of an effect file that holds a learned force."""
+    domain = learned.domain
+    shown = {"growth": ("y", "mm", 1e3), "speed": ("ẋ", "m/s", 1.0), "time": ("t", "ms", 1e3),
+             "pressure": ("P", "kPa", 1e-3)}  # fmt: skip
+    ranges = [
+        f"{_variables_text(name)} from {low * shown[name][2]:.3g} to {high * shown[name][2]:.3g} {shown[name][1]}"
+        for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
+    ]
+    validity = (
+        f"It is valid for {joined(ranges)}, the range that trials visited; outside, it keeps its value at the edge,"
+        " which has no meaning. Forces are positive along the growth, so that a friction is negative. The table"
+        " reproduces these trials but explains nothing: look at its figure, and find the formula."
+    )
+    symbols, counts = ", ".join(shown[name][0] for name in domain.variables), " × ".join(map(str, domain.counts))
+    formula = f"tail force a T({symbols}), T the sum of {counts} cubic splines on even steps"
+    title = f"Learned force: a table over {_variables_text(domain.name)}, no law."
+    return _file_text(title, [origin, str(learned.sentence), validity], formula)
+
+
+# ------------------------------------------------------------------------------
+# Vines not yet built.
+
+
+def volume_text(volume_m3: float) -> str:
+    """Return a volume in litres, or in millilitres below 0.1 L."""
+    return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
+
+
+def trial_text(trial: Trial) -> str:
+    """Describe a trial in one line."""
+    size = f"{1e3 * trial.diameter_m:.4g} mm × {1e6 * trial.thickness_m:.4g} µm × {1e3 * trial.length_m:.4g} mm"
+    payload = f"payload {1e3 * trial.payload_kg:.4g} g" if trial.payload_kg > 0 else "no payload"
+    degrees = math.degrees(trial.growth_angle_rad)
+    names = {0: "straight down", 90: "horizontally", 180: "straight up"}
+    direction = names.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
+    rig = "" if math.isnan(trial.chamber_m3) else f", chamber {volume_text(trial.chamber_m3)}"
+    rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
+    return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {direction}{rig}"
+
+
+def sweeps_text(trial: Trial, swept_m3: float, in_full: bool) -> str:
+    """Return the volume of the grown vine of a trial, which is described in full or by its size alone."""
+    size = f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa"
+    return f"{trial_text(trial) if in_full else size}: it sweeps {volume_text(swept_m3)}"
+
+
+def value_in_unit(value: float, unit: str) -> str:
+    """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
+    return "never" if math.isinf(value) else number(value * display_unit(unit, PREDICTION_UNITS)[1])
+
+
+def speed_band_text(share: Contribution) -> str:
+    """Return the 90 % band of the final speed with one uncertain input."""
+    return f"{number(share.low)} to {number(share.high)} m/s"
+
+
+def _at_place(y_over_L: float) -> str:
+    return "" if y_over_L == 1 else f" at y/L = {y_over_L:g}"
+
+
+def _of_draws(share: float) -> str:
+    return "in every draw" if share > 0.995 else f"in {share:.0%} of the draws"
+
+
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
+    "no_tube": lambda column: (
+        f"it acts on {'a tube under pressure' if column == 'yield_pressure_kPa' else 'the gas of a chamber'}, and a"
+        " body that moves as a whole has none"
+    ),
+    "columns_partly_blank": lambda columns: (
+        f"it needs `{'` and `'.join(columns)}`, which the sheet leaves blank for some trials"
+    ),
+    "implausible_size": lambda symbol, value, unit, low, high: (
+        f"it would need {symbol} = {f'{value:.3g} {unit}'.strip()}, and {low:.3g} to {high:.3g} is plausible"
+    ),
+    "several_missing": lambda count: (
+        f"{('two', 'three', 'four', 'five')[count - 2]} effects are missing: none alone removes the misfit"
+    ),
+    "not_tried": lambda names: f"Not tried, because the sheet does not state what they need: {joined(names)}.",
+    "left_out_error_does_not_fall": lambda name, without_m, with_m: (
+        f"Against this verdict: The error on left-out conditions does not fall with {name}: {1e3 * without_m:.2f} mm"
+        f" without it, {1e3 * with_m:.2f} mm with it. The data support {name} by the shape of the motion alone."
+    ),
+    "still_drifts": lambda model, drift: f"Against this verdict: With {' + '.join(model)}: {drift}",
+    "left_out_error_without": lambda left_out, count, reason: (
+        f"The error on {'left-out conditions' if left_out == 'conditions' else 'the left-out highest pressure'} is"
+        f" without {_count(count, 'trial')}, unlike that in sample: {reason}"
+    ),
+    "B_given": lambda error: f"B is given to {100 * error:.2g} % (one standard deviation)",
+    "printed_B_scatter": lambda printed, here, dof: (
+        f"the four printed B scatter by {100 * printed:.0f} % about it: {100 * here:.0f} % at this size (Student's t,"
+        f" {dof} degrees of freedom)"
+    ),
+    "one_t_over_D": lambda sigma, here: (
+        f"B is printed for one t/D only: exponents of t and D ±{sigma:g} against each other, {100 * here:.0f} % at this"
+        " t/D"
+    ),
+    "spread": lambda origin, size: f"{origin}: {100 * size:.2g} %",
+    "medians_and_bands": lambda model, samples: f"{' + '.join(model)}; medians and 90 % bands of {samples} draws",
+    "fastest_by": lambda quantity, y_over_L, share, burst_MPa, kPa: (
+        f"fastest by {quantity}{_at_place(y_over_L)}; hoop stress up to {share:.0%} of {burst_MPa:g} MPa, supply up to"
+        f" {kPa:g} kPa"
+    ),
+    "sweeps": sweeps_text,
+    "supplied_chambers": lambda ms, volumes: (
+        f"with a supply that refills the chamber in {ms:g} ms, at the medians: "
+        + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
+    ),
+    "speeds_at_medians": lambda y_over_L, m_s: (
+        f"speed: final speed at the medians{_at_place(y_over_L)}; {number(m_s)} m/s at constant pressure"
+    ),
+    "goes_slack": lambda share: (
+        f"the tail goes slack on the way {_of_draws(share)}: tail speeds are then those of the film at the tip, and a"
+        " payload falls freely, at a speed that is not predicted"
+    ),
+    "tail_compressed": lambda share, median_N, low_N, has_payload: (
+        f"the model predicts compression in the tail {_of_draws(share)} (least tension {median_N:.2g} N"
+        f"{'' if median_N < 0 else f', below {low_N:.2g} N in one draw of twenty'}), which thin film cannot carry: the"
+        " payload runs ahead of the film"
+        f"{', and the ejection speed of the payload is at least the one stated' if has_payload else ''};"
+        " `--tail-slack free` allows that"
+    ),
     "odd_trials": odd_in_words,
     "odd_trials_decide": odd_deciding_in_words,
     "frames_missing": dropped_in_words,
@@ -676,4 +1019,25 @@ REMARKS: dict[str, Callable[..., str]] = {
     "detectable": lambda power: "\n".join([false_alarm_sentence(power), *could_have_seen(power)]),
     "diagnosis_page": diagnosis_page,
     "law": law_text,
+    "fails_nowhere": lambda z, condition: (
+        "In no condition does the mean of the replicates deviate from the model by more than their scatter explains"
+        f" (at most {z:.1f} σ, at {_condition_text(**condition)})."
+    ),
+    "fails_most": fails_most_text,
+    "misfit_rises": lambda column: (
+        f"The {'higher the pressure' if column == 'pressure_Pa' else 'larger the payload'}, the larger the misfit."
+    ),
+    "misfit_falls": lambda column: (
+        f"The {'lower the pressure' if column == 'pressure_Pa' else 'smaller the payload'}, the larger the misfit."
+    ),
+    "fails_in": lambda count, total: (
+        f"It fails in {'every condition' if count == total else f'{count} of {total} conditions'} by more than the"
+        " scatter of replicates."
+    ),
+    "drifts": drift_text,
+    "like_no_law": like_no_law_text,
+    "like_a_law": like_a_law_text,
+    "learned_force": learned_force_text,
+    "learned_file": learned_file_text,
+    "law_file": law_file_text,
 }

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, with_error
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND
-from vinetrack.diagnosis.remarks import joined
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -37,8 +37,8 @@ from vinetrack.inference.robust_covariance import FILM_ERROR
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.core.problems import Remark
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
-    from vinetrack.diagnosis.remarks import Remark
     from vinetrack.diagnosis.replicates import OddTrial
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep

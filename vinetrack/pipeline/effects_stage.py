@@ -117,6 +117,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     from vinetrack.diagnosis.result import UNEXPLAINED
     from vinetrack.dynamics.model import make_model
     from vinetrack.effects import own_effects, remember
+    from vinetrack.narrative.diagnosis_text import proposal_lines
 
     results = Results(folder)
     diagnosis = read_diagnosis(results)
@@ -132,7 +133,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     pairs, _ = measured_trials(experiment, results)
     proposal = propose(model, pairs, report)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
-    lines = [*([learned["sentence"]] if learned else []), *proposal.sentences()]
+    lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
     origin = (
         f"From {len(proposal.before.trials)} trials of {experiment.name}. RMS error in left-out conditions:"
         f" {' + '.join(model.names)} {1e3 * proposal.rms_left_out_m:.2f} mm; with this"

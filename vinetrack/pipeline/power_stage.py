@@ -175,7 +175,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
         PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
         PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", fps_origin),
         *(
-            PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", of_vine.origins[key])
+            PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", str(of_vine.origins[key]))
             for vine, of_vine in by_vine.items()
             for symbol, key in (("B", DAMPING), ("n", EXPONENT))
         ),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.problems import ExperimentError, Problem, format_problems
+from vinetrack.core.problems import ExperimentError, Problem, format_problems, remark
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import STANDARD_OUTPUT, write_bytes, write_csv, write_json
 from vinetrack.core.terminal import progress, table, waiting
@@ -26,12 +26,13 @@ from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, p
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
 from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.planning.prediction import (
     GAMMAS,
     TIME,
     Choice,
-    Contribution,
     Neglected,
     Quantity,
     Room,
@@ -39,7 +40,7 @@ from vinetrack.planning.prediction import (
     chambers,
     design_checks,
     fastest,
-    final_m_s,
+    final_speeds,
     final_with,
     gauge_loss,
     neglected,
@@ -84,15 +85,13 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
     in_use = read_json(results.fit)
     diagnosis = read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
-        return ChosenFit(
-            in_use, (f"! {folder} has no diagnosis: it is unknown whether this model describes the trials",)
-        )
+        return ChosenFit(in_use, (f"! {remark('fit_not_diagnosed', folder=folder)}",))
     if diagnosis.verdict == ADEQUATE:
         return ChosenFit(in_use, ())
     final = read_json(results.final_fit) if results.final_fit.exists() else None
     added = " + ".join(diagnosis.effects)
     if diagnosis.final_verdict == ADEQUATE and final is not None:
-        return ChosenFit(final, (f"predicted from the final model of the diagnosis, with {added} added",))
+        return ChosenFit(final, (str(remark("from_final_model", added=added)),))
     verdict = f"{diagnosis.final_verdict or diagnosis.verdict}: {diagnosis.explanation}"
     if not anyway:
         reason = (
@@ -101,8 +100,8 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
             else "because the diagnosis refuted the model and found none that describes the trials"
         )
         raise ResultsError(f"{folder}: no prediction, {reason}; or predict from it with --anyway. {verdict}")
-    model = f"the model with {added} added" if final is not None else "the model in use"
-    return ChosenFit(final or in_use, (f"! {verdict}", f"! the following is nevertheless predicted from {model}"))
+    caution = remark("from_refuted_model", model=f"the model with {added} added" if final else "the model in use")
+    return ChosenFit(final or in_use, (f"! {verdict}", f"! {caution}"))
 
 
 # ------------------------------------------------------------------------------
@@ -187,7 +186,7 @@ def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
 def _read_fit(results: Path, chosen: ChosenFit) -> tuple[FitNumbers, Mapping[str, Effect]]:
     """Read a fit of a results folder, and the user's own effects if its model contains any."""
     with planning_errors():
-        fit = fit_numbers(chosen.content, results.as_posix())
+        fit = fit_numbers(FitSummary.from_json(chosen.content), results.as_posix())
     own_names = [name for name in fit.model if name not in catalogue()]
     if not own_names:
         return fit, {}
@@ -218,38 +217,14 @@ def planning_errors() -> Iterator[None]:
         raise ResultsError(str(error)) from None
 
 
-def format_volume(volume_m3: float) -> str:
-    """Return a volume in litres, or in millilitres below 0.1 L."""
-    return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
-
-
-def describe_trial(trial: Trial) -> str:
-    """Describe a trial in one line."""
-    size = f"{1e3 * trial.diameter_m:.4g} mm × {1e6 * trial.thickness_m:.4g} µm × {1e3 * trial.length_m:.4g} mm"
-    payload = f"payload {1e3 * trial.payload_kg:.4g} g" if trial.payload_kg > 0 else "no payload"
-    degrees = math.degrees(trial.growth_angle_rad)
-    names = {0: "straight down", 90: "horizontally", 180: "straight up"}
-    direction = names.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
-    rig = "" if math.isnan(trial.chamber_m3) else f", chamber {format_volume(trial.chamber_m3)}"
-    rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
-    return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {direction}{rig}"
-
-
-def display_value(value: float, unit: str) -> str:
-    """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
-    if math.isinf(value):
-        return "never"
-    return number(value * display_unit(unit, PREDICTION_UNITS)[1])
-
-
 def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
     """Return rows of a table of inputs: symbol, median, 90 % band, unit, origin; constants of nature are left out."""
     rows = []
     for entry in inputs:
-        if entry.origin != "constant":
-            low, median, high = (display_value(value, entry.unit) for value in (entry.low, entry.median, entry.high))
+        if entry.origin.code != "constant":
+            low, median, high = (value_in_unit(value, entry.unit) for value in (entry.low, entry.median, entry.high))
             band = "–" if entry.low == entry.high else f"{low} to {high}"
-            rows.append((entry.symbol, median, band, display_unit(entry.unit, PREDICTION_UNITS)[0], entry.origin))
+            rows.append((entry.symbol, median, band, display_unit(entry.unit, PREDICTION_UNITS)[0], str(entry.origin)))
     return rows
 
 
@@ -296,11 +271,12 @@ def predict_conditions(
     with planning_errors():
         for inputs in progress(basis.inputs, "predicting", unit="condition"):
             prediction = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
-            entries.append(ConditionPrediction(prediction, design_checks(prediction), neglected(inputs, at_fraction)))
+            hazards = tuple(map(str, design_checks(prediction)))
+            entries.append(ConditionPrediction(prediction, hazards, neglected(inputs, at_fraction)))
     lines = [*basis.heading, *(_condition_lines(entries[0]) if len(entries) == 1 else _table_lines(entries))]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
-        titles = [describe_trial(entry.prediction.inputs.trial) for entry in entries]
+        titles = [trial_text(entry.prediction.inputs.trial) for entry in entries]
         write_figure(draw_predictions([entry.prediction for entry in entries], titles, at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
@@ -316,7 +292,7 @@ def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
     """Yield all lines about a single condition."""
     prediction = entry.prediction
     inputs = prediction.inputs
-    yield f"{describe_trial(inputs.trial)}; {' + '.join(inputs.model.names)}"
+    yield f"{trial_text(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
     yield from table(input_rows(inputs.bands()), ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
@@ -324,7 +300,7 @@ def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
     yield from table(rows, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
-    yield from table([(share.name, speed_band(share), share.words) for share in prediction.shares], head)
+    yield from table([(share.name, speed_band_text(share), str(share.why)) for share in prediction.shares], head)
     yield from _left_out(entry)
     yield ""
     yield from (f"! {warning}" for warning in entry.hazards)
@@ -340,14 +316,9 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
     elif unit == "N" and max(abs(value) for value in values) < 0.01:
         texts, unit = [number(1e3 * value) for value in values], "mN"
     else:
-        texts, unit = [display_value(value, unit) for value in values], display_unit(unit, PREDICTION_UNITS)[0]
+        texts, unit = [value_in_unit(value, unit) for value in values], display_unit(unit, PREDICTION_UNITS)[0]
     no_band = quantity.low == quantity.high or math.isnan(quantity.median)
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
-
-
-def speed_band(share: Contribution) -> str:
-    """Return the 90 % band of the final speed with one uncertain input, in words."""
-    return f"{display_value(share.low, 'm/s')} to {display_value(share.high, 'm/s')} m/s"
 
 
 def _left_out(entry: ConditionPrediction) -> Iterator[str]:
@@ -357,7 +328,7 @@ def _left_out(entry: ConditionPrediction) -> Iterator[str]:
         (
             omitted.effect,
             omitted.size,
-            f"{display_value(omitted.without_m_s, 'm/s')} → {display_value(omitted.final_m_s, 'm/s')} m/s",
+            f"{value_in_unit(omitted.without_m_s, 'm/s')} → {value_in_unit(omitted.final_m_s, 'm/s')} m/s",
             f"{omitted.change:+.1%}",
         )
         for omitted in entry.neglected
@@ -371,7 +342,7 @@ def _left_out(entry: ConditionPrediction) -> Iterator[str]:
 def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
     """Yield a table with one row per condition."""
     first = entries[0].prediction
-    yield f"{' + '.join(first.inputs.model.names)}; medians and 90 % bands of {first.samples} draws"
+    yield str(remark("medians_and_bands", model=first.inputs.model.names, samples=first.samples))
     rows = [
         (
             entry.prediction.inputs.trial.condition,
@@ -384,10 +355,10 @@ def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
     if any(entry.prediction.inputs.trial.payload_kg > 0 for entry in entries):
-        yield "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine"
+        yield str(remark("final_speed"))
     yield ""
     yield "uncertainties included:"
-    sources = dict.fromkeys((share.name, share.words) for entry in entries for share in entry.prediction.shares)
+    sources = dict.fromkeys((share.name, str(share.why)) for entry in entries for share in entry.prediction.shares)
     yield from (f"  {name}: {text}" for name, text in sources)
     yield ""
     hazards = dict.fromkeys(text for entry in entries for text in entry.hazards)
@@ -403,10 +374,10 @@ def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
         "condition": prediction.inputs.trial.condition,
         "model": list(prediction.inputs.model.names),
         "samples": prediction.samples,
-        "inputs": [_band(one) | {"from": one.origin} for one in prediction.inputs.bands()],
+        "inputs": [_band(one) | {"from": str(one.origin)} for one in prediction.inputs.bands()],
         "quantities": [_band(one) | {"y_over_L": one.y_over_L} for one in prediction.quantities],
         "uncertainties": [
-            {"name": s.name, "words": s.words, "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
+            {"name": s.name, "words": str(s.why), "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
             for s in prediction.shares
         ],
         "left_out": [
@@ -534,12 +505,8 @@ def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     best = choices[0].prediction
-    yield (
-        f"fastest by {best.final.name}"
-        + ("" if best.final.y_over_L == 1 else f" at y/L = {best.final.y_over_L:g}")
-        + f"; hoop stress up to {room.burst_share:.0%} of {room.burst_stress_Pa / 1e6:g} MPa, supply up to "
-        f"{room.pressure_Pa / 1e3:g} kPa"
-    )
+    limits = {"share": room.burst_share, "burst_MPa": room.burst_stress_Pa / 1e6, "kPa": room.pressure_Pa / 1e3}
+    yield str(remark("fastest_by", quantity=best.final.name, y_over_L=best.final.y_over_L, **limits))
     yield ""
     rows = []
     for choice in choices:
@@ -551,8 +518,8 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
                 f"{1e3 * trial.length_m:.3g}",
                 f"{trial.pressure_Pa / 1e3:.3g}",
                 f"{hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m) / 1e6:.2f}",
-                display_value(final.median, "m/s"),
-                f"{display_value(final.low, 'm/s')} to {display_value(final.high, 'm/s')}",
+                value_in_unit(final.median, "m/s"),
+                f"{value_in_unit(final.low, 'm/s')} to {value_in_unit(final.high, 'm/s')}",
                 f"{choice.odds:.0%}",
                 ", ".join(choice.limits),
             )
@@ -561,13 +528,10 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield from table(rows, head, ("µm", "mm", "mm", "kPa", "MPa", "m/s", "m/s", "of draws", ""), align=">>>>>><><")
     yield ""
     if choices[0].odds < 0.8 and len(choices) > 1:
-        yield (
-            f"the choice of film is uncertain: {1e6 * choices[0].thickness_m:g} µm is the fastest in only "
-            f"{choices[0].odds:.0%} of the draws; measuring B and P_y of the first two films would decide it"
-        )
-    yield f"uncertainty budget of the fastest, {describe_trial(best.inputs.trial)}: final speed by each input alone"
-    yield from table([(f"  {share.name}", speed_band(share), share.words) for share in best.shares])
-    yield "  not included: the burst stress, a guess from one vine, and effects not in the model (`vinetrack predict`)"
+        yield str(remark("film_uncertain", um=1e6 * choices[0].thickness_m, odds=choices[0].odds))
+    yield str(remark("budget_of_fastest", trial=trial_text(best.inputs.trial)))
+    yield from table([(f"  {share.name}", speed_band_text(share), str(share.why)) for share in best.shares])
+    yield f"  {remark('not_in_budget')}"
     yield from (f"! {warning}" for warning in design_checks(best))
 
 
@@ -591,13 +555,9 @@ def design_reservoir(
         lines = [*basis.heading, *_reservoir_lines(trial, inputs, loss, at_fraction)]
         if math.isfinite(supply_s) and inputs is not None:
             volumes = {law: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
-            needed = ", ".join(
-                f"{format_volume(volume) if volume > 0 else 'none'} ({law.split(',')[0]})"
-                for law, volume in volumes.items()
-            )
-            lines.append(f"with a supply that refills the chamber in {1e3 * supply_s:g} ms, at the medians: {needed}")
+            lines.append(str(remark("supplied_chambers", ms=1e3 * supply_s, volumes=volumes)))
     if math.isfinite(supply_s) and inputs is None:
-        lines.append("! --supply-s needs --thickness-um: how fast the vine takes up gas depends on its wall")
+        lines.append(f"! {remark('supply_needs_wall')}")
     if figure is not None:
         swept = swept_m3(trial)
         drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
@@ -619,24 +579,22 @@ def design_reservoir(
 
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
-    size = f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa"
-    description = size if inputs is None else describe_trial(trial)
-    yield f"{description}: it sweeps {format_volume(swept_m3(trial))}"
-    yield f"closed chamber that keeps the gauge pressure within {100 * loss:g} %, by the gas law in absolute pressure"
+    yield str(remark("sweeps", trial=trial, swept_m3=swept_m3(trial), in_full=inputs is not None))
+    yield str(remark("keeps_pressure", percent=100 * loss))
     yield ""
     laws = [law.split(",")[0] for law in GAMMAS]
     rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
     for name, volume_m3 in chambers(trial, loss).items():
-        cells = [name, format_volume(volume_m3)]
+        cells = [name, volume_text(volume_m3)]
         cells += [f"{100 * gauge_loss(trial, volume_m3, gamma):.1f}" for gamma in GAMMAS.values()]
         if inputs is not None:
             finals = [final_with(inputs, volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
-            cells += [display_value(final, "m/s") for final in finals]
+            cells += [value_in_unit(final, "m/s") for final in finals]
         rows.append(cells)
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
     yield from table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
     if inputs is not None:
-        steady = final_m_s(inputs, inputs.model, host_for(inputs.model), at_fraction)
-        place = "" if trial.payload_kg > 0 else f" at y/L = {at_fraction:g}"
-        yield f"speed: final speed at the medians{place}; {display_value(steady, 'm/s')} m/s at constant pressure"
-    yield "slow: γ = 1, isothermal; fast: γ = 1.4, adiabatic, as within milliseconds"
+        (steady,) = final_speeds(inputs.model, [trial], at_fraction, host=host_for(inputs.model)).tolist()
+        place = 1.0 if trial.payload_kg > 0 else at_fraction
+        yield str(remark("speeds_at_medians", y_over_L=place, m_s=steady))
+    yield str(remark("slow_and_fast"))

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import brentq
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
@@ -189,10 +190,10 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Contribution:
-    """The 90 % band of the final speed, m/s, with one uncertain input; `name` and `words` are those of the input."""
+    """The 90 % band of the final speed, m/s, with one uncertain input; `name` and `why` are those of the input."""
 
     name: str
-    words: str
+    why: Remark
     low: float
     high: float
 
@@ -281,7 +282,7 @@ def predict_vine(
         # 400: draws for the band of one uncertainty alone (derived)
         alone = drawn_final_speeds(inputs, at_fraction, min(samples, 400), seed, [uncertainty.name])
         low, _, high = band(alone).tolist()
-        contributions.append(Contribution(uncertainty.name, uncertainty.words, low, high))
+        contributions.append(Contribution(uncertainty.name, uncertainty.why, low, high))
     return VinePrediction(
         inputs=inputs,
         at_fraction=at_fraction,
@@ -358,65 +359,49 @@ class Neglected:
         return self.final_m_s / self.without_m_s - 1 if self.without_m_s > 0 else math.nan
 
 
-def design_checks(prediction: VinePrediction) -> tuple[str, ...]:
-    """Return warnings about a planned vine in sentences, most serious first."""
+def design_checks(prediction: VinePrediction) -> tuple[Remark, ...]:
+    """Return warnings about a planned vine, most serious first."""
     hazards = (*_burst(prediction.inputs.trial), *_no_growth(prediction), *_slack(prediction), *_rules(prediction))
     return (*hazards, *prediction.inputs.notes)
 
 
-def _burst(trial: Trial) -> Iterator[str]:
+def _burst(trial: Trial) -> Iterator[Remark]:
     stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-    highest_kPa = burst_pressure_Pa(trial.diameter_m, trial.thickness_m) / 1e3
-    shown = f"hoop stress PD/2t is {stress / 1e6:.3g} MPa, film is guessed to burst at {BURST_STRESS_PA / 1e6:g} MPa"
-    if stress > BURST_STRESS_PA:
-        yield f"the vine would burst: its {shown}, so at {highest_kPa:.3g} kPa; lower the pressure or thicken the wall"
-    elif stress > 0.9 * BURST_STRESS_PA:
-        yield f"the vine is about to burst: its {shown}, so at {highest_kPa:.3g} kPa (a guess from one vine)"
+    if stress > 0.9 * BURST_STRESS_PA:
+        highest_kPa = burst_pressure_Pa(trial.diameter_m, trial.thickness_m) / 1e3
+        facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "burst_kPa": highest_kPa}
+        yield remark("bursts" if stress > BURST_STRESS_PA else "nearly_bursts", **facts)
 
 
-def _no_growth(prediction: VinePrediction) -> Iterator[str]:
+def _no_growth(prediction: VinePrediction) -> Iterator[Remark]:
     trial = prediction.inputs.trial
     low, median, high = np.quantile(prediction.inputs.draw(2000, 1)[YIELD], BAND) / 1e3
     if median >= trial.pressure_Pa / 1e3:
-        yield (
-            f"{trial.pressure_Pa / 1e3:g} kPa lies below the yield pressure, {median:.3g} kPa ({low:.2g} to "
-            f"{high:.2g}): nothing would evert; raise the pressure"
-        )
+        yield remark("below_yield", kPa=trial.pressure_Pa / 1e3, yield_kPa=median, low_kPa=low, high_kPa=high)
     elif prediction.arrives < 1 - WARNING_FRACTION:
-        yield (
-            f"in {1 - prediction.arrives:.0%} of the draws the vine does not grow to its end; raise the pressure or "
-            "measure its yield pressure"
-        )
+        yield remark("stalls", share=1 - prediction.arrives)
 
 
-def _slack(prediction: VinePrediction) -> Iterator[str]:
+def _slack(prediction: VinePrediction) -> Iterator[Remark]:
     trial = prediction.inputs.trial
     if prediction.slack < WARNING_FRACTION:
         return
-    frequency = "in every draw" if prediction.slack > 0.995 else f"in {prediction.slack:.0%} of the draws"
     if trial.tail_slack == "free":
-        yield (
-            f"the tail goes slack on the way {frequency}: tail speeds are then those of the film at the tip, and a "
-            "payload falls freely, at a speed that is not predicted"
-        )
-        return
-    tension = prediction[LEAST_TENSION]
-    also = "" if tension.median < 0 else f", below {tension.low:.2g} N in one draw of twenty"
-    payload = f", and the {EJECTION} is at least the one stated" if trial.payload_kg > 0 else ""
-    yield (
-        f"the model predicts compression in the tail {frequency} (least tension {tension.median:.2g} N{also}), which "
-        f"thin film cannot carry: the payload runs ahead of the film{payload}; `--tail-slack free` allows that"
-    )
+        yield remark("goes_slack", share=prediction.slack)
+    else:
+        tension, has_payload = prediction[LEAST_TENSION], trial.payload_kg > 0
+        facts = {"median_N": tension.median, "low_N": tension.low, "has_payload": has_payload}
+        yield remark("tail_compressed", share=prediction.slack, **facts)
 
 
-def _rules(prediction: VinePrediction) -> Iterator[str]:
+def _rules(prediction: VinePrediction) -> Iterator[Remark]:
     """Warnings of the audit along the median motion, except the one about the tail, which `_slack` gives."""
     inputs = prediction.inputs
     (moved,), _ = grown(inputs.model, [inputs.trial])
     keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
     motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
     violations = audit(inputs.model, [motion]).violations
-    yield from (violation.words for violation in violations if violation.rule != "tension")
+    yield from (remark("rule", words=violation.words) for violation in violations if violation.rule != "tension")
 
 
 def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
@@ -427,7 +412,7 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
     # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
     # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
     kappa = (1 - 0.5 / 4) * trial.diameter_m / (2 * 25e6 * trial.thickness_m)
-    without = final_m_s(inputs, inputs.model, host, at_fraction)
+    (without,) = final_speeds(inputs.model, [trial], at_fraction, host=host).tolist()
     neglected_effects = []
     # Effects that every vine has to some extent; the others of the catalogue may be absent.
     universal = ("air_drag", "fold_inertia", "gas_inertia", "inlet_loss", "payload_drag", "reservoir_depletion")
@@ -439,17 +424,12 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
         sizes = {p: kappa if name == "wall_stretch" else p.default for p in effect.parameters}
         model = (inputs.model + effect).with_values({f"{name}.{p.name}": value for p, value in sizes.items()})
         try:
-            final = final_m_s(inputs, model, host, at_fraction)
+            (final,) = final_speeds(model, [trial], at_fraction, host=host).tolist()
         except EffectError:
             continue
         words = [f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in sizes.items()]
         neglected_effects.append(Neglected(name, ", ".join(words), final, without))
     return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
-
-
-def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
-    """Return the final speed at the medians under this model, m/s, see `final_speeds`."""
-    return float(final_speeds(model, [inputs.trial], at_fraction, host=host)[0])
 
 
 # ------------------------------------------------------------------------------
@@ -643,7 +623,7 @@ def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fra
     """Return the final speed at the medians with a closed chamber of this volume, m/s; see `VinePrediction.final`."""
     model = _with(inputs.model, "reservoir_depletion", gamma=gamma)
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
-    return final_m_s(replace(inputs, trial=trial, model=model), model, host_for(inputs.model), at_fraction)
+    return float(final_speeds(model, [trial], at_fraction, host=host_for(inputs.model))[0])
 
 
 def _with(model: Model, name: str, **values: float) -> Model:

@@ -12,24 +12,21 @@ import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
 from vinetrack.core import published
-from vinetrack.core.problems import Problem
+from vinetrack.core.problems import Problem, Remark, remark
 from vinetrack.core.records import Floats, Trial
-from vinetrack.core.units import convert, number, or_nan
+from vinetrack.core.units import convert, number
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE
-
-if TYPE_CHECKING:
-    from vinetrack.inference.fit_result import Fit
-
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
+from vinetrack.inference.fit_summary import FitSummary
 
 # ------------------------------------------------------------------------------
 # Scaling priors for vines that have not been measured, each with a standard error.
@@ -132,7 +129,7 @@ class Uncertainty:
     """
 
     name: str
-    words: str
+    why: Remark
     key: str
     sample: Sampler = field(repr=False, compare=False)
 
@@ -147,7 +144,7 @@ class Input:
     low: float
     median: float
     high: float
-    origin: str
+    origin: Remark
 
 
 @dataclass(frozen=True)
@@ -156,10 +153,10 @@ class PredictiveInputs:
 
     trial: Trial
     model: Model
-    origins: Mapping[str, str]
+    origins: Mapping[str, Remark]
     uncertainties: tuple[Uncertainty, ...]
     spreads: tuple[float, float]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
 
     @property
     def medians(self) -> dict[str, float]:
@@ -196,7 +193,7 @@ class PredictiveInputs:
         for name in dict.fromkeys([*first, *draws]):
             symbol, unit = named[name]
             low, median, high = (float(q) for q in np.quantile(draws[name], BAND))
-            bands.append(Input(name, symbol, unit, low, median, high, self.origins.get(name, "")))
+            bands.append(Input(name, symbol, unit, low, median, high, self.origins.get(name, Remark())))
         return bands
 
 
@@ -275,7 +272,7 @@ def _uniform(name: str, size: Size) -> Sampler:
 # ------------------------------------------------------------------------------
 # Fitted parameters in the form from which predictions draw: means, covariance, between-trial standard deviations.
 #
-# They come from a `Fit` or from `fit.json`. B is held as its logarithm, as in the fit.
+# B is held as its logarithm, as in the fit.
 
 
 @dataclass(frozen=True)
@@ -309,62 +306,44 @@ class FitNumbers:
         return {m[0]: (float(m[1]) / 1e3, float(m[2]) / 1e6) for m in named if m}
 
 
-def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
-    """Read the parameters of a fit from the content of `fit.json`."""
-    if content.get("refused"):
-        raise FitError(f"{source} holds no fit to predict from: {content['refused']}")
-    numbers = content["numbers"]
-    if not numbers:
+def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
+    """Read the parameters of a fit, in memory or from `fit.json`."""
+    if isinstance(fit, FitSummary) and fit.refused:
+        raise FitError(f"{source} holds no fit to predict from: {fit.refused}")
+    if not fit.numbers:
         raise FitError(f"{source} holds a fit without numbers: there is nothing to predict from.")
-    covariance = np.array([[or_nan(cell) for cell in row] for row in content["covariance"]], dtype=float)
-    values = np.array([number["value"] for number in numbers], dtype=float)
-    log = np.array([number["parameter"] == DAMPING and number["value"] > 0 for number in numbers], dtype=bool)
+    values = np.array([number.value for number in fit.numbers])
+    log = np.array([number.key == DAMPING and number.value > 0 for number in fit.numbers])
     slopes = np.where(log, 1 / np.where(log, values, 1.0), 1.0)
-    widening = np.array([_widening(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)])
-    between = np.array([[or_nan(cell) for cell in row] for row in content.get("between_trials") or ()], dtype=float)
-    is_known = np.isfinite(np.diag(covariance))
-    if between.shape == covariance.shape:
+    widening = np.array([_widening(number, bool(is_log)) for number, is_log in zip(fit.numbers, log, strict=True)])
+    covariance, is_known = fit.covariance, np.isfinite(np.diag(fit.covariance))
+    if fit.between is not None and fit.between.shape == covariance.shape:
         # A prediction is of one trial, whose parameters differ from the shared ones.
-        covariance = covariance + np.nan_to_num(between)
-    dof = float(max(len(content["trials"]) - len(numbers), 3))  # t of fewer degrees of freedom has no variance
+        covariance = covariance + np.nan_to_num(fit.between)
+    dof = float(max(len(fit.trials) - len(fit.numbers), 3))  # t of fewer degrees of freedom has no variance
     scale = np.where(is_known, slopes * widening, 0.0)
     return FitNumbers(
         source=source,
-        model=tuple(content["model"]),
-        keys=tuple(number["parameter"] for number in numbers),
-        vines=tuple(number["vine"] for number in numbers),
+        model=fit.names,
+        keys=tuple(number.key for number in fit.numbers),
+        vines=tuple(number.vine for number in fit.numbers),
         log=log,
         mean=np.where(log, np.log(np.where(log, values, 1.0)), values),
         covariance=np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale,
-        open=tuple(number["symbol"] for number, known in zip(numbers, is_known, strict=True) if not known),
-        spreads={name: float(spread["value"]) for name, spread in content["spreads"].items()},
-        spread_dof={name: dof if spread["estimated"] else math.inf for name, spread in content["spreads"].items()},
-        n_trials=len(content["trials"]),
+        open=tuple(number.symbol for number, known in zip(fit.numbers, is_known, strict=True) if not known),
+        spreads={name: spread.value for name, spread in fit.spreads.items()},
+        spread_dof={name: dof if spread.estimated else math.inf for name, spread in fit.spreads.items()},
+        n_trials=len(fit.trials),
     )
 
 
-def _widening(number: Mapping[str, Any], log: bool) -> float:
+def _widening(number: Number, log: bool) -> float:
     """Ratio of the fit's 95 % interval to that of a normal distribution, at least 1; 1 where a bound determines it."""
-    low, high, sigma = (or_nan(number[key]) for key in ("low_95", "high_95", "sigma"))
-    if number["interval"] != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
+    low, high, sigma = number.low, number.high, number.sigma
+    if number.method != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
         return 1.0
     half = (math.log(high / low) if log else high - low) / 2
-    return max(half / (float(ndtri(0.975)) * (sigma / number["value"] if log else sigma)), 1.0)
-
-
-def numbers_of(fit: Fit) -> FitNumbers:
-    """Return the parameters of a fit as `vinetrack.fit` returns it."""
-    content = {
-        "model": fit.model.names,
-        "numbers": [number.to_json() for number in fit.numbers],
-        "covariance": fit.covariance,
-        "between_trials": None if fit.between is None else fit.between.tolist(),
-        "spreads": {
-            name: {"value": spread.value, "estimated": spread.estimated} for name, spread in fit.spreads.items()
-        },
-        "trials": {trial.name: None for trial in fit.trials},
-    }
-    return fit_numbers(content, "the fit")
+    return max(half / (float(ndtri(0.975)) * (sigma / number.value if log else sigma)), 1.0)
 
 
 def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
@@ -430,24 +409,28 @@ class _Sources:
         self.trial = trial if trial.vine else with_names([trial])[0]
         self.fit = fit
         self.values: dict[str, float] = {}
-        self.origins: dict[str, str] = {}
+        self.origins: dict[str, Remark] = {}
         self.uncertainties: list[Uncertainty] = []
-        self.notes: list[str] = []
+        self.notes: list[Remark] = []
         self.from_fit: dict[str, int] = {}
         """Inputs taken from the fit, and their indices in it."""
 
-    def set(self, name: str, value: float, origin: str) -> None:
-        self.values[name], self.origins[name] = value, origin
+    def set(self, name: str, value: float, origin: str, **facts: str) -> None:
+        self.values[name], self.origins[name] = value, remark(origin, **facts)
 
-    def set_fitted(self, name: str, place: int, factor: float = 1.0, origin: str = "fitted, {}") -> None:
+    def set_fitted(self, name: str, place: int, factor: float = 1.0, origin: str = "fitted", **facts: str) -> None:
         """Take an input from the fit, multiplied by a factor."""
         assert self.fit is not None
         mean = float(self.fit.mean[place])
         self.from_fit[name] = place
-        self.set(name, factor * (math.exp(mean) if self.fit.log[place] else mean), origin.format(self.fit.source))
+        value = factor * (math.exp(mean) if self.fit.log[place] else mean)
+        self.set(name, value, origin, source=self.fit.source, **facts)
 
-    def add_uncertainty(self, name: str, words: str, key: str, sample: Sampler) -> None:
-        self.uncertainties.append(Uncertainty(name, words, key, sample))
+    def set_printed(self, name: str, value: float) -> None:
+        self.set(name, value, "printed", source=published.SOURCE)
+
+    def add_uncertainty(self, name: str, key: str, sample: Sampler, why: str, **facts: object) -> None:
+        self.uncertainties.append(Uncertainty(name, remark(why, **facts), key, sample))
 
 
 def predictive_inputs(
@@ -484,7 +467,7 @@ def predictive_inputs(
     stated = stated or StatedValues()
     if fit is not None and not isinstance(fit, FitNumbers):
         stated = replace(stated, user_effects={**{effect.name: effect for effect in fit.model}, **stated.user_effects})
-        fit = numbers_of(fit)
+        fit = fit_numbers(fit)
     sources = _Sources(trial, fit)
     names = [*(fit.model if fit else stated.model), *stated.effects]
     model = make_model(dict.fromkeys(names), stated.user_effects)
@@ -517,43 +500,37 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
     if math.isfinite(stated.B):
         sources.set(DAMPING, stated.B, "given")
         if stated.B_error > 0:
-            words = f"B is given to {100 * stated.B_error:.2g} % (one standard deviation)"
-            sources.add_uncertainty("error of B", words, f"B given|{trial.vine}", scaled(DAMPING, stated.B_error))
+            sample = scaled(DAMPING, stated.B_error)
+            sources.add_uncertainty("error of B", f"B given|{trial.vine}", sample, "B_given", error=stated.B_error)
         return
     if fit is not None and place is not None and (is_same or fit.vines[place] == ""):
         sources.set_fitted(DAMPING, place)
         return
     if place is None and (scale := _printed_scale(trial)) is not None:
-        sources.set(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
-        words = f"the error of the printed B is not printed: assumed to be {100 * printed_error:.0f} %"
-        sources.add_uncertainty("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, printed_error))
+        sources.set_printed(DAMPING, published.DAMPING_B[scale])
+        sample = scaled(DAMPING, printed_error)
+        sources.add_uncertainty(
+            "error of B", f"B printed|{trial.vine}", sample, "B_printed", percent=100 * printed_error
+        )
         return
     # The scaling prior, from the nearest vine of the fit where there is one. Its uncertainties are the scatter of the
     # printed values about it, and the exponents of t against D.
     split, scatter = split_leverage(*size), damping_log_sigma(*size)
     if fit is None or place is None:
-        sources.set(DAMPING, damping_prior(*size), "guess: 6.44 (t/200 µm)(D/24 mm)^0.75")
+        sources.set(DAMPING, damping_prior(*size), "B_guessed")
     else:
         like = fit.sizes()[vine]
         factor = damping_prior(*size) / damping_prior(*like)
-        sources.set_fitted(DAMPING, place, factor, f"scaled from {vine} of {{}} as t·D^0.75: a guess")
-        sources.notes.append(
-            f"no vine of {fit.source} has this diameter and wall: B is carried over from {vine} by the scaling prior, "
-            "a guess"
-        )
+        sources.set_fitted(DAMPING, place, factor, "B_scaled", vine=vine)
+        sources.notes.append(remark("B_carried_over", source=fit.source, vine=vine))
         split -= split_leverage(*like)
-    words = (
-        f"the four printed B scatter by {100 * damping_scatter():.0f} % about it: {100 * scatter:.0f} % at this "
-        f"size (Student's t, {SCATTER_DOF} degrees of freedom)"
-    )
-    sources.add_uncertainty("guess of B", words, f"B scatter|{trial.vine}", scaled(DAMPING, scatter, SCATTER_DOF))
+    sample = scaled(DAMPING, scatter, SCATTER_DOF)
+    facts = {"printed": damping_scatter(), "here": scatter, "dof": SCATTER_DOF}
+    sources.add_uncertainty("guess of B", f"B scatter|{trial.vine}", sample, "printed_B_scatter", **facts)
     if abs(split) > 1e-9:
         split_sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
-        words = (
-            f"B is printed for one t/D only: exponents of t and D ±{split_sigma:g} against each other, "
-            f"{100 * abs(split) * split_sigma:.0f} % at this t/D"
-        )
-        sources.add_uncertainty("t against D", words, "B split", scaled(DAMPING, split * split_sigma))
+        facts, sample = {"sigma": split_sigma, "here": abs(split) * split_sigma}, scaled(DAMPING, split * split_sigma)
+        sources.add_uncertainty("t against D", "B split", sample, "one_t_over_D", **facts)
 
 
 def _printed_scale(trial: Trial) -> int | None:
@@ -567,14 +544,13 @@ def _exponent(sources: _Sources, stated: StatedValues) -> None:
     if math.isfinite(stated.n):
         sources.set(EXPONENT, stated.n, "given")
         if stated.n_error > 0:
-            words = f"n is given to {stated.n_error:.2g} (one standard deviation)"
-            sources.add_uncertainty("error of n", words, "n given", shifted(EXPONENT, stated.n_error))
+            sample = shifted(EXPONENT, stated.n_error)
+            sources.add_uncertainty("error of n", "n given", sample, "n_given", error=stated.n_error)
     elif place is not None:
         sources.set_fitted(EXPONENT, place)
     else:
-        sources.set(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
-        words = f"±{sigma:.2g}, from the printed R² of the fits"
-        sources.add_uncertainty("error of n", words, "n printed", shifted(EXPONENT, sigma))
+        sources.set_printed(EXPONENT, published.EXPONENT)
+        sources.add_uncertainty("error of n", "n printed", shifted(EXPONENT, sigma), "n_printed", error=sigma)
 
 
 def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
@@ -592,18 +568,18 @@ def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
     elif math.isfinite(stated):
         sources.set(YIELD, stated, "given")
         if sigma > 0:
-            words = f"stated to {sigma / 1e3:.2g} kPa"
-            sources.add_uncertainty("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
+            sample = shifted(YIELD, sigma)
+            sources.add_uncertainty("stated P_y", f"P_y stated|{trial.vine}", sample, "P_y_stated", kPa=sigma / 1e3)
     elif _printed_scale(trial) == 4:  # the vine whose yield pressure is printed
         rounding_Pa = 1000 / math.sqrt(12)
-        sources.set(YIELD, printed_Pa, f"printed, {published.SOURCE}")
-        words = f"printed to a whole number: ±{rounding_Pa / 1e3:.2g} kPa"
-        sources.add_uncertainty("printed P_y", words, "P_y printed", shifted(YIELD, rounding_Pa))
+        sources.set_printed(YIELD, printed_Pa)
+        sample = shifted(YIELD, rounding_Pa)
+        sources.add_uncertainty("printed P_y", "P_y printed", sample, "P_y_printed", kPa=rounding_Pa / 1e3)
     else:
-        sources.set(YIELD, printed_Pa, "guess: the one that is printed, for another vine")
-        words = f"{published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine; nine of ten others within a factor 3"
-        log_sigma = math.log(3.0) / float(ndtri(0.95))
-        sources.add_uncertainty("guess of P_y", words, "P_y guess", scaled(YIELD, log_sigma))
+        sources.set(YIELD, printed_Pa, "P_y_guessed")
+        # Nine of ten vines within a factor of 3
+        sample = scaled(YIELD, math.log(3.0) / float(ndtri(0.95)))
+        sources.add_uncertainty("guess of P_y", "P_y guess", sample, "P_y_guess", kPa=published.YIELD_PRESSURE_KPA)
 
 
 def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anchor: tuple[str, bool]) -> None:
@@ -619,18 +595,16 @@ def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anc
                 sources.set(name, size.middle, "given")
                 low, high = parameter.plausible or parameter.bounds
                 if size.low < low or size.high > high:
-                    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-                    sources.notes.append(
-                        f"{parameter.symbol} of {effect.name} is outside its plausible range, {low:g} to {high:g}{unit}"
-                    )
+                    facts = {"low": low, "high": high, "unit": "" if parameter.unit == "1" else f" {parameter.unit}"}
+                    sources.notes.append(remark("implausible", symbol=parameter.symbol, effect=effect.name, **facts))
                 if size.high > size.low:
-                    words = f"{parameter.symbol} of {effect.name} uniform between {size.low:g} and {size.high:g}"
-                    sources.add_uncertainty(f"{parameter.symbol} ({effect.name})", words, name, _uniform(name, size))
+                    title = f"{parameter.symbol} ({effect.name})"
+                    facts = {"symbol": parameter.symbol, "effect": effect.name, "low": size.low, "high": size.high}
+                    sources.add_uncertainty(title, name, _uniform(name, size), "uniform", **facts)
             elif place is not None:
                 sources.set_fitted(name, place)
             else:
-                fixed = "constant" if parameter.held else "typical size, without an error"
-                sources.set(name, parameter.default, fixed)
+                sources.set(name, parameter.default, "constant" if parameter.held else "typical_size")
 
 
 def _joint_draw_of_fit(sources: _Sources) -> None:
@@ -653,12 +627,10 @@ def _joint_draw_of_fit(sources: _Sources) -> None:
 
     symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
     shown = ", ".join(symbols.get(name, name) for name in names)
-    words = f"{shown} of {fit.source}, with their covariance ({fit.n_trials} trials)"
-    sources.uncertainties.insert(0, Uncertainty("fitted numbers", words, "fit", sample))
+    why = remark("with_covariance", names=shown, source=fit.source, count=fit.n_trials)
+    sources.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", sample))
     if fit.open:
-        sources.notes.append(
-            f"{fit.source} does not determine {', '.join(fit.open)}: kept at the fitted values, without an error"
-        )
+        sources.notes.append(remark("not_determined", source=fit.source, names=", ".join(fit.open)))
 
 
 def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[float, float]:
@@ -669,12 +641,12 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
     stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else pressure_spread
     pressure = stated if math.isfinite(stated) else pressure_spread
     dof: Mapping[str, float] = {}
-    damping, origin = damping_spread, "assumed:"
+    damping, origin = damping_spread, "assumed"
     if stated_values.spreads is not None:
-        (pressure, damping), origin = stated_values.spreads, "given:"
+        (pressure, damping), origin = stated_values.spreads, "given"
     elif fit is not None and fit.spreads:
         pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
-        origin, dof = f"estimated in {fit.source}:", fit.spread_dof
+        origin, dof = f"estimated in {fit.source}", fit.spread_dof
     sources.set(PRESSURE, trial.pressure_Pa, "set")
     dof_of_pressure = dof.get("pressure", math.inf)
     relative = _varied(PRESSURE, lambda P, draw: P * (1 + pressure * _deviates(draw, P.size, dof_of_pressure)))
@@ -683,8 +655,8 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
         ("B", damping, scaled(DAMPING, damping, dof.get("B", math.inf))),
     ):
         if spread > 0:
-            words = f"{origin} {100 * spread:.2g} %"
-            sources.add_uncertainty(f"{symbol} from trial to trial", words, f"{symbol} trial|{trial.vine}", sampler)
+            title, key = f"{symbol} from trial to trial", f"{symbol} trial|{trial.vine}"
+            sources.add_uncertainty(title, key, sampler, "spread", origin=origin, size=spread)
     return pressure, damping
 
 

@@ -204,7 +204,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "facts": summary_facts(diagnosis, result.ladder),
         "explanation": diagnosis.explanation,
         "ladder": ladder_table(result.ladder),
-        "where": [line for line in diagnosis.where if line not in drifting],
+        "where": [line for line in map(str, diagnosis.where) if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
         "rounds": rounds,
         # Upper limits are valid only if no effect is missing.
