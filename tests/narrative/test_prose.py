@@ -50,7 +50,7 @@ def test_no_module_outside_the_room_of_prose_parses_it() -> None:
 
 
 def test_every_code_has_a_sentence_and_every_sentence_a_code() -> None:
-    makers = ("diagnosis", "planning", "pipeline")
+    makers = ("inference", "diagnosis", "planning", "pipeline")
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name in makers)
     assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= SENTENCES.keys() | REMARKS.keys()
     assert [code for code in (*SENTENCES, *REMARKS) if not re.search(rf"""["']{code}["']""", source)] == []

@@ -26,7 +26,6 @@ from vinetrack.diagnosis.candidate_fits import (
     SubsetFitter,
     best_subset_fit,
     full_fit,
-    restart_exponents,
     start_values,
 )
 from vinetrack.diagnosis.force_inversion import uniform_splines
@@ -40,7 +39,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     answer_set,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, learn_missing_force, missing_force
 from vinetrack.diagnosis.score_test import shapes_of
 from vinetrack.dynamics.model import Model, check_needs, make_model
@@ -81,24 +79,14 @@ def add(
     if effect not in candidates:
         candidates = (*candidates, effect)
     before = initial_fit(model, pairs_of(experiment, tracks)[0], candidates, profile=False)
-    before, after = both_fits(before, effect, report)
+    after = fit_with(before, effect, report)
     report("errors before and after")
     return before, after, ladder((before, after), ("", effect.name))
 
 
-def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tuple[Fit, Fit]:
-    """Fit a model without and with an effect, each from its best minimum, as the diagnosis does. Returns before, after
-    : Fit.
-    """
-    if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
-        before = restart_exponents(before)
-    report(f"fitting it with {effect.name}")
-    after = _fit_with(before, effect)
-    return before, after
-
-
-def _fit_with(before: Fit, effect: Effect) -> Fit:
+def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
     """Fit a model with an effect added, from several starts."""
+    report(f"fitting it with {effect.name}")
     fitter = SubsetFitter(before)
     starts = [((effect,), start_values(shape, shape.step * 10)) for shape in shapes_of(effect)]
     subset_fit = best_subset_fit(fitter, starts, float("inf"))
@@ -278,7 +266,8 @@ def proposed_table(
         remember(path)
         effect = load_effect(path)
         try:
-            start, after = both_fits(with_host(before, Model((*model, effect))), effect, report)
+            start = with_host(before, Model((*model, effect)))
+            after = fit_with(start, effect, report)
         except FitError:
             return None
         ratio = likelihood_ratio(start, (effect,), after)
@@ -332,8 +321,6 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     candidates = candidates_of(model, None, {})
     report("fitting the model")
     before = initial_fit(model, pairs, candidates, profile=False)
-    if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
-        before = restart_exponents(before)
     report("estimating the missing force")
     detected = missing_force(before, learn=False).detected
     # 0.2: laws that explain less than the best by more than this part are not fitted (chosen)
@@ -356,10 +343,9 @@ def _fitted_laws(model: Model, before: Fit, detected: Sequence[DetectedLaw], rep
         fitted = []
         for law, effect in zip(detected, effects, strict=True):
             try:
-                start, after = both_fits(before, effect, report)
+                after = fit_with(before, effect, report)
             except FitError:
                 continue
-            before = max((before, start), key=lambda fit: fit.log_likelihood)
             fitted.append((law, effect, likelihood_ratio(before, (effect,), after)))
         report("errors on left-out conditions")
         highest = max((ratio.fit.log_likelihood for _, _, ratio in fitted), default=-math.inf)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from vinetrack.core.notebook import html_table, plot
+from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import decimals, display_unit, or_nan
@@ -370,7 +371,7 @@ class Number(JsonRecord):
 class BetweenTrialSpread:
     """Between-trial standard deviation, relative; `estimated` tells whether it is from these data."""
 
-    value: float
+    value: OrNaN
     estimated: bool
 
 
@@ -424,7 +425,7 @@ class NumberTable:
     names: tuple[str, ...]
     numbers: tuple[Number, ...]
     covariance: Floats
-    messages: tuple[str, ...]
+    messages: tuple[Any, ...]
     trials: Collection[Any]
 
     @property
@@ -434,7 +435,8 @@ class NumberTable:
 
     def _repr_html_(self) -> str:
         head = ("", "value", "standard error", "of it shared", "95 % interval", "unit")
-        return html_table(head, [number_row(number) for number in self.numbers], self.heading, self.messages)
+        rows = [number_row(number) for number in self.numbers]
+        return html_table(head, rows, self.heading, list(map(str, self.messages)))
 
     def __getitem__(self, name: str) -> Number:
         """The number of this name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique."""
@@ -474,7 +476,7 @@ class Fit(NumberTable):
     chi2_per_dof: float
     log_likelihood: float
     trials: tuple[TrialFit, ...]
-    messages: tuple[str, ...]
+    messages: tuple[Remark, ...]
     left_out: Mapping[str, str]
     converged: bool
     iterations: int

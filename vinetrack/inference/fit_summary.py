@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator
 
 from vinetrack.core.notebook import html_table
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
-from vinetrack.core.units import display_unit, or_nan
+from vinetrack.core.tables import JsonRecord
 from vinetrack.dynamics.model import Value, values_by_key
-from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, numbers_text
+from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, OrNaN, numbers_text
 from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.robust_covariance import FILM_ERROR, film_errors, sandwich
 
@@ -31,8 +33,6 @@ from vinetrack.inference.robust_covariance import FILM_ERROR, film_errors, sandw
 FILM = "film_mass"  # The effect that makes the mass of the film a free parameter
 
 MATTERS = 1.0  # Change of a number, in its stated errors, from which the film is mentioned (derived)
-
-MOST_NAMED = 4  # Largest number of changes listed, the largest first (chosen)
 
 
 def film_influence(fit: Fit) -> Floats:
@@ -63,63 +63,59 @@ def film_influence(fit: Fit) -> Floats:
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)
 
 
-def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[str, ...]:
+def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...]:
     """A message on the film mass where it matters as much as the stated errors, else none. Shapes: moved
     (n_numbers,).
     """
     sigma = np.array([number.sigma for number in numbers])
     ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
     affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= MATTERS]
-    if not affected:
-        return ()
-    parts = []
-    for k in affected[:MOST_NAMED]:
-        unit, factor = display_unit(numbers[k].unit)
-        parts.append(f"{numbers[k].title} by {factor * moved[k]:.2g} {unit}".rstrip())
-    more = len(affected) - len(parts)
-    listed = ", ".join(parts) + (f", and {more} more" if more else "")
-    return (
-        f"these errors assume the stated mass of the film; an error of {100 * FILM_ERROR:g} % in each vine would change"
-        f" {listed}. Weigh a piece of each vine, and correct thickness_um or film_density_kg_m3",
-    )
-
-
-SCALARS = ("noise_m", "noise_correlation", "chi2_per_dof", "log_likelihood")
-KEYS = {"names": "model", "between": "between_trials"}  # Where a key of the file is not the name of the field
+    changes = [(numbers[k].title, moved[k], numbers[k].unit) for k in affected]
+    return (remark("film_matters", error=FILM_ERROR, changes=changes),) if affected else ()
 
 
 @dataclass(frozen=True)
 class TrialEstimates:
     """What a fit estimated for one trial; deviations are relative, of the set pressure and of the vine's B."""
 
-    release_s: float
-    release_sigma_s: float
-    origin_m: float
-    origin_sigma_m: float
-    pressure_deviation: float
-    pressure_deviation_sigma: float
-    damping_deviation: float
-    damping_deviation_sigma: float
+    release_s: OrNaN
+    release_sigma_s: OrNaN
+    origin_m: OrNaN
+    origin_sigma_m: OrNaN
+    pressure_deviation: OrNaN
+    pressure_deviation_sigma: OrNaN
+    damping_deviation: OrNaN
+    damping_deviation_sigma: OrNaN
+
+
+def _array(content: Any) -> Floats:
+    """An array of a JSON file, where null means that a number is not known."""
+    return np.array(content if content is not None else (), dtype=float)
+
+
+Stored = Annotated[Floats, PlainValidator(_array), PlainSerializer(lambda array: array)]
 
 
 @dataclass(frozen=True, repr=False)
-class FitSummary(NumberTable):
+class FitSummary(NumberTable, JsonRecord):
     """The quoted results of a fit: see `vinetrack.inference.fit_result.Fit` for the meaning of each field. `names` are
     those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the audit.
     `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
     """
 
-    names: tuple[str, ...]
-    refused: str = ""
+    names: Annotated[tuple[str, ...], Field(alias="model")]
+    refused: Annotated[
+        str, BeforeValidator(lambda reason: reason or ""), PlainSerializer(lambda text: text or None)
+    ] = ""
     numbers: tuple[Number, ...] = ()
-    covariance: Floats = field(default_factory=lambda: np.empty((0, 0)))
-    between: Floats = field(default_factory=lambda: np.empty((0, 0)))
-    moved_by_film: Floats = field(default_factory=lambda: np.empty(0))
+    covariance: Stored = field(default_factory=lambda: np.empty((0, 0)))
+    between: Annotated[Stored, Field(alias="between_trials")] = field(default_factory=lambda: np.empty((0, 0)))
+    moved_by_film: Stored = field(default_factory=lambda: np.empty(0))
     spreads: Mapping[str, BetweenTrialSpread] = field(default_factory=dict)
-    noise_m: float = math.nan
-    noise_correlation: float = math.nan
-    chi2_per_dof: float = math.nan
-    log_likelihood: float = math.nan
+    noise_m: OrNaN = math.nan
+    noise_correlation: OrNaN = math.nan
+    chi2_per_dof: OrNaN = math.nan
+    log_likelihood: OrNaN = math.nan
     converged: bool = False
     messages: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -133,49 +129,8 @@ class FitSummary(NumberTable):
 
     def to_json(self) -> dict[str, Any]:
         """As `fit.json` holds it, SI; a refused fit has its model and the reason alone."""
-        content: dict[str, Any] = {"model": list(self.names), "refused": self.refused or None}
-        if self.refused:
-            return content
-        content |= {KEYS.get(entry.name, entry.name): getattr(self, entry.name) for entry in fields(self)[2:]}
-        return content | {
-            "numbers": [number.to_json() for number in self.numbers],
-            "spreads": {name: asdict(spread) for name, spread in self.spreads.items()},
-            "messages": list(self.messages),
-            "warnings": list(self.warnings),
-            "left_out": dict(self.left_out),
-            "trials": {name: asdict(estimates) for name, estimates in self.trials.items()},
-        }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> FitSummary:
-        """Read what `to_json` wrote; unknown numbers are NaN."""
-        numbers = tuple(Number.from_json(entry) for entry in content.get("numbers") or ())
-        covariance, between = (
-            np.array([[or_nan(cell) for cell in row] for row in content.get(key) or ()], dtype=float)
-            for key in ("covariance", "between_trials")
-        )
-        keys = [entry.name for entry in fields(TrialEstimates)]
-        return cls(
-            names=tuple(content.get("model") or ()),
-            refused=str(content.get("refused") or ""),
-            numbers=numbers,
-            covariance=covariance if covariance.size else np.full((len(numbers), len(numbers)), math.nan),
-            between=between if between.size else np.empty((0, 0)),
-            moved_by_film=np.array([or_nan(cell) for cell in content.get("moved_by_film") or ()]),
-            spreads={
-                str(name): BetweenTrialSpread(or_nan(spread["value"]), bool(spread["estimated"]))
-                for name, spread in (content.get("spreads") or {}).items()
-            },
-            **{name: or_nan(content.get(name)) for name in SCALARS},
-            converged=bool(content.get("converged")),
-            messages=tuple(content.get("messages") or ()),
-            warnings=tuple(content.get("warnings") or ()),
-            left_out=dict(content.get("left_out") or {}),
-            trials={
-                str(name): TrialEstimates(*(or_nan(estimates.get(key)) for key in keys))
-                for name, estimates in (content.get("trials") or {}).items()
-            },
-        )
+        content = super().to_json()
+        return {key: content[key] for key in ("model", "refused")} if self.refused else content
 
     def __repr__(self) -> str:
         state = "refused" if self.refused else f"{len(self.trials)} trials"
@@ -207,9 +162,12 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
         between=np.zeros_like(fit.covariance) if fit.between is None else fit.between,
         moved_by_film=moved,
         spreads=fit.spreads,
-        **{name: getattr(fit, name) for name in SCALARS},
+        noise_m=fit.noise_m,
+        noise_correlation=fit.noise_correlation,
+        chi2_per_dof=fit.chi2_per_dof,
+        log_likelihood=fit.log_likelihood,
         converged=fit.converged,
-        messages=(*fit.messages, *film_messages(fit.numbers, moved), *further_messages),
+        messages=tuple(map(str, (*fit.messages, *film_messages(fit.numbers, moved), *further_messages))),
         warnings=tuple(warnings),
         left_out=fit.left_out,
         trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
-from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import values_by_key
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError, FitTrial
@@ -66,7 +66,7 @@ from vinetrack.inference.position_errors import (
     smooth_errors,
     student,
 )
-from vinetrack.inference.robust_covariance import LENS, recorded_pressures, too_few_clusters, widened_covariance
+from vinetrack.inference.robust_covariance import recorded_pressures, too_few_clusters, widened_covariance
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -363,38 +363,24 @@ def fit_messages(
     precision: Precision,
     between: Floats,
     chi2: float,
-) -> tuple[str, ...]:
+) -> tuple[Remark, ...]:
     """Warnings on convergence, on each number, on the size of the residuals and on trials that disagree; notes on the
     data. Shapes: between (n_numbers, n_numbers).
     """
-    messages = []
-    if not solution.converged:
-        messages.append(f"the fit did not converge in {solution.iterations} iterations: its values are not reliable")
+    told = [] if solution.converged else [remark("not_converged", iterations=solution.iterations)]
     for k, number in enumerate(numbers):
-        free = predictor.layout.free[k]
+        named, free = {"title": number.title, "key": number.key}, predictor.layout.free[k]
         if precision.insensitive[k]:
-            messages.append(
-                f"{number.title} ({number.key}) has no influence on the trajectories: it stays at {number.value:.4g}"
-            )
+            told.append(remark("no_influence", **named, value=number.value))
         elif math.isfinite(number.bound):
-            messages.append(
-                f"{number.title} ({number.key}) sits at its bound {number.bound:.4g}: the data favour values outside"
-            )
-        # 0.95: ratio of fitted to stated error of P_y from which the trajectories are said not to constrain
-        # it (chosen)
+            told.append(remark("at_bound", **named, bound=number.bound))
+        # 0.95, 1.05: ratios of fitted to stated error of P_y from which the trajectories are said not to constrain it,
+        # and why the fitted error exceeds the stated one (chosen)
         elif math.isfinite(free.prior_sd) and number.sigma > 0.95 * free.prior_sd:
-            # 1.05: the same ratio from which the message explains why the fitted error exceeds the stated
-            # one (chosen)
-            wider = number.sigma > 1.05 * free.prior_sd
-            why = (
-                "; trials disagree by more than their noise, so its error is larger than in the sheet" if wider else ""
-            )
-            messages.append(f"{number.title}: the trajectories do not constrain it beyond the value in the sheet{why}")
+            told.append(remark("not_constrained", title=number.title, wider=number.sigma > 1.05 * free.prior_sd))
     if precision.collinear.any():
-        titles = [
-            f"{n.title} ({n.key})" for n, collinear in zip(numbers, precision.collinear, strict=True) if collinear
-        ]
-        messages.append(f"these data do not determine separate values of {', '.join(titles)}")
+        together = [n for n, collinear in zip(numbers, precision.collinear, strict=True) if collinear]
+        told.append(remark("not_separable", names=[f"{n.title} ({n.key})" for n in together]))
     variance = np.diag(precision.covariance)
     usable = np.flatnonzero(np.isfinite(variance) & (variance > 0))
     for i, j in itertools.combinations(usable.tolist(), 2):
@@ -402,78 +388,53 @@ def fit_messages(
         # 0.98: correlation of two fitted numbers from which the fit warns (chosen)
         if abs(correlation) > 0.98:
             first, second = numbers[i].title, numbers[j].title
-            messages.append(f"{first} and {second} are strongly correlated ({correlation:.3f})")
+            told.append(remark("correlated", first=first, second=second, correlation=float(correlation)))
+    varying = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
     for k, name in enumerate(SPREAD_NAMES):
-        if solution.problem.has_deviation[:, k].any() and not solution.estimable[k]:
-            messages.append(
-                f"the between-trial standard deviation of {name} is taken as {100 * solution.state.spread[k]:.2g} %"
-            )
+        if varying[k] and not solution.estimable[k]:
+            told.append(remark("spread_taken", name=name, spread=solution.state.spread[k]))
     # 2.0: χ² per degree of freedom from which the fit warns of misfit (chosen)
     if chi2 > 2.0:
-        varying = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.has_deviation[:, k].any()]
-        although = f", although {' and '.join(varying)} may vary from trial to trial" if varying else ""
-        messages.append(
-            f"the residuals are {math.sqrt(chi2):.3g} times the noise of the tracks{although}:"
-            " an effect is missing, or the tracks have slow errors larger than their noise"
-        )
-    messages += _shared_messages(numbers)
+        may_vary = [SPREAD_NAMES[k] for k in (1, 0) if varying[k]]
+        told.append(remark("misfit", ratio=math.sqrt(chi2), may_vary=may_vary))
+    by_source: dict[str, list[str]] = {}
+    for number in numbers:
+        if number.shared and number.shared_sigma**2 > 0.5 * number.sigma**2:
+            largest = max(number.shared, key=lambda source: number.shared[source])
+            by_source.setdefault(largest, []).append(number.title)
+    told += [remark("mostly_shared", names=titles, source=source) for source, titles in by_source.items()]
     sd = np.sqrt(np.diag(between))
     # 1.0: standard deviation between trials, in errors of the shared number, from which the fit says that trials
     # disagree
-    disagreements = [
-        f"{n.title} by ± {sd[k] * display_unit(n.unit)[1]:.2g} {display_unit(n.unit)[0]}".rstrip()
+    differing = [
+        (n.title, float(sd[k]), n.unit)
         for k, n in enumerate(numbers)
         if sd[k] > 1.0 * n.sigma and math.isfinite(n.sigma)
     ]
-    if disagreements:
-        where = ", ".join(disagreements)
-        messages.append(f"trials disagree by more than their noise, in {where}: they get nearly equal weights")
-    return (*messages, *_notes_on_data(predictor.data))
+    if differing:
+        told.append(remark("trials_disagree", differences=differing))
+    return (*told, *_notes_on_data(predictor.data))
 
 
-def _shared_messages(numbers: Sequence[Number]) -> list[str]:
-    """Which numbers a measurement would improve more than further trials."""
-    remedies = {
-        "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
-        "tracking": "film sharper edges", LENS: "calibrate the lens with a board",
-    }  # fmt: skip
-    mostly = [number for number in numbers if number.shared and number.shared_sigma**2 > 0.5 * number.sigma**2]
-    by_remedy: dict[str, list[str]] = {}
-    for number in mostly:
-        largest = max(number.shared, key=lambda source: number.shared[source])
-        by_remedy.setdefault(remedies[largest], []).append(number.title)
-    return [
-        f"most of the error of {', '.join(titles)} comes from what all trials share: {remedy}"
-        for remedy, titles in by_remedy.items()
-    ]
-
-
-def _notes_on_data(data: Sequence[FitTrial]) -> list[str]:
+def _notes_on_data(data: Sequence[FitTrial]) -> list[Remark]:
     """Notes on points with unequal weights, on positions that were smoothed before they were imported, and on recorded
     pressures that the fit corrected.
     """
     notes = []
     weighted = [trial_data for trial_data in data if trial_data.relative_sd is not None]
     if weighted and weighted[0].blur_s > 0:
-        blur_us = 1e6 * weighted[0].blur_s
-        notes.append(
-            f"the noise of positions grows with speed, by {blur_us:.2g} µs × speed: points are weighted accordingly"
-        )
+        notes.append(remark("weighted_by_speed", blur_us=1e6 * weighted[0].blur_s))
     elif weighted:
-        notes.append("points are weighted by the standard deviations that their files state")
-    notes += dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None)
-    corrections_Pa = [
-        each.trace_errors_Pa @ each.trace_error_sizes
+        notes.append(remark("weighted_as_stated"))
+    smoothed = dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None)
+    notes += [remark("smoothed", note=note) for note in smoothed]
+    largest_Pa = [
+        float(np.max(np.abs(each.trace_errors_Pa @ each.trace_error_sizes)))
         for each in data
         if each.trace_errors_Pa is not None and each.trace_error_sizes is not None
     ]
-    if corrections_Pa:
-        trials = f"{len(corrections_Pa)} trials" if len(corrections_Pa) > 1 else "one trial"
-        largest_kPa = max(float(np.max(np.abs(correction_Pa))) for correction_Pa in corrections_Pa) / 1e3
-        notes.append(
-            f"recorded pressures of {trials} are corrected by up to {largest_kPa:.2g} kPa, within the errors that the"
-            " noise of the gauge leaves, to agree with the motion"
-        )
+    if largest_Pa:
+        notes.append(remark("pressures_corrected", count=len(largest_Pa), largest_kPa=max(largest_Pa) / 1e3))
     return notes
 
 

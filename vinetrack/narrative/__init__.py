@@ -79,6 +79,15 @@ SENTENCES = {
     "keeps_pressure": "closed chamber that keeps the gauge pressure within {percent:g} %, by the gas law in absolute "
     "pressure",
     "slow_and_fast": "slow: γ = 1, isothermal; fast: γ = 1.4, adiabatic, as within milliseconds",
+    # Messages of a fit
+    "not_converged": "the fit did not converge in {iterations} iterations: its values are not reliable",
+    "no_influence": "{title} ({key}) has no influence on the trajectories: it stays at {value:.4g}",
+    "at_bound": "{title} ({key}) sits at its bound {bound:.4g}: the data favour values outside",
+    "correlated": "{first} and {second} are strongly correlated ({correlation:.3f})",
+    "weighted_by_speed": "the noise of positions grows with speed, by {blur_us:.2g} µs × speed: points are weighted "
+    "accordingly",
+    "weighted_as_stated": "points are weighted by the standard deviations that their files state",
+    "smoothed": "{note}",
     "with_corrected_times": "With corrected times: {verdict}. {explanation}",
 }
 

@@ -948,8 +948,55 @@ def _of_draws(share: float) -> str:
     return "in every draw" if share > 0.995 else f"in {share:.0%} of the draws"
 
 
+def _with_sizes(changes: Sequence[tuple[str, float, str]]) -> list[tuple[str, str]]:
+    """Names of numbers and sizes of their changes, in display units."""
+    shown = [(name, size, *display_unit(unit)) for name, size, unit in changes]
+    return [(name, f"{size * factor:.2g} {unit}".rstrip()) for name, size, unit, factor in shown]
+
+
+def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -> str:
+    """Return the message that an error of the film's mass matters as much as the errors stated."""
+    listed = ", ".join(f"{name} by {size}" for name, size in _with_sizes(changes)[:4])
+    more = f", and {len(changes) - 4} more" if len(changes) > 4 else ""
+    return (
+        f"these errors assume the stated mass of the film; an error of {100 * error:g} % in each vine would change"
+        f" {listed}{more}. Weigh a piece of each vine, and correct thickness_um or film_density_kg_m3"
+    )
+
+
+# What improves a number whose error comes mostly from what all trials share
+REMEDIES = {
+    "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
+    "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
+}  # fmt: skip
+
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
+    "film_matters": film_matters_text,
+    "spread_taken": lambda name, spread: (
+        f"the between-trial standard deviation of {name} is taken as {100 * spread:.2g} %"
+    ),
+    "not_constrained": lambda title, wider: (
+        f"{title}: the trajectories do not constrain it beyond the value in the sheet"
+        + ("; trials disagree by more than their noise, so its error is larger than in the sheet" if wider else "")
+    ),
+    "not_separable": lambda names: f"these data do not determine separate values of {', '.join(names)}",
+    "misfit": lambda ratio, may_vary: (
+        f"the residuals are {ratio:.3g} times the noise of the tracks"
+        f"{f', although {joined(may_vary)} may vary from trial to trial' if may_vary else ''}: an effect is missing, or"
+        " the tracks have slow errors larger than their noise"
+    ),
+    "mostly_shared": lambda names, source: (
+        f"most of the error of {', '.join(names)} comes from what all trials share: {REMEDIES[source]}"
+    ),
+    "trials_disagree": lambda differences: (
+        "trials disagree by more than their noise, in "
+        f"{', '.join(f'{name} by ± {size}' for name, size in _with_sizes(differences))}: they get nearly equal weights"
+    ),
+    "pressures_corrected": lambda count, largest_kPa: (
+        f"recorded pressures of {f'{count} trials' if count > 1 else 'one trial'} are corrected by up to"
+        f" {largest_kPa:.2g} kPa, within the errors that the noise of the gauge leaves, to agree with the motion"
+    ),
     "no_tube": lambda column: (
         f"it acts on {'a tube under pressure' if column == 'yield_pressure_kPa' else 'the gas of a chamber'}, and a"
         " body that moves as a whole has none"

@@ -136,7 +136,7 @@ def numbers_panel(
         rows=[_number_row(number, known.get(number.vine, number.vine) or "all") for number in fit.numbers],
         sizes_changed=sizes_changed,
         facts=facts,
-        messages=fit.messages,
+        messages=list(map(str, fit.messages)),
         ladder=ladder,
         gained=likelihood_change_text(fits[-2].fit, fit) if len(fits) > 1 else "",
     )
