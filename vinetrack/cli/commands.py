@@ -256,8 +256,8 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     import pandas as pd
 
     from vinetrack.core.tables import write_csv
+    from vinetrack.figures.style import check_figure, write_figure
     from vinetrack.pipeline.power_stage import PowerRequest, power_of_target, sheet_rows
-    from vinetrack.pipeline.predict_stage import check_figure, write_figure
 
     check_figure(figure)
     power = power_of_target(PowerRequest(target=target, **options))

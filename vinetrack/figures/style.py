@@ -18,6 +18,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import write_bytes
+
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
@@ -128,6 +131,21 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
             files[form] = file.getvalue()
     fig.set_layout_engine(engine)
     return files
+
+
+def write_figure(fig: Figure, path: Path) -> None:
+    """Write a figure in the format that the suffix names."""
+    check_figure(path)
+    form = path.suffix.lower().removeprefix(".")
+    write_bytes(path, render(fig, [form])[form])
+
+
+def check_figure(path: Path | None) -> None:
+    """Check the suffix of an output figure before anything is computed."""
+    figure_formats = (".png", ".svg", ".pdf")
+    if path is not None and path.suffix.lower() not in figure_formats:
+        remedy = f"end it in one of {', '.join(figure_formats)}"
+        raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])
 
 
 # ------------------------------------------------------------------------------

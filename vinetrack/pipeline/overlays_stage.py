@@ -18,21 +18,21 @@ from vinetrack.core.problems import INTERNAL_ERROR, UserError
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, hand_corrected, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.units import number
+from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
-from vinetrack.figures.style import GREEN
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
+from vinetrack.figures.style import GREEN, render
 from vinetrack.narrative.verdict_text import spaced_name
-from vinetrack.pipeline.trials import map_unordered
+from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.video.axis import Axis
+from vinetrack.video.curved_axis import axis_entry, axis_from_entry
+from vinetrack.video.frames import CONTAINERS, IMAGES, Recording, RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.survey import Measurement, measure_recording
+from vinetrack.video.write import write_clip
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from vinetrack.experiment.folder import Experiment
-    from vinetrack.figures.overlay import ClipView, Edge
-    from vinetrack.pipeline.stages import Job
-    from vinetrack.video.axis import Axis
-    from vinetrack.video.frames import Recording
-    from vinetrack.video.survey import Measurement
 
 
 log = logging.getLogger(__name__)
@@ -55,8 +55,6 @@ def draw_overlays(job: Job) -> list[str]:
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
     """Write the clip of one trial of a results folder with the settings of its run; return its path."""
-    from vinetrack.experiment.folder import read_experiment
-
     results = Results(folder)
     provenance = read_json(results.provenance)
     read = read_experiment(experiment or Path(str(provenance["experiment"])))
@@ -98,9 +96,6 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
 
 def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
     """Write the clip of one trial; return its path."""
-    from vinetrack.video.curved_axis import axis_from_entry
-    from vinetrack.video.frames import RecordingError, inspect_recording
-
     track, analysed = read_result(results.track(trial.name)), read_json(results.analysed(trial.name))
     shown, line = frames_to_show(track), analysed.get("axis")
     if line is None:
@@ -126,9 +121,6 @@ def _write_clip(
     since_s: Floats, shown: range, settings: OverlaySettings,
 ) -> None:  # fmt: skip
     """Write a clip of the shown frames; `since_s` is the time since release. Shapes: since_s (n_frames,)."""
-    from vinetrack.figures.overlay import ClipView
-    from vinetrack.video.write import write_clip
-
     rate = 1.0 / float(np.median(np.diff(since_s))) if len(since_s) > 1 else math.nan
     play_fps, stride = playback_rate(len(shown), settings.seconds)
     size = recording.width, recording.height
@@ -162,9 +154,6 @@ def draw_over(
     recording: Recording, view: ClipView, edges: list[Edge], time_ms: Floats, shown: range, stride: int
 ) -> Iterator[NDArray[np.uint8]]:
     """Draw edges over the frames of a recording. Shapes: time_ms (n_frames,)."""
-    from vinetrack.figures.overlay import compose, levels
-    from vinetrack.video.frames import iterate_frames
-
     low = high = 0.0
     for frame, picture in enumerate(iterate_frames(recording)):
         if frame >= shown.stop:
@@ -190,8 +179,6 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
     """Return the tracked edge, the predicted edges if there are any, and the time of release, s. Returns edges,
     release_s.
     """
-    from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
-
     edge_px = track["edge_px"].to_numpy(dtype=float)
     edges, first_moving = [Edge("tracked edge", TRACKED, edge_px)], frames_to_show(track).start + MARGIN_FRAMES
     release_s = float(track["time_s"].iloc[min(first_moving, len(track) - 1)])
@@ -260,9 +247,6 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
     """Track the leading edge of one recording; write its table, strip and clip. Returns mapping with facts about the
     file, results of tracking, and paths of output files, units in the keys.
     """
-    from vinetrack.video.frames import RecordingError, inspect_recording
-    from vinetrack.video.survey import measure_recording
-
     settings, folder = _calibration(options)
     try:
         recording = inspect_recording(_recording_path(path))
@@ -300,8 +284,6 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
 
 def _recording_path(path: Path) -> Path:
     """Return the path if it can be a single recording."""
-    from vinetrack.video.frames import CONTAINERS, IMAGES
-
     if not path.exists():
         parent = path.parent
         names = sorted(entry.name for entry in parent.iterdir()) if parent.is_dir() else []
@@ -407,9 +389,6 @@ def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
 
 
 def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: bool) -> dict[str, Path]:
-    from vinetrack.figures.overlay import TRACKED, Edge, draw_strip
-    from vinetrack.figures.style import render
-
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; name a folder with --out")
     tracking, recording = measurement.tracking, measurement.recording
@@ -430,8 +409,6 @@ def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: 
 def _tracking_facts(
     measurement: Measurement, table: pd.DataFrame, options: TrackOptions, rate: float
 ) -> dict[str, Any]:
-    from vinetrack.video.curved_axis import axis_entry
-
     tracking = measurement.tracking
     edge_px = tracking.track.edge_px
     usable = np.isfinite(edge_px)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.records import Trial
-from vinetrack.core.tables import STANDARD_OUTPUT, write_bytes, write_csv, write_json
+from vinetrack.core.tables import STANDARD_OUTPUT, write_csv, write_json
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE
@@ -24,7 +24,7 @@ from vinetrack.experiment.schema import COLUMNS, CellError, option, read_cell
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
-from vinetrack.figures.style import render
+from vinetrack.figures.style import check_figure, write_figure
 from vinetrack.inference.fit_data import FitError
 from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.planning.prediction import (
@@ -60,7 +60,7 @@ from vinetrack.planning.predictive_inputs import (
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # ------------------------------------------------------------------------------
@@ -251,21 +251,6 @@ def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
             band = "–" if entry.low == entry.high else f"{low} to {high}"
             rows.append((entry.symbol, median, band, display_unit(entry.unit, PREDICTION_UNITS)[0], entry.origin))
     return rows
-
-
-def write_figure(fig: Figure, path: Path) -> None:
-    """Write a figure in the format that the suffix names."""
-    check_figure(path)
-    form = path.suffix.lower().removeprefix(".")
-    write_bytes(path, render(fig, [form])[form])
-
-
-def check_figure(path: Path | None) -> None:
-    """Check the suffix of an output figure before anything is computed."""
-    figure_formats = (".png", ".svg", ".pdf")
-    if path is not None and path.suffix.lower() not in figure_formats:
-        remedy = f"end it in one of {', '.join(figure_formats)}"
-        raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])
 
 
 @dataclass(frozen=True)
