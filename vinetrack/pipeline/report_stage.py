@@ -25,8 +25,6 @@ from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
 from vinetrack.report.build import (
     Clip,
-    DiagnosisResult,
-    ModelResult,
     ReportContent,
     ReportFigure,
     ReportSection,
@@ -162,6 +160,9 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
     if experiment.settings.published:
         figures = _figures(tables, figures_of("paper").values(), diagnosis)
         paper = [paper_section(tables.paper, tables.paper_departures, figures)]
+    known = dict(catalogue())
+    with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
+        known |= own_effects([experiment.folder / path for path in experiment.settings.effects])
     return ReportContent(
         name=experiment.name,
         trials=trials,
@@ -181,33 +182,21 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         },
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
         clip=_clip(results, tables.diagnosed, trials),
-        model=ModelResult(
-            read_fit(results), read_result(results.comparison), read_result(results.model_check), diagnosis
-        ),
-        diagnosis=None if diagnosis is None else _diagnosis_section(results, diagnosis, experiment),
+        fit=read_fit(results),
+        comparison=read_result(results.comparison),
+        check=read_result(results.model_check),
+        diagnosis=diagnosis,
+        moved=_table_of(results, "moved.csv"),
+        laws=_table_of(results, "damping_laws.csv"),
+        effects=known,
         sections=paper,
         notes=experiment.blank_notes,
     )
 
 
-def _diagnosis_section(results: Results, diagnosis: Diagnosis, experiment: Experiment) -> DiagnosisResult:
-    """Return the content of the report's section on the diagnosis."""
-    known = dict(catalogue())
-    with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
-        known |= own_effects([experiment.folder / path for path in experiment.settings.effects])
-    paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
-    moved, laws = (table if path.exists() and len(table := read_result(path)) else None for path in paths)
-    reported = [*diagnosis.effects, *diagnosis.answer_set]
-    named = dict.fromkeys([*reported, *(row.effect for ranked in diagnosis.rounds for row in ranked.ranking)])
-    effects = {name: known[name] for name in named if name in known}
-    return DiagnosisResult(
-        diagnosis,
-        diagnosis.ladder,
-        moved,
-        laws,
-        {name: effects[name].summary for name in reported if name in effects},
-        {f"{name}.{p.name}": (p.symbol, p.unit) for name, effect in effects.items() for p in effect.parameters},
-    )
+def _table_of(results: Results, name: str) -> pd.DataFrame | None:
+    """A table of the diagnosis; None if it wrote none."""
+    return read_result(path) if (path := results.diagnosed(name)).exists() else None
 
 
 def _picture(path: Callable[[str], Path]) -> str | bytes:
