@@ -46,9 +46,7 @@ SYSTEMATIC_OF_TRAVEL = 4e-4  # Smooth position error where the lens is unknown, 
 
 @dataclass(frozen=True)
 class PictureAxis:
-    """The growth axis of a trial in the picture: (x, y) of its ends, px; `width_m` is NaN if not given. `via_px` are
-    intermediate points of a curved path, in order.
-    """
+    """Growth axis of a trial in the picture: (x, y) of its ends and of points between, px; NaN for no width."""
 
     from_px: tuple[float, float]
     to_px: tuple[float, float]
@@ -195,9 +193,7 @@ class Track:
 def plain_track(
     time_s: Floats, lead_position_m: Floats, *, sigma_m: Floats | None = None, pressure_Pa: Floats | None = None
 ) -> Track:
-    """Make a track of positions alone: without flags and pixels, and without errors unless given. Shapes: time_s,
-    lead_position_m, sigma_m, pressure_Pa (n_frames,).
-    """
+    """Make a track of positions alone, without errors unless given. Shapes of all arrays (n_frames,)."""
     unknown = np.full(len(time_s), np.nan)
     no_flag = np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}")
     return Track(time_s, lead_position_m, unknown if sigma_m is None else sigma_m, no_flag, unknown.copy(), pressure_Pa)

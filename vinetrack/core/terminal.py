@@ -71,9 +71,7 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 class Progress(Generic[Item]):
-    """A progress bar with the remaining time, or a spinner with the elapsed time if the total is unknown. It appears
-    on standard error after half a second if that is a terminal; see `progress` and `waiting`.
-    """
+    """A bar with the time left, or a spinner; on standard error after half a second, if that is a terminal."""
 
     def __init__(self, items: Iterable[Item] | None, total: int | None, description: str, unit: str = "") -> None:
         from rich import progress as rich

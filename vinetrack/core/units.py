@@ -86,9 +86,7 @@ def interval(bounds: Sequence[float | None] | None) -> str:
 
 
 def with_interval(value: float | None, bounds: Sequence[float | None] | None, shown: bool = True) -> str:
-    """Return `value (95 %: low to high)`, with decimals that suit the width; only the value if the bounds
-    are unknown or not to be `shown`.
-    """
+    """Return `value (95 %: low to high)`, with decimals that suit the width; without bounds the value."""
     if value is None or bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return number(value)
     low, high = (float(bound) for bound in bounds if bound is not None)

@@ -330,9 +330,7 @@ CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure
 
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
-    """Return the rank of every trial, from 0, in the order in which they were run, shape (n_trials,), and whether the
-    sheet states that order.
-    """
+    """Return the rank of every trial, from 0, as they were run, shape (n_trials,), and whether the sheet says so."""
     order = np.array([trial.order for trial in trials], dtype=float)
     stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
     ranks = np.argsort(np.argsort(order)) if stated else np.arange(order.size)
@@ -497,9 +495,7 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
 
 
 def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
-    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
-    ends of the file are kept; other encodings are converted to UTF-8.
-    """
+    """Set `model:` in `experiment.yaml`, its byte-order mark and line ends kept; return the path."""
     path, mark = folder / SETTINGS, b"\xef\xbb\xbf"
     before = path.read_bytes() if path.exists() else b""
     text = read_text(path) if before else ""

@@ -164,9 +164,7 @@ def read_value(column: Column, value: Any) -> Any:
 
 
 def read_range(column: Column, value: Any) -> tuple[float, float]:
-    """Read the two ends of a range, `low:high` or two numbers, each checked like a cell of the column. Returns low and
-    high, in the unit of the column.
-    """
+    """Read `low:high` or two numbers, each checked like a cell of the column and in its unit."""
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
         raise CellError("is not a range", "write low:high, such as 7:40", code="not_a_range")

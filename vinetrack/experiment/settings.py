@@ -423,9 +423,7 @@ def _group(model: type[BaseModel], location: tuple[Any, ...]) -> type[BaseModel]
 
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Rename columns in other units to those of the sheet and convert their numbers, with a warning for each. A column
-    of the sheet without any value gives way to the same quantity in another unit.
-    """
+    """Convert columns in other units to those of the sheet, with a warning each; of two units the blank gives way."""
     problems: list[Problem] = []
     known = {other: (name, unit) for name in COLUMNS for other, unit in other_units(name).items()}
     taken = {name for name in table.columns if any(row[name] for row in table.rows)}
@@ -450,9 +448,7 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
 
 
 def _in_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> YamlDocument:
-    """Rename keys in other units, such as `pressure_psi`, to those of the settings and convert their numbers, with a
-    warning for each. Of two keys for one quantity a blank one gives way.
-    """
+    """Convert keys in other units to those of the settings, with a warning each; of two units the blank gives way."""
     content, lines = dict(document.content), dict(document.lines)
     groups: dict[str, Iterable[type[BaseModel]]] = {
         "": [ExperimentSettings],

@@ -127,9 +127,7 @@ def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
 
 
 def closest_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
-    """Name of the entry of a missing file's folder that is most like its own, in upper or lower case, and not `taken`;
-    blank if there is none.
-    """
+    """Entry beside a missing file most like it, whatever its case, and not `taken`; blank if there is none."""
     try:
         names = {entry.name.lower(): entry.name for entry in sorted(path.parent.iterdir()) if entry not in taken}
     except (OSError, ValueError):

@@ -150,9 +150,7 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
 
 
 def rms_m(trials: pd.DataFrame, model: str) -> float:
-    """Return the root mean square error of position of a model after release, m. Returns all trials have the same
-    weight, as in `comparison.csv`; NaN without a prediction.
-    """
+    """Root mean square error of a model after release, m, every trial with one weight; NaN without prediction."""
     squares = [
         float(np.mean((part["lead_position_m"] - part[model]) ** 2))
         for _, part in trials[trials["time_s"] >= 0].groupby("trial", sort=False)

@@ -145,9 +145,7 @@ def _draw_kymograph(ax: Axes, tracking: Tracking) -> None:
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """Return a picture reduced to at most `largest_px` pixels per side by averaging, ignoring NaN. Shapes: picture
-    (height, width) → (≤ largest_px, ≤ largest_px).
-    """
+    """Return a picture averaged to at most `largest_px` pixels per side, ignoring NaN. Shape (height, width)."""
     for axis in (0, 1):
         step = -(-picture.shape[axis] // largest_px)
         if step > 1:
@@ -244,9 +242,7 @@ class ClipView:
         return 1.1 * self.line_px + 1.35 * self.line_px * row
 
     def at(self, along_px: Any, across_px: float = 0.0) -> Any:
-        """Places of the clip along the axis. Pixel centres are at integers in the recording, at half-integers in the
-        clip.
-        """
+        """Places of the clip along the axis; pixel centres are at integers in the recording, at halves in the clip."""
         return (self.axis.points(along_px, across_px) + 0.5) * self.zoom - 0.5
 
 
@@ -349,8 +345,6 @@ def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
-    """Return grey levels stretched so that `low` is black and `high` white. Shapes: picture (height, width) → (height,
-    width).
-    """
+    """Return grey levels, shape (height, width), stretched so that `low` is black and `high` white."""
     stretched = (picture.astype(np.float32) - low) * (255.0 / max(high - low, 1e-9))
     return np.clip(np.round(stretched), 0, 255).astype(np.uint8)

@@ -59,9 +59,7 @@ def draw_choice(choices: Sequence[Choice]) -> Figure:
 def draw_reservoir(
     volumes_m3: np.ndarray, losses: Mapping[str, np.ndarray], loss: float, swept_m3: float, chosen_m3: float
 ) -> Figure:
-    """Draw the fraction of the gauge pressure that a closed chamber loses while a vine grows, by two gas laws, against
-    its volume. Shapes: volumes_m3, losses (n_volumes,).
-    """
+    """Draw the part of its gauge pressure that a closed chamber loses to a vine. Shapes (n_volumes,)."""
     # Below 10 mL the axis is in millilitres, so that its ticks need no exponent.
     factor, unit = (1e3, "L") if volumes_m3[0] >= 1e-5 else (1e6, "mL")
     fig = st.new_figure(7.2, 4.4)
@@ -221,9 +219,7 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
 
 @st.look()
 def draw_power(power: Power) -> Figure | None:
-    """Draw the power to detect each effect against its size; first what is detected at the smallest fraction of its
-    plausible size.
-    """
+    """Draw the power to detect each effect against its size, in the order of what is detected first."""
     from matplotlib.colors import LinearSegmentedColormap
 
     entries = sorted(power.effects, key=lambda one: abs((one.size_at(0.9) - one.zero) / (one.largest - one.zero)))

@@ -240,9 +240,7 @@ def line_key(label: str, **style: Any) -> Line2D:
 
 
 def error_points(ax: Axes, x: ArrayLike, y: ArrayLike, sigma: ArrayLike, index: int, label: str, **style: Any) -> None:
-    """Draw points with error bars in the colour and with the marker of a group of vines or conditions. Shapes: x, y,
-    sigma (n_points,).
-    """
+    """Draw points with error bars, colour and marker by group. Shapes: x, y, sigma (n_points,)."""
     properties: dict[str, Any] = {"ms": 6, "capsize": 3, **style}
     colour, marker = VINE_COLOURS[index % len(VINE_COLOURS)], VINE_MARKERS[index % len(VINE_MARKERS)]
     bars = np.nan_to_num(np.asarray(sigma, dtype=float))

@@ -63,9 +63,7 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
 
 
 def model_problems(experiment: Path) -> list[Problem]:
-    """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`. Returns nothing for
-    the base model, nor if the experiment cannot be read, which `check_experiment` reports.
-    """
+    """Find problems of the effects that a readable experiment names in `model`, `candidates` or `effects`."""
     try:
         read = read_experiment(experiment, strict=False)
     except ExperimentError:

@@ -195,9 +195,7 @@ Pairs = Sequence[tuple[Trial, Track]]
 
 
 def diagnose_results(job: Job, fitted: Fit | None) -> None:
-    """Diagnose the trials of a results folder, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and the
-    folder `diagnosis`.
-    """
+    """Diagnose the trials, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and `diagnosis/`."""
     results = Results(job.results)
     try:
         diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
@@ -218,9 +216,7 @@ def diagnose_results(job: Job, fitted: Fit | None) -> None:
 def diagnosed(
     experiment: Experiment, results: Results, report: Report, fitted: Fit | None = None
 ) -> tuple[Diagnosis, Pairs]:
-    """The diagnosis with the model, candidates, user effects and limits that the experiment states, and with what
-    recordings and speeds contradict in its sheet; and its trials.
-    """
+    """The diagnosis as the experiment asks for it, with what contradicts its sheet; and its trials."""
     from vinetrack.diagnosis.diagnose import diagnose
 
     pairs, _ = measured_trials(experiment, results)
@@ -243,9 +239,7 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
 
 
 def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
-    """Return a sentence for each column of the sheet that recordings or speeds contradict. Returns by name of the
-    column.
-    """
+    """Return a sentence for each column of the sheet that recordings or speeds contradict, by its name."""
     noted: dict[str, list[tuple[str, str]]] = {}
     for trial, _ in pairs:
         for entry in read_json(results.analysed(trial.name)).get("contradictions", []):

@@ -42,9 +42,7 @@ FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a p
 
 
 def draw_overlays(job: Job) -> list[str]:
-    """Write the clips that the settings request; return a line for every clip that could not be made. A recording that
-    cannot be drawn does not stop the others. The folder is created even without clips.
-    """
+    """Write the clips that the settings request; return a line for every clip that could not be made."""
     experiment, results, settings = job.experiment, Results(job.results), job.settings.overlays
     results.overlays.mkdir(parents=True, exist_ok=True)
     chosen = chosen_trials(experiment, results, settings.of)
@@ -142,9 +140,7 @@ def frames_to_show(track: pd.DataFrame) -> range:
 
 
 def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
-    """Return playback rate and stride of a clip that lasts about `seconds`. Returns play_fps (frames per second),
-    stride (every how many frames of the recording one is shown).
-    """
+    """Return frames per second of a clip of about `seconds`, and of how many frames of the film it shows one."""
     fastest_fps, slowest_fps = 30.0, 4.0  # Limits of the playback rate of a clip, frames per second (chosen)
     stride = max(round(n_frames / seconds / fastest_fps), 1)
     return float(np.clip(n_frames / stride / seconds, slowest_fps, fastest_fps)), stride
@@ -166,9 +162,7 @@ def draw_over(
 
 
 def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
-    """Return the shift of each frame along the axis due to camera shake, px; 0 for a camera at rest. Shape
-    (n_frames,).
-    """
+    """Return the shift of each frame along the axis by camera shake, px, shape (n_frames,); 0 at rest."""
     shake_px = np.zeros(n_frames)
     stored_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
     shake_px[: stored_px.size] = stored_px
@@ -176,9 +170,7 @@ def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
 
 
 def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
-    """Return the tracked edge, the predicted edges if there are any, and the time of release, s. Returns edges,
-    release_s.
-    """
+    """Return the tracked edge, the predicted edges if there are any, and the time of release, s."""
     edge_px = track["edge_px"].to_numpy(dtype=float)
     edges, first_moving = [Edge("tracked edge", TRACKED, edge_px)], frames_to_show(track).start + MARGIN_FRAMES
     release_s = float(track["time_s"].iloc[min(first_moving, len(track) - 1)])
@@ -206,9 +198,7 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
 
 
 def position_to_px(track: pd.DataFrame) -> Any:
-    """Return the conversion from metres to pixels along the axis, fitted to the points of a track. It is a quadratic
-    polynomial, since lens distortion and tilt make it slightly nonlinear.
-    """
+    """Return the quadratic (lens, tilt) that converts metres to pixels along the axis, fitted to a track."""
     both = track[["lead_position_m", "edge_px"]].dropna()
     metres, px = both["lead_position_m"].to_numpy(dtype=float), both["edge_px"].to_numpy(dtype=float)
     if len(both) < FEWEST_POINTS or np.ptp(metres) <= 0:
@@ -244,9 +234,7 @@ class TrackOptions:
 
 
 def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) -> dict[str, Any]:
-    """Track the leading edge of one recording; write its table, strip and clip. Returns mapping with facts about the
-    file, results of tracking, and paths of output files, units in the keys.
-    """
+    """Track the leading edge of one recording; write table, strip and clip. Returns facts, units in the keys."""
     settings, folder = _calibration(options)
     try:
         recording = inspect_recording(_recording_path(path))

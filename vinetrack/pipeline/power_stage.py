@@ -194,9 +194,7 @@ def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[
 
 @in_one_blas_thread
 def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
-    """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns; of
-    those in memory, of a fit or with the base model, where they are given.
-    """
+    """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
     with waiting("calculating the power of the trials"):
         if given is None:
             campaign = campaign_of_target(request)

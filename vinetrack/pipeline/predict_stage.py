@@ -129,9 +129,7 @@ class PredictionRequest:
 
 @dataclass(frozen=True)
 class PredictionBasis:
-    """What predictive inputs are made from: planned trials, stated values, and a fit if there is one; `heading` stands
-    over everything predicted from it.
-    """
+    """Planned trials, stated values, a fit if there is one; `heading` stands over everything predicted from them."""
 
     planned: PlannedTrials
     stated: StatedValues
@@ -415,9 +413,7 @@ FILMS = "--films-um"
 
 
 def read_range(column: str, text: str) -> tuple[float, float]:
-    """Read a range from `low:high` or one number, each checked like a cell of the column. Returns low, high : float,
-    SI.
-    """
+    """Read `low:high` or one number, each checked like a cell of the column; return both in SI."""
     values = [_cell(column, part) for part in text.split(":")]
     if len(values) > 2:
         raise _refusal(column, text, "is not a range", "write low:high, such as 5:25")

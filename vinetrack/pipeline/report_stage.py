@@ -210,9 +210,7 @@ def _picture(path: Callable[[str], Path]) -> str | bytes:
 def _figures(
     tables: FigureTables, figures: Iterable[RegisteredFigure], diagnosis: Diagnosis | None
 ) -> list[ReportFigure]:
-    """Return the figures that were drawn for the page, each with its data: a file of the results, or a table of its own
-    with five digits, more than a figure can show.
-    """
+    """Return the drawn figures with their data: a file of the results, or a table of its own with five digits."""
     shown = []
     for one in figures:
         if picture := _picture(partial(tables.results.figure, one.name)):

@@ -129,9 +129,7 @@ Answer = TypeVar("Answer")
 
 
 def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
-    """Yield `function(item)` of every item as soon as it is ready, in any order. `function` and items are sent to other
-    processes and must be picklable.
-    """
+    """Yield `function(item)` of every item as soon as it is ready; both go to other processes, so are picklable."""
     if n_workers < 2 or len(items) < 2:
         yield from map(function, items)
         return

@@ -208,9 +208,7 @@ def analyse_trials(job: Job) -> list[str]:
 
 
 def _analyse(name: str, experiment: Experiment, results: Results, settings: RunSettings) -> tuple[str, str, str]:
-    """Analyse one trial in a worker process. Returns its name, why it failed (blank if it did not), and the traceback
-    of an unexpected exception (blank if there was none).
-    """
+    """Analyse one trial. Returns its name, why it failed and the traceback of a fault; blank if there are none."""
     reason, fault, kept = experiment.failed.get(name, ""), "", Kept(results.folder)
     trial = None if reason else experiment.trial(name)
     measurement, summary = None, None

@@ -78,9 +78,7 @@ def command_for_results(experiment: Path, results: Path) -> str:
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
-    """Return the ground truth of a shipped virtual experiment; None for any other folder. The virtual laboratory has a
-    file for each folder of `data/` that it makes, with the same name.
-    """
+    """Ground truth, named like its folder in `data/`, of a shipped virtual experiment; None for any other."""
     for ground_truth in sorted((PACKAGE / "laboratory").glob("*.yaml")):
         shipped = base / "data" / ground_truth.stem
         if folder.exists() and shipped.exists() and folder.samefile(shipped):
@@ -225,9 +223,7 @@ class WorkflowPlan:
 
     @property
     def jobs(self) -> dict[str, tuple[str, Stage, Sequence[str]]]:
-        """Jobs by name: the name of the stage, the stage, and the trials it is for. Trials are shared out over several
-        jobs where they are many, so that a cluster works on them at the same time.
-        """
+        """Jobs by name: name of the stage, stage, trials; many trials are shared out over several jobs."""
         jobs: dict[str, tuple[str, Stage, Sequence[str]]] = {}
         for name, stage in self.stages.items():
             step = TRIALS_PER_JOB if name == "trials" else len(self.trials)
@@ -236,9 +232,7 @@ class WorkflowPlan:
         return jobs
 
     def files(self, group: str, trials: Sequence[str] | None = None) -> list[str]:
-        """Paths of a file or folder of the results, or of a group of files, as the table of stages names them; those of
-        some trials alone, or of all.
-        """
+        """Paths of a file, folder or group of files of the table of stages; of some trials alone, or of all."""
         trials = self.trials if trials is None else trials
         if not group.startswith("<"):
             return [self.result(group)]
@@ -265,9 +259,7 @@ class WorkflowPlan:
         return [self.result("figures", f"{prefix}{name}.{form}") for name in names for form in formats]
 
     def settings_of(self, stage: Stage) -> str:
-        """Settings that a stage depends on, as JSON; all but the paths if it names none. Paths are left out, since the
-        same folder can be written in several ways.
-        """
+        """Settings that a stage depends on, as JSON; all but the paths, which have many spellings, if it names none."""
         chosen = set(stage.settings) or set(type(self.settings).model_fields) - {"experiment", "results"}
         return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
@@ -324,9 +316,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
 
 
 def or_exit(function: Callable[..., Made], *given: Any) -> Made:
-    """Call a function; print its problems in at most 20 lines and exit with status 1. For the Snakefile, where an
-    exception would be printed with Snakemake's traceback.
-    """
+    """Call a function for the Snakefile; print its problems instead of a traceback and exit with status 1."""
     try:
         return function(*given)
     except ExperimentError as error:

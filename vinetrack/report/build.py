@@ -552,9 +552,7 @@ MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single tria
 
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
-    """Return all trials for the template, and the number of trials whose figures were left out for size. Returns
-    entries, n_left_out.
-    """
+    """Return all trials for the template, and how many of them have their figures left out for size."""
     entries, left_out, weight = [], 0, 0
     for row in rows(content.trials):
         name, curve = row.trial, content.kinematics.get(row.trial)
@@ -588,9 +586,7 @@ def _thinned(curve: pd.DataFrame, n_trials: int) -> str:
 
 
 def speed_sparkline(curve: pd.DataFrame, steady_s: tuple[float, float]) -> Markup:
-    """Return the speed of a trial against time as a small SVG, with the steady window thick; blank if there is nothing
-    to draw.
-    """
+    """Return the speed of a trial as a small SVG, its steady window thick; blank if there is nothing to draw."""
     spark_px = (132, 30)  # Width and height of the small curve of a trial (chosen)
     known = curve[np.isfinite(curve["time_s"]) & np.isfinite(curve["lead_velocity_m_s"])]
     known = known.iloc[:: max(len(known) // spark_px[0], 1)]
@@ -654,9 +650,7 @@ def _rms_mm(values_m: pd.Series) -> str:
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip that plays in the page: the trial, the MP4 file, a caption, and a WebP poster. The poster is shown until
-    the clip plays, and in print.
-    """
+    """A clip that plays in the page: trial, MP4 file, caption; a WebP poster, shown until it plays and in print."""
 
     trial: str
     mp4: bytes
