@@ -154,9 +154,9 @@ def split_flags(flag: str) -> list[str]:
     return [part for part in flag.split(";") if part]
 
 
-def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:
-    """Return the mask of points that carry a flag. Shape (n_frames,)."""
-    return np.array([name in split_flags(str(flag)) for flag in flags], dtype=bool)
+def with_flag(flags: Iterable[str], *names: str) -> NDArray[np.bool_]:
+    """Return the mask of points that carry one of these flags. Shape (n_frames,)."""
+    return np.array([any(name in names for name in split_flags(str(flag))) for flag in flags], dtype=bool)
 
 
 def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import UNUSABLE_FLAGS, Floats, hand_corrected
+from vinetrack.core.records import FLAGS, UNUSABLE_FLAGS, Floats, hand_corrected, with_flag
 from vinetrack.core.units import number
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
@@ -128,7 +128,7 @@ def _draw_kymograph(ax: Axes, tracking: Tracking) -> None:
     extent = (-0.5, strip.shape[1] - 0.5, float(shown_ms[-1]) + half_ms, float(shown_ms[0]) - half_ms)
     ax.imshow(small, aspect="auto", extent=extent, cmap="gray", vmin=dark, vmax=light, interpolation="none")
     edge, by_hand = track.edge_px, hand_corrected(track.flag)
-    odd = flagged(track.flag) & ~by_hand
+    odd = with_flag(track.flag, *set(FLAGS) - {"before_release"}) & ~by_hand
     fine = ~odd & ~by_hand & np.isfinite(edge)
     ax.plot(edge[fine], time_ms[fine], color=st.ORANGE, linewidth=1.0, label=f"leading edge, N = {int(fine.sum())}")
     if odd.any():
@@ -155,13 +155,6 @@ def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
             counts = np.add.reduceat(known.astype(np.float32), starts, axis=axis)
             picture = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
     return picture
-
-
-def flagged(flag: Any) -> np.ndarray:
-    """Return a mask, shape (n_frames,), of the frames with any flag except `before_release`. Shapes: flag (n_frames,) →
-    (n_frames,).
-    """
-    return np.array([bool(set(str(entry).split(";")) - {"before_release", ""}) for entry in flag], dtype=bool)
 
 
 def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:

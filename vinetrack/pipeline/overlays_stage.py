@@ -191,7 +191,7 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
                 edges.append(Edge(label, colour, to_px(position_m), 1e3 * (position_m - measured_m)))
         fitted = read_fit(results).trials if results.fit.exists() else {}
         release_s = fitted[trial].release_s if trial in fitted else release_s
-    by_hand = hand_corrected(track["flag"].fillna(""))
+    by_hand = hand_corrected(track["flag"])
     if by_hand.any():
         edges.append(Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan), by_hand=True))
     return edges, release_s
@@ -399,9 +399,7 @@ def _tracking_facts(
 ) -> dict[str, Any]:
     tracking = measurement.tracking
     edge_px = tracking.track.edge_px
-    usable = np.isfinite(edge_px)
-    for flag in UNUSABLE_FLAGS:
-        usable &= ~with_flag(tracking.track.flag, flag)
+    usable = np.isfinite(edge_px) & ~with_flag(tracking.track.flag, *UNUSABLE_FLAGS)
     moving = usable & ~with_flag(tracking.track.flag, "before_release")
     frame = np.flatnonzero(usable)
     scale = measurement.m_per_px if options.scaled else math.nan
