@@ -20,8 +20,6 @@ from lsoda_vine import grown_position, vine_trial
 import vinetrack
 
 # A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
-
-
 ROOT = Path(__file__).parents[1]
 N = 0.4
 B = {12: 2.0, 24: 6.0}
@@ -255,8 +253,6 @@ def test_the_same_experiment_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 # A workflow that is killed goes on with the same command.
-
-
 @through_snakemake
 def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None:
     write_campaign(tmp_path / "vines")

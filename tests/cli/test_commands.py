@@ -28,8 +28,6 @@ from vinetrack.pipeline import effects_stage, model_stage
 from vinetrack.pipeline.workflow import command_for_results
 
 # The command line: exit codes, sentences, no tracebacks.
-
-
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
 TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20))
 
@@ -96,8 +94,6 @@ def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch:
 
 
 # `vinetrack diagnose` and `vinetrack add` from a folder of tracks to files and sentences.
-
-
 LADDER = (
     "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m,partial"
 )
@@ -184,8 +180,6 @@ def test_a_wrong_folder_exits_with_1() -> None:
 
 
 # `vinetrack propose`: from a verdict of `unexplained` to an effect file that `vinetrack add` takes.
-
-
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""

@@ -18,8 +18,6 @@ from vinetrack.pipeline.predict_stage import PredictionRequest, read_basis, read
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 # `vinetrack predict`: what it says, what it writes, and how it refuses.
-
-
 FAST = ("--diameter-mm", 25, "--thickness-um", 100, "--length-mm", 400, "--pressure-kPa", 62)
 SHEET = "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,payload_g\n"
 FEW = ("--samples", 60)
@@ -111,8 +109,6 @@ def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_pa
 
 
 # `vinetrack design …`: what it says, what it writes, and how it refuses.
-
-
 INJECTOR = ("--diameter-mm", 2.5, "--length-mm", 12.5, "--pressure-kPa", 48, "--chamber-l", 0.003534)
 FASTEST = ("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60)
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
 import vinetrack as vt
 from vinetrack.core.problems import ExperimentError
-from vinetrack.inference.fit_result import Fit
 from vinetrack.interface.loaded import LoadedResults
 from vinetrack.results.folder_layout import ResultsError
 
@@ -68,11 +66,6 @@ def test_the_story_of_the_readme_runs(small_run: Path, tmp_path: Path, monkeypat
     assert (tmp_path / "ladder.png").exists()
 
 
-@pytest.fixture(scope="module")
-def fit() -> Fit:
-    return vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
-
-
 def test_a_frame_of_tracks_in_other_units_is_the_same_experiment() -> None:
     frame = vt.example_tracks()
     inches = frame.assign(diameter_in=frame["diameter_mm"] / 25.4).drop(columns="diameter_mm")
@@ -90,10 +83,3 @@ def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_press
     _, track = vt.tracks_from_frame(frame.assign(pressure_kPa=frame["pressure_kPa"] - frame["time_s"]))[0]
     assert track.pressure_Pa is not None
     assert track.pressure_Pa[0] == pytest.approx(24e3)
-
-
-@pytest.mark.slow
-def test_a_fit_of_a_frame_is_that_of_its_pairs(fit: Fit) -> None:
-    again = vt.fit(vt.base_model(), vt.tracks_from_frame(vt.example_tracks()), profile=False)
-    pd.testing.assert_frame_equal(again.table(), fit.table())
-    assert list(again.positions().columns)[-1] == "residual_m"

@@ -100,8 +100,6 @@ def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentenc
 
 
 # Clips from a results folder: which recordings get one, where predictions stand in pixels, and what is refused.
-
-
 N, WIDTH, HEIGHT = 60, 480, 120
 MM_PER_PX = 0.5
 

@@ -40,8 +40,6 @@ from vinetrack.report.build import (
 )
 
 # The report, from tables written by hand: its first screen, a single file, and no external requests.
-
-
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
 
@@ -227,8 +225,6 @@ def test_coordinates_are_shortened_and_images_keep_the_decimals_that_place_them(
 
 
 # The section on the diagnosis, for every verdict, for a refused diagnosis, and without one.
-
-
 def read(content: dict) -> Diagnosis:
     return Diagnosis.from_json(content)
 
@@ -314,8 +310,6 @@ def test_the_page_says_what_the_trials_could_have_seen() -> None:
 
 
 # The section on the model in use, from tables written by hand.
-
-
 FIT = {
     "model": ["gravity", "eversion_damping"],
     "refused": None,
@@ -349,8 +343,6 @@ def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
 
 
 # The section on the paper's numbers: both tables, every row, and the explanation of the marks.
-
-
 def test_table_two_sets_departures_beside_the_errors() -> None:
     row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
     row |= {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}
@@ -365,8 +357,6 @@ def test_table_two_sets_departures_beside_the_errors() -> None:
 
 
 # Recordings and calibrations in the report, from entries written by hand.
-
-
 def recording() -> TrackedRecording:
     board = {"kind": "charuco", "image": "calibration/board.png", "mm_per_px": 0.2407, "scale_rel_sigma": 9e-5}
     board |= {"reprojection_px": 0.031, "n_corners": 52, "n_pictures": 1}
