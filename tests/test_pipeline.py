@@ -163,18 +163,6 @@ def test_nothing_is_left_to_do_afterwards_and_the_last_line_still_says_where(cam
 
 
 @through_snakemake
-def test_a_setting_reruns_only_what_depends_on_it(campaign: tuple) -> None:
-    results, _ = campaign
-    arguments = ("--cores", "1", "-n", "--config", "experiment=my vines (1)", "damping={resamples: 500}")
-    planned = snakemake(results.parents[1], *arguments)
-    assert planned.returncode == 0, planned.stderr
-    listed = {line.split()[0] for line in planned.stdout.splitlines() + planned.stderr.splitlines() if line.split()}
-    assert "damping" in listed
-    assert "trials" not in listed
-    assert not planned.stdout.strip().endswith("report.html")
-
-
-@through_snakemake
 def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path: Path) -> None:
     write_track(tmp_path / "vines" / "a.csv", 12, 20, 1)
     done = snakemake(tmp_path, "--cores", "1", "--config", "experiment=vinse")

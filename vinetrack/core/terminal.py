@@ -20,18 +20,12 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 
-def colour_wanted(stream: TextIO) -> bool:
-    """Whether to use colour on a stream."""
-    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
-        return False
-    return stream.isatty()
-
-
 def severity_first(line: str, stream: TextIO) -> str:
     """Return a line of `format_problems` with its first word in the colour of its severity."""
     word, colon, message = line.partition(":")
     colours = {"error": "31", "warning": "33"}  # Red and yellow, as codes of a terminal
-    if word not in colours or not colour_wanted(stream):
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty()
+    if plain or word not in colours:
         return line
     return f"\x1b[{colours[word]};1m{word}\x1b[0m{colon}{message}"
 

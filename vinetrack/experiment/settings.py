@@ -38,9 +38,9 @@ from vinetrack.experiment.schema import (
     SHARED,
     SMALLEST_POINT_SPACING_PX,
     CellError,
+    read_cell,
     read_limit,
     read_range,
-    read_value,
 )
 
 
@@ -265,7 +265,7 @@ class ExperimentSettings(_SharedColumns):
             return value
         if isinstance(value, bool | list | dict):
             raise CellError("is not a single value", "write one, as in the sheet", code="not_a_value")
-        return read_value(column, value)
+        return read_cell(column, str(value).strip())
 
     @field_validator("model", "candidates", "effects")
     @classmethod

@@ -566,7 +566,7 @@ def assemble_tables(
     located: pd.DataFrame,
     drifting: pd.DataFrame,
     force: pd.DataFrame,
-    learned: pd.DataFrame | None = None,
+    learned: pd.DataFrame,
 ) -> DiagnosisTables:
     """Assemble the data of the figures."""
     import pandas as pd
@@ -588,7 +588,7 @@ def assemble_tables(
         rounds=rounds,
         worst=labels.get(worst, worst),
         added=listed_names(diagnosis.effects),
-        learned_force=pd.DataFrame() if learned is None else learned,
+        learned_force=learned,
     )
 
 

@@ -422,11 +422,6 @@ def read_range(column: str, text: str) -> tuple[float, float]:
     return values[0], values[-1]
 
 
-def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
-    """Read a list of numbers joined by commas, each checked like a cell of the column. Returns without repetitions."""
-    return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
-
-
 def _cell(column: str, text: str, name: str = "") -> float:
     """Read one number of a column; return it in SI."""
     try:
@@ -459,7 +454,7 @@ def design_vine(
     check_figure(figure)
     basis = read_basis(request, needed=("pressure_kPa",))
     room = Room(
-        films_m=read_list("thickness_um", films, FILMS),
+        films_m=tuple(dict.fromkeys(_cell("thickness_um", part, FILMS) for part in films.split(",") if part.strip())),
         diameter_m=read_range("diameter_mm", diameter),
         length_m=read_range("length_mm", length),
         pressure_Pa=basis.planned.trials[0].pressure_Pa,

@@ -133,12 +133,6 @@ def has_wildcard(path: Path) -> bool:
 # when a run is killed; the profile and `vinetrack run` do without them.
 
 
-def refuse_running(results: Path) -> None:
-    """Refuse a results folder that another running process writes."""
-    if results.is_dir():
-        _locked(results).release()
-
-
 def _locked(results: Path) -> FileLock:
     """Return the lock of a results folder, held by this process."""
     from filelock import FileLock, Timeout
@@ -461,7 +455,8 @@ def check_before_run(paths: RunPaths, say: Say) -> None:
 
 def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     """Run Snakemake on an experiment; show a progress bar on a terminal, and one line per stage elsewhere."""
-    refuse_running(paths.results)
+    if paths.results.is_dir():
+        _locked(paths.results).release()  # refused, if another running process writes there
     log = paths.results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # Snakemake parses values of --config as YAML, where ` #2` in the name of a folder would be a comment.
