@@ -43,10 +43,10 @@ def _setup(folder: Path, page: bool, port: int | None, browser: bool, say: Say) 
 def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.pipeline.overlays_stage import TrackOptions, track_file
+    from vinetrack.pipeline.overlays_stage import track_file
 
     with waiting(f"tracking {recording.name}"):
-        return (), track_file(recording, TrackOptions(**options), say)
+        return (), track_file(recording, say, **options)
 
 
 @command()

@@ -6,7 +6,7 @@ import difflib
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -211,34 +211,19 @@ def position_to_px(track: pd.DataFrame) -> Any:
 # The command `vinetrack track`: the leading edge of a single recording as a table, a strip figure and a clip.
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackOptions:
-    """Options of the command; NaN and None for those not given. `capture_fps` is the rate, `exposure_us` the exposure
-    of a frame. The scale is `mm_per_px`, or the `calibration:` of the settings file `calibration`. `body`: the object
-    moves as a whole. `out` is the output folder.
+def track_file(
+    path: Path, say: Callable[[str], None], *, capture_fps: float = math.nan, exposure_us: float = math.nan,
+    mm_per_px: float = math.nan, calibration: Path | None = None, axis: PictureAxis | None = None,
+    frames_used: tuple[int, int] | None = None, body: bool = False, out: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Track the leading edge of one recording; write table, strip and clip in `out`. NaN and None for what is not
+    given; the scale is `mm_per_px` or the `calibration:` of a settings file. Returns facts, units in the keys.
     """
-
-    capture_fps: float = math.nan
-    exposure_us: float = math.nan
-    mm_per_px: float = math.nan
-    calibration: Path | None = None
-    axis: PictureAxis | None = None
-    frames_used: tuple[int, int] | None = None
-    body: bool = False
-    out: Path | None = None
-
-    @property
-    def scaled(self) -> bool:
-        """Whether there is a scale, so that positions are also given in metres."""
-        return math.isfinite(self.mm_per_px) or self.calibration is not None
-
-
-def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) -> dict[str, Any]:
-    """Track the leading edge of one recording; write table, strip and clip. Returns facts, units in the keys."""
-    settings, folder = _calibration(options)
+    settings, folder = _calibration(calibration, mm_per_px)
+    scaled = math.isfinite(mm_per_px) or calibration is not None
     try:
         recording = inspect_recording(_recording_path(path))
-        rate = _capture_fps(recording, options)
+        rate = _capture_fps(recording, capture_fps)
         recording_facts = _recording_facts(recording, rate)
         for line in _recording_lines(recording_facts):
             say(line)
@@ -247,12 +232,12 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
             video=recording.path,
             capture_fps=rate if math.isfinite(rate) else 1.0,
             capture_fps_is_playback=True,
-            exposure_s=options.exposure_us / 1e6 if math.isfinite(rate) else math.nan,
+            exposure_s=exposure_us / 1e6 if math.isfinite(rate) else math.nan,
             # Without a scale, the unit of length is one pixel.
-            m_per_px=options.mm_per_px / 1e3 if options.scaled else 1.0,
-            travel_ratio=1.0 if options.body else 2.0,
-            axis=options.axis,
-            frames_used=options.frames_used,
+            m_per_px=mm_per_px / 1e3 if scaled else 1.0,
+            travel_ratio=1.0 if body else 2.0,
+            axis=axis,
+            frames_used=frames_used,
         )
         measurement = measure_recording(trial, settings, folder)
     except RecordingError as error:
@@ -261,9 +246,9 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
         tracking = measurement.tracking
         untimed = replace(tracking.track, time_s=np.full(len(tracking.track.time_s), math.nan))
         measurement = replace(measurement, tracking=replace(tracking, track=untimed))
-    table = _table(measurement, options.scaled)
-    written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled)
-    tracking_facts = _tracking_facts(measurement, table, options, rate)
+    table = _table(measurement, scaled)
+    written = _write(out or Path(f"{recording.path.stem}_track"), measurement, table, scaled)
+    tracking_facts = _tracking_facts(measurement, table, axis is not None, scaled, rate)
     for line in _tracking_lines(tracking_facts):
         say(line)
     say("Written: " + ", ".join(map(str, written.values())))
@@ -289,13 +274,12 @@ def _recording_path(path: Path) -> Path:
     return path
 
 
-def _calibration(options: TrackOptions) -> tuple[ExperimentSettings, Path]:
+def _calibration(file: Path | None, mm_per_px: float) -> tuple[ExperimentSettings, Path]:
     """Return settings with only the calibration, and the folder to which the path of its picture is relative."""
-    if options.calibration is None:
+    if file is None:
         return ExperimentSettings(), Path()
-    if math.isfinite(options.mm_per_px):
+    if math.isfinite(mm_per_px):
         raise UserError("--mm-per-px and --calibration are two scales: give one")
-    file = options.calibration
     if file.is_dir():
         file = file / "experiment.yaml"
     if not file.is_file():
@@ -306,14 +290,14 @@ def _calibration(options: TrackOptions) -> tuple[ExperimentSettings, Path]:
     return ExperimentSettings(calibration=calibration), file.parent
 
 
-def _capture_fps(recording: Recording, options: TrackOptions) -> float:
+def _capture_fps(recording: Recording, given_fps: float) -> float:
     """Capture rate, Hz: that stated by the file, else that given by the user; NaN if neither is known."""
     stated_fps = recording.capture_fps
     if stated_fps is None:
-        return options.capture_fps
-    if math.isfinite(options.capture_fps) and abs(options.capture_fps / stated_fps - 1) > 1e-3:
+        return given_fps
+    if math.isfinite(given_fps) and abs(given_fps / stated_fps - 1) > 1e-3:
         raise UserError(
-            f"{recording.path.name}: --capture-fps is {options.capture_fps:g}, but the file states a capture rate of "
+            f"{recording.path.name}: --capture-fps is {given_fps:g}, but the file states a capture rate of "
             f"{stated_fps:g}; leave --capture-fps out"
         )
     return stated_fps
@@ -395,14 +379,14 @@ def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: 
 
 
 def _tracking_facts(
-    measurement: Measurement, table: pd.DataFrame, options: TrackOptions, rate: float
+    measurement: Measurement, table: pd.DataFrame, axis_given: bool, scaled: bool, rate: float
 ) -> dict[str, Any]:
     tracking = measurement.tracking
     edge_px = tracking.track.edge_px
     usable = np.isfinite(edge_px) & ~with_flag(tracking.track.flag, *UNUSABLE_FLAGS)
     moving = usable & ~with_flag(tracking.track.flag, "before_release")
     frame = np.flatnonzero(usable)
-    scale = measurement.m_per_px if options.scaled else math.nan
+    scale = measurement.m_per_px if scaled else math.nan
     growth_px = float(np.ptp(edge_px[usable])) if usable.any() else math.nan
     steps = np.diff(edge_px[frame]) / np.diff(frame) if frame.size > 1 else np.full(1, math.nan)
     sigma = table["edge_sigma_px"].to_numpy()[moving]
@@ -411,7 +395,7 @@ def _tracking_facts(
         "n_frames": len(edge_px),
         "n_known": int(usable.sum()),
         "axis": axis_entry(axis),
-        "axis_given": options.axis is not None,
+        "axis_given": axis_given,
         "mm_per_px": 1e3 * scale,
         "scale_rel_sigma": measurement.scale_rel_sigma,
         "tube_width_px": tracking.tube_width_px,
