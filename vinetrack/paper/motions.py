@@ -233,15 +233,8 @@ def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
 
 POSITION_COLUMNS = ("condition", "pressure_kPa", "n_trials", "rms_mean_m", "rms_single_m")
 SPEED_COLUMNS = (
-    "condition",
-    "vine",
-    "pressure_kPa",
-    "payload_g",
-    "n_final",
-    "final_at_mm",
-    "final_lead_velocity_m_s",
-    "final_lead_velocity_sigma_m_s",
-    "eq2_lead_velocity_m_s",
+    *("condition", "vine", "pressure_kPa", "payload_g", "n_final", "final_at_mm"),
+    *("final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s", "eq2_lead_velocity_m_s"),
 )
 MEAN_COLUMNS = ("pressure_kPa", "time_s", "lead_position_m", "lead_position_sigma_m", "n_trials")
 
