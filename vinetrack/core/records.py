@@ -166,9 +166,7 @@ def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Track:
-    """Position of the leading edge at each frame of one trial. All arrays have shape (n_frames,). `lead_position_m` is
-    NaN where the edge was not found.
-    """
+    """The leading edge at each frame of one trial, shapes (n_frames,); its position is NaN where it was not found."""
 
     time_s: Floats
     lead_position_m: Floats
@@ -224,9 +222,7 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class Window:
-    """A window of a trial tested for steadiness by one rule: whether it was accepted, and the reason. `doubtful`: one
-    chosen by hand that is used though it is not shown to be steady.
-    """
+    """A window tested for steadiness by one rule; `doubtful`: used by the user's choice, though not shown steady."""
 
     rule: str
     accepted: bool

@@ -174,9 +174,7 @@ def check_row(row: Row, folder: Path) -> None:
 
 
 def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
-    """Report required cells that are blank, and return required columns that neither sheet nor settings have. The
-    latter are a fault of the sheet, which the caller reports once.
-    """
+    """Report required cells that are blank; return required columns that neither sheet nor settings have."""
     faulty = {problem.column for problem in row.problems if problem.severity == "error"}
     if "travel_ratio" in faulty:
         return set()
@@ -325,9 +323,7 @@ def planned_trial(
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
-    """Read the conditions of an experiment folder or of a single sheet, filmed or not. Rows with the same nominal
-    settings form one condition, represented by the first; rows with `use: no` are skipped.
-    """
+    """Read the conditions in use of a folder or sheet, filmed or not: the first row of each, or `every_row`."""
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
         remedy = (

@@ -203,9 +203,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class ClipView:
-    """Layout shared by all frames of a clip. `size_px` is width and height of the recording; `mm_per_px` its scale
-    along the axis; `slowed` the factor of the slow motion.
-    """
+    """Layout of all frames of a clip: size of the recording, scale along the axis, factor of the slow motion."""
 
     title: str
     axis: Axis

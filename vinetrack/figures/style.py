@@ -276,9 +276,7 @@ def note_below(fig: Figure, note: str) -> None:
 
 
 def up_from_zero(ax: Axes, *, x: bool = False) -> None:
-    """Let the axes begin at zero and end 8 % above the largest value. A margin in proportion to the range of the data
-    would vanish for two points of nearly equal value.
-    """
+    """Let the axes begin at zero and end 8 % above the largest value, however little the data vary."""
     ax.set_ylim(0, 1.08 * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
     if x:
         ax.set_xlim(0, 1.08 * ax.dataLim.x1 if ax.dataLim.x1 > 0 else None)

@@ -85,9 +85,7 @@ def fit_and_diagnose(job: Job) -> list[str]:
 
 
 def fit_model(job: Job) -> Fit | None:
-    """Fit the model in use to all trials. Writes `fit.json`, whose `refused` is None or the reason, `comparison.csv`,
-    `comparison/`, `model_check.csv` and `audit.csv`. Returns the fit for a diagnosis.
-    """
+    """Fit the model in use, write the fit and what it is compared with; return it for a diagnosis."""
     experiment, results = job.experiment, Results(job.results)
     damping = read_json(results.damping)
     pairs, kinematics = measured_trials(experiment, results)

@@ -555,9 +555,7 @@ def design_reservoir(
     at_fraction: float,
     figure: Path | None = None,
 ) -> tuple[list[str], dict[str, Any]]:
-    """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested. Speeds are
-    predicted if the wall thickness is given. Returns lines, and JSON content.
-    """
+    """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
     check_figure(figure)
     basis = read_basis(request, needed=("diameter_mm", "length_mm", "pressure_kPa"))
     trial = basis.planned.trials[0]

@@ -188,9 +188,7 @@ TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
 
 
 def analyse_trials(job: Job) -> list[str]:
-    """Analyse all trials that are used, or only some; write the files of each in `tracks/`, `kinematics/`, `analysed/`
-    and `figures/`. Trials with a faulty row of the sheet get empty files. Returns reasons of failed trials.
-    """
+    """Analyse all trials in use, or some, and write their files; empty ones of faulty rows. Returns what failed."""
     experiment, only = job.experiment, job.trials
     names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
     model_of(experiment)
@@ -239,9 +237,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
 def _of_recording(
     trial: Trial, measurement: Measurement, experiment: Experiment
 ) -> tuple[Track, dict[str, float], dict[str, Any]]:
-    """Return the track of a recording, its columns of `trials.csv`, and what pages show of it as JSON entries: its
-    calibration, the axis along which its `edge_px` is measured, and what contradicts the sheet.
-    """
+    """Return the track of a recording, its columns of `trials.csv`, and what pages show of it as JSON entries."""
     tracking, calibration = measurement.tracking, measurement.calibration
     problems = [*size_problems(trial, tracked_facts(trial, measurement)), *exposure_problems(trial, tracking)]
     if errors := [problem.reason for problem in problems if problem.severity == "error"]:

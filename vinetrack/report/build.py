@@ -64,9 +64,7 @@ if TYPE_CHECKING:
 
 
 def inline_picture(picture: str | bytes, prefix: str, description: str) -> Markup:
-    """Return an SVG file or a PNG file as an element of the page, as wide as `--wide` where there is room: then its
-    text is as large as that of the page. Blank for an empty file.
-    """
+    """Return an SVG or PNG file as an element of the page, `--wide` if there is room; blank for an empty one."""
     if not picture:
         return Markup()
     if isinstance(picture, str):
