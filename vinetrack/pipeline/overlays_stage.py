@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -20,6 +19,7 @@ from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.units import number
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
+from vinetrack.experiment.sheet import closest_entry
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
 from vinetrack.figures.style import GREEN, render
 from vinetrack.narrative.verdict_text import spaced_name
@@ -258,10 +258,8 @@ def track_file(
 def _recording_path(path: Path) -> Path:
     """Return the path if it can be a single recording."""
     if not path.exists():
-        parent = path.parent
-        names = sorted(entry.name for entry in parent.iterdir()) if parent.is_dir() else []
-        near = difflib.get_close_matches(path.name, names, 1, 0.5)
-        remedy = f"did you mean {parent / near[0]}?" if near else "check its folder and its name"
+        near = closest_entry(path)
+        remedy = f"did you mean {path.with_name(near)}?" if near else "check its folder and its name"
         raise UserError(f"{path}: there is no such file or folder; {remedy}")
     if path.is_dir():
         inside = sorted(entry for entry in path.iterdir() if entry.is_file() and not entry.name.startswith("."))
