@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_CONDITION_PANELS = 60  # Chosen: in rows of nine they are 1.2 in wide, the narrowest that has room for its label
-
 # ------------------------------------------------------------------------------
 # All trials: speed against growth in small panels, replicates superposed, steady windows thick.
 #
@@ -42,7 +40,8 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     for name, table in tables.items():
         part = st.thinned(table, n_points)
         curves[name] = part.assign(growth_mm=1e3 * (part["lead_position_m"] - part["lead_position_m"].min()))
-    by_condition = shown["condition"].nunique() <= MAX_CONDITION_PANELS
+    # 60 (chosen): in rows of nine they are 1.2 in wide, the narrowest that has room for its label
+    by_condition = shown["condition"].nunique() <= 60
     if by_condition:
         order = {name: i for i, name in enumerate(dict.fromkeys(shown["vine"]))}
         ordered = shown.assign(order=shown["vine"].map(order)).sort_values(["order", "pressure_kPa"], kind="stable")
