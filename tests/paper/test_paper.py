@@ -342,13 +342,6 @@ EVERY_NUMBER = {
     "drag_share_95": 5,
 }  # fmt: skip
 """Every published number, as it is printed."""
-EVERY_STATEMENT = {
-    "pressures_R1": "8 to 11", "trials_R1": "4 to 5", "window_fewest_points": "at least 3",
-    "B_power_of_scale": "near-linear", "B_power_of_wall": "rises linearly",
-    "steady_speed_power": "rises monotonically", "steady_speed_over_diameter_power": "no trend",
-    "efficiency_power_of_wall": "higher for thinner walls", "efficiency_power_of_diameter": "no clear trend",
-    "gauge_drop_7kPa_slow": "3.5, within 5",
-}  # fmt: skip
 
 
 def test_no_published_number_is_without_its_line() -> None:
@@ -359,7 +352,5 @@ def test_no_published_number_is_without_its_line() -> None:
     by_row = whole.set_index("row")
     for row, value in EVERY_NUMBER.items():
         assert by_row.loc[row, "published"] == pytest.approx(value), row
-    for row, words in EVERY_STATEMENT.items():
-        assert by_row.loc[row, "as_printed"] == words, row
     assert set(whole["mark"]) == {SIMULATED, COMPUTED, NOT_CHECKABLE}
     assert (whole["how"] != "").all()
