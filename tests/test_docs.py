@@ -20,11 +20,8 @@ from PIL import Image
 
 import vinetrack
 from vinetrack.cli.main import app
-from vinetrack.effects import EffectError, own_effects
 
 # README and docs: links and pictures lead somewhere, commands exist, nothing names the machine it was written on.
-
-
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -85,8 +82,6 @@ def test_the_citation_and_the_changelog_name_the_version_of_the_package() -> Non
 
 
 # The site of the documentation leaves no page out, and the reference names only what exists.
-
-
 def pages(entry: object) -> list[str]:
     """Files that an entry of the site's navigation names, nested ones included."""
     if isinstance(entry, str):
@@ -107,8 +102,6 @@ def test_the_reference_holds_all_that_the_package_offers() -> None:
 
 
 # docs/design.md: its commands print what stands below them, its pictures are made by them, its Python runs.
-
-
 PAGE = Path(__file__).parents[1] / "docs" / "design.md"
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 COMMANDS_PAGE = [piece for piece in pieces(PAGE.read_text(encoding="utf-8")) if isinstance(piece, Shown)]
@@ -133,9 +126,7 @@ def test_the_python_on_the_page_runs() -> None:
     assert known["prediction"].table["unit"].tolist()[0] == "m/s"  # type: ignore[attr-defined]
 
 
-# docs/own_effect.md: its effect and settings work as they stand there, and its messages are those that are given.
-
-
+# docs/own_effect.md: its effect and settings work as they stand there.
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\na,a.csv,12,100,300,20,3\n"
 
 
@@ -164,46 +155,26 @@ def test_what_the_page_shows_of_the_effect_is_what_is_printed(experiment: Path) 
     assert said.strip().replace(str(experiment), "my_experiment") == shown.output
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "told"),
-    [
-        ("    tail force −k x\n", "", "the docstring must say what it is and show the formula on an indented line"),
-        ("def tail_force", "def pull", "defines none of the functions"),
-        ("(s, rig, k)", "(s, rig)", "tail_force(s, rig) must be tail_force(s, rig, k)"),
-        ('"N/m", 0.5', '"N/m", 50.0', "the default of k lies outside its bounds"),
-        ("from vinetrack", "1 / 0\nfrom vinetrack", "this effect cannot be read ("),
-        ("s.tail_position\n", "s.tail_place\n", "tail_force cannot be compiled: "),
-        ("-0.1,", "-0.2,", "tail_force gives -0.1 where worked out by hand it is -0.2 ("),
-    ],
-)
-def test_its_messages_are_those_that_are_given(tmp_path: Path, old: str, new: str, told: str) -> None:
-    text = block("python")
-    assert old in text
-    path = tmp_path / "spring_line.py"
-    path.write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(EffectError) as caught:
-        own_effects([path])
-    assert told in str(caught.value)
-    assert f"`{told}" in OWN_EFFECT.read_text(encoding="utf-8")
-
-
-# Examples in docstrings say what happens; those of names of `vinetrack` itself run in `interface`.
-
-
+# Examples in docstrings say what happens, and every name that a user calls from Python has one.
 ROOT_EXAMPLES = Path(vinetrack.__file__).parent
-ELSEWHERE = {f"{home}.{name}" for name, home in vinetrack._HOMES.items()}
 MODULES = sorted(
     ".".join(("vinetrack", *path.relative_to(ROOT_EXAMPLES).with_suffix("").parts))
     for path in ROOT_EXAMPLES.rglob("*.py")
     if path.name != "__init__.py" and ">>> " in path.read_text(encoding="utf-8")
 )
+FITTED = ("vinetrack.interface.loaded", "vinetrack.inference.fit", "vinetrack.inference.fit_summary")
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_the_examples_of_a_module_say_what_happens(name):
+@pytest.mark.parametrize("name", [pytest.param(m, marks=[pytest.mark.slow] * (m in FITTED)) for m in MODULES])
+def test_the_examples_of_a_module_say_what_happens(name: str) -> None:
     said: list[str] = []
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
     for test in doctest.DocTestFinder().find(importlib.import_module(name), name):
-        if test.name not in ELSEWHERE:
-            runner.run(test, out=said.append)
+        runner.run(test, out=said.append)
     assert not said, "".join(said)
+
+
+def test_every_name_that_a_user_calls_shows_an_example() -> None:
+    called = [getattr(vinetrack, name) for name in vinetrack.__all__ if callable(getattr(vinetrack, name))]
+    assert len(called) >= 20
+    assert [one.__name__ for one in called if ">>> " not in (one.__doc__ or "")] == []

@@ -20,8 +20,6 @@ from lsoda_vine import grown_position, vine_trial
 import vinetrack
 
 # A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
-
-
 ROOT = Path(__file__).parents[1]
 N = 0.4
 B = {12: 2.0, 24: 6.0}
@@ -165,18 +163,6 @@ def test_nothing_is_left_to_do_afterwards_and_the_last_line_still_says_where(cam
 
 
 @through_snakemake
-def test_a_setting_reruns_only_what_depends_on_it(campaign: tuple) -> None:
-    results, _ = campaign
-    arguments = ("--cores", "1", "-n", "--config", "experiment=my vines (1)", "damping={resamples: 500}")
-    planned = snakemake(results.parents[1], *arguments)
-    assert planned.returncode == 0, planned.stderr
-    listed = {line.split()[0] for line in planned.stdout.splitlines() + planned.stderr.splitlines() if line.split()}
-    assert "damping" in listed
-    assert "trials" not in listed
-    assert not planned.stdout.strip().endswith("report.html")
-
-
-@through_snakemake
 def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path: Path) -> None:
     write_track(tmp_path / "vines" / "a.csv", 12, 20, 1)
     done = snakemake(tmp_path, "--cores", "1", "--config", "experiment=vinse")
@@ -255,8 +241,6 @@ def test_the_same_experiment_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 # A workflow that is killed goes on with the same command.
-
-
 @through_snakemake
 def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None:
     write_campaign(tmp_path / "vines")

@@ -19,17 +19,15 @@ from grown import sheet as sheet_command
 from hidden_truth import sheet
 
 import vinetrack
-from vinetrack.diagnosis import propose as search
 from vinetrack.diagnosis.propose import add, propose
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import catalogue, own_effects
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow, write_experiment
+from vinetrack.pipeline import effects_stage, model_stage
 from vinetrack.pipeline.workflow import command_for_results
 
 # The command line: exit codes, sentences, no tracebacks.
-
-
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
 TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20))
 
@@ -87,7 +85,7 @@ def test_a_fault_of_the_program_is_one_sentence_and_its_traceback_is_in_the_log(
 
 def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = Mock(side_effect=ZeroDivisionError("unforeseen"))
-    monkeypatch.setattr("vinetrack.kinematics.summary.summarise_trial", broken)
+    monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", broken)
     folder = experiment(tmp_path / "v")
     done = run("trials", folder, tmp_path / "r", "--log", tmp_path / "t.log")
     assert done.exit_code == 0
@@ -96,8 +94,6 @@ def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch:
 
 
 # `vinetrack diagnose` and `vinetrack add` from a folder of tracks to files and sentences.
-
-
 LADDER = (
     "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m,partial"
 )
@@ -159,13 +155,13 @@ def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     added = []
-    monkeypatch.setattr(search, "add", lambda *given: added.append(add(*given)) or added[-1])
+    monkeypatch.setattr(model_stage, "add", lambda *given: added.append(add(*given)) or added[-1])
     output = succeed("add", "air_drag", results)
     assert re.search(r"Δχ² = -", output) is None
     assert "highest pressure" in output
     assert [row["added"] for row in ladder(results)] == ["", "reservoir_depletion", "air_drag"]
     assert {row["partial"] for row in ladder(results)} == {"False"}
-    monkeypatch.setattr(search, "add", lambda *_: added[0])  # the same once more, without the fits
+    monkeypatch.setattr(model_stage, "add", lambda *_: added[0])  # the same once more, without the fits
     succeed("add", "air_drag", results)
     assert len(ladder(results)) == 3
 
@@ -184,8 +180,6 @@ def test_a_wrong_folder_exits_with_1() -> None:
 
 
 # `vinetrack propose`: from a verdict of `unexplained` to an effect file that `vinetrack add` takes.
-
-
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""
@@ -207,12 +201,12 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     experiment, results = bench
     assert json.loads((results / "diagnosis.json").read_text())["verdict"] == "unexplained"
     proposals = []
-    monkeypatch.setattr(search, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
+    monkeypatch.setattr(effects_stage, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
     succeed("propose", results)
     path = experiment / "proposed_time.py"
     effect = own_effects([path])["proposed_time"]
     assert "4 trials of bench" in effect.text
-    monkeypatch.setattr(search, "propose", lambda *_: proposals[0])  # the same once more, without the search
+    monkeypatch.setattr(effects_stage, "propose", lambda *_: proposals[0])  # the same once more, without the search
     again = run("propose", results)
     assert again.exit_code == 1
     assert "exists already" in again.output

@@ -70,12 +70,6 @@ def test_shared_settings_fill_blank_cells_and_a_cell_overrides_them(folder: Path
     assert (a.ambient_pressure_Pa, a.mass_loss, a.tail_slack) == (84e3, "as_printed", "free")
 
 
-@pytest.mark.parametrize("spelling", ["my-vines", "my-vines/", "./my-vines", "my-vines/."])
-def test_the_name_is_the_last_part_of_the_path(folder: Path, spelling: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder.parent)
-    assert read_experiment(spelling).name == "my-vines"
-
-
 def test_a_fault_of_one_row_fails_that_trial_alone_unless_strict(folder: Path) -> None:
     write(folder, GOOD.replace("b,b.csv,24", "b,b.csv,0.024"))
     experiment = read_experiment(folder)

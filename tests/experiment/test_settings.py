@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import read_yaml
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.experiment.reference import column_entries, reference_page, setting_entries
+from vinetrack.experiment.reference import reference_content, reference_page, setting_entries
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import ExperimentSettings, RunSettings, read_experiment_settings, run_settings
 
@@ -150,7 +150,7 @@ def test_a_wrong_run_setting_is_named(values: dict[str, Any], column: str) -> No
 
 
 def test_every_key_of_both_files_is_listed_once() -> None:
-    names = [entry.name for entry in setting_entries(ExperimentSettings)] + [entry.name for entry in column_entries()]
+    names = [entry["name"] for part in ("experiment", "columns") for entry in reference_content()[part]]
     assert {name for name in names if names.count(name) > 1} == {"axis"}  # of all trials, and of one
     assert set(ExperimentSettings.model_fields) <= set(names)
     assert set(RunSettings.model_fields) <= {entry.name for entry in setting_entries(RunSettings)}

@@ -29,7 +29,6 @@ from vinetrack.figures.diagnosis_figures import (
     draw_learned_force,
     draw_missing_force,
     draw_where,
-    rms_m,
 )
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION
 
@@ -154,20 +153,8 @@ def test_cosines_stand_below_the_diagonal_and_ties_are_framed() -> None:
     assert [label.get_text() for label in ax.get_yticklabels()] == ["b", "c"]
 
 
-def test_without_content_there_is_no_figure() -> None:
-    nothing = pd.DataFrame()
-    assert draw_ladder(nothing) is draw_candidates([("one", ranking())]) is draw_cosines(nothing) is None
-    assert draw_before_after("", nothing, "") is draw_where(nothing, "") is draw_drift(nothing, "") is None
-    assert draw_missing_force(nothing) is draw_learned_force(nothing) is None
-    assert math.isnan(rms_m(prediction("a", 8e-3, math.nan), "model_after_m"))
-
-
 # The learned force as a curve or a map, with units, and blank outside the range of the trials.
-
-
 NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
-
-
 Y, V = np.linspace(0, 0.25, 26), np.linspace(0, 8, 20)
 
 
@@ -194,8 +181,6 @@ def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
 
 
 # Figures for comparison with the paper, from tables written by hand: content, and nothing cut off.
-
-
 NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
 PRINTED_CM = {7: 1.90, 14: 0.29, 28: 0.31}
 

@@ -75,8 +75,6 @@ def test_grey_levels_are_stretched_and_clipped() -> None:
 
 
 # The strip of a recording, from arrays written by hand: position of the edge, and marks of flagged frames.
-
-
 N = 40
 
 
@@ -119,8 +117,6 @@ def test_a_strip_is_small_in_a_page() -> None:
 
 
 # Pixel locking is distinguished from a uniform distribution of edges within a pixel.
-
-
 def places(amplitude_px: float, count: int = 4000, seed: int = 971) -> np.ndarray:
     """Edges anywhere, estimated with an error that repeats with every pixel."""
     edge = np.random.default_rng(seed).uniform(0, 500, count)

@@ -7,6 +7,9 @@ from pathlib import Path
 import pytest
 from explorer_campaign import FEW_CANDIDATES, SETTINGS, SMALL, make_experiment, make_results, run
 
+import vinetrack as vt
+from vinetrack.interface.loaded import LoadedResults
+
 
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -19,3 +22,8 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run("figures", experiment, results)
     run("report", experiment, results)
     return results
+
+
+@pytest.fixture(scope="session")
+def loaded(small_run: Path) -> LoadedResults:
+    return vt.load(small_run)

@@ -1,26 +1,22 @@
-"""A results folder in memory, and the story of the README told on it."""
+"""A results folder in memory; the story of the README and the notebook of the documentation run on it."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
-import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from notebook import run
 
 import vinetrack as vt
 from vinetrack.core.problems import ExperimentError
-from vinetrack.inference.fit_result import Fit
 from vinetrack.interface.loaded import LoadedResults
 from vinetrack.results.folder_layout import ResultsError
 
 README = Path(__file__).parents[2] / "README.md"
-
-
-@pytest.fixture(scope="module")
-def loaded(small_run: Path) -> LoadedResults:
-    return vt.load(small_run)
 
 
 def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded: LoadedResults) -> None:
@@ -68,11 +64,6 @@ def test_the_story_of_the_readme_runs(small_run: Path, tmp_path: Path, monkeypat
     assert (tmp_path / "ladder.png").exists()
 
 
-@pytest.fixture(scope="module")
-def fit() -> Fit:
-    return vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
-
-
 def test_a_frame_of_tracks_in_other_units_is_the_same_experiment() -> None:
     frame = vt.example_tracks()
     inches = frame.assign(diameter_in=frame["diameter_mm"] / 25.4).drop(columns="diameter_mm")
@@ -92,8 +83,24 @@ def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_press
     assert track.pressure_Pa[0] == pytest.approx(24e3)
 
 
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "python.ipynb"
+
+
+def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
+    return [sorted(one.get("data", one)) for one in outputs]
+
+
 @pytest.mark.slow
-def test_a_fit_of_a_frame_is_that_of_its_pairs(fit: Fit) -> None:
-    again = vt.fit(vt.base_model(), vt.tracks_from_frame(vt.example_tracks()), profile=False)
-    pd.testing.assert_frame_equal(again.table(), fit.table())
-    assert list(again.positions().columns)[-1] == "residual_m"
+def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored() -> None:
+    shown = [one for outputs in run(NOTEBOOK) for one in outputs]
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    stored = [one for cell in cells for one in cell.get("outputs", [])]
+    assert kinds(shown) == kinds(stored)
+    assert sum("image/png" in kind for kind in kinds(shown)) == 3
+    texts = [["".join(one["data"]["text/plain"]) for one in each if "data" in one] for each in (shown, stored)]
+    objects = [[text for text in each if text.startswith(("Fit(", "Diagnosis("))] for each in texts]
+    assert objects[0] == objects[1]
+    assert objects[0][1] == "Diagnosis(missing: reservoir_depletion)"
+    printed = [["".join(one["text"]) for one in each if "text" in one] for each in (shown, stored)]
+    assert printed[0] == printed[1]
+    assert "n = 0.369 instead of" in printed[0][0]

@@ -11,17 +11,11 @@ import numpy as np
 import pytest
 from explorer_campaign import run
 
-import vinetrack as vt
 from vinetrack.core.units import number
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.interface.loaded import LoadedResults
 from vinetrack.narrative.verdict_text import estimate_text, summary_facts
 from vinetrack.pages.page import open_campaign
-
-
-@pytest.fixture(scope="module")
-def loaded(small_run: Path) -> LoadedResults:
-    return vt.load(small_run)
 
 
 @pytest.fixture(scope="module")

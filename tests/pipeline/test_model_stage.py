@@ -131,8 +131,6 @@ def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> 
 
 
 # A recording whose axis is not that of the others fails when the trials are gathered, and enters no fit.
-
-
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Five trials filmed level and two filmed straight down, analysed."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pandas as pd
@@ -46,17 +45,6 @@ def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder
     assert ("0 mm", "stated") in {(entry.value, entry.origin) for entry in corrected.inputs}
     for name in ("leak", "air_drag"):
         assert corrected[name].size_at(0.9) < 0.9 * uncorrected[name].size_at(0.9)
-
-
-@pytest.mark.slow
-def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> None:
-    file, figure = tmp_path / "power.json", tmp_path / "power.png"
-    output = succeed("power", folder, "--effect", "leak", "--json", file, "--figure", figure)
-    content = json.loads(file.read_text())
-    (leak,) = content["effects"]
-    assert 0 < leak["size_50"] < leak["size_90"]
-    assert "90 % power" in output
-    assert figure.stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -35,8 +35,6 @@ from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 
 # The fit and the diagnosis of a results folder, read back as they were written.
-
-
 OPEN = math.nan
 
 
@@ -98,8 +96,6 @@ def test_a_fit_that_is_none_of_ours_is_one_sentence(tmp_path: Path, content: str
 
 
 # What a diagnosis left in a results folder, read back for pictures and page: whole, in parts, and not there.
-
-
 RELEASE_S, ORIGIN_M = 0.05, 0.2
 TRIALS = {"a": "slow", "b": "slow", "c": "fast"}
 
@@ -216,8 +212,6 @@ def test_ties_stand_in_the_order_of_the_ranking() -> None:
 
 
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.
-
-
 @pytest.mark.parametrize(
     ("verdicts", "final", "model"),
     [
@@ -247,8 +241,6 @@ def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted
 
 
 # What recordings and speeds contradict in the sheet stands beside the verdict, for it passes for physics.
-
-
 PSI = 6.894757
 VINE = Trial(
     name="a", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, pressure_Pa=30e3, yield_pressure_Pa=3e3,
@@ -284,8 +276,6 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tm
 
 
 # Which file of a figure the page shows, for every choice of `figures.formats`.
-
-
 @pytest.mark.parametrize(
     ("formats", "limit", "shown"),
     [(("png", "svg"), 9, "<svg/>"), (("png", "svg"), 5, b"png"), (("svg",), 9, "<svg/>"), (("pdf",), 9, b"")],

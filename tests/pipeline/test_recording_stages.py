@@ -15,8 +15,8 @@ from plain_scene import Plan, Scene, plain_scene, write_video
 
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
-from vinetrack.figures import overlay
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge, draw_strip
+from vinetrack.pipeline import overlays_stage
 from vinetrack.pipeline.overlays_stage import (
     MARGIN_FRAMES,
     chosen_trials,
@@ -50,7 +50,7 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(
     scene: Scene, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Tracking] = []
-    monkeypatch.setattr(overlay, "draw_strip", lambda *given: drawn.append(given[1]) or draw_strip(*given))
+    monkeypatch.setattr(overlays_stage, "draw_strip", lambda *given: drawn.append(given[1]) or draw_strip(*given))
     assert "Capture rate unknown" in succeed("track", clip, "--out", tmp_path / "out")
     table = pd.read_csv(tmp_path / "out" / "track.csv")
     assert list(table) == [
@@ -100,8 +100,6 @@ def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentenc
 
 
 # Clips from a results folder: which recordings get one, where predictions stand in pixels, and what is refused.
-
-
 N, WIDTH, HEIGHT = 60, 480, 120
 MM_PER_PX = 0.5
 
@@ -194,7 +192,7 @@ def test_edges_go_along_with_a_shaken_picture(tmp_path: Path, monkeypatch: pytes
         drawn.append(np.array([edge.along_px[frame] for edge in edges]))
         return np.repeat(picture[:, :, None], 3, axis=2)
 
-    monkeypatch.setattr("vinetrack.figures.overlay.compose", seen)
+    monkeypatch.setattr("vinetrack.pipeline.overlays_stage.compose", seen)
     overlay_one(results, "a", seconds=2)
     path, shake_px = results / "analysed" / "a.json", 2.0 * np.sin(np.arange(N))
     content = json.loads(path.read_text())

@@ -18,8 +18,8 @@ from plain_scene import Plan, plain_scene, write_video
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
-from vinetrack.pipeline.stages import Job
-from vinetrack.pipeline.trials import Kept, analyse_trials, map_unordered, packed, unpacked
+from vinetrack.pipeline.stages import Job, map_unordered
+from vinetrack.pipeline.trials import Kept, analyse_trials, packed, unpacked
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import Tracking, in_metres
@@ -160,7 +160,7 @@ def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked: tuple
 
 PARENT = """
 import os, sys, time
-from vinetrack.pipeline.trials import map_unordered
+from vinetrack.pipeline.stages import map_unordered
 
 def task(number):
     os.write(1, b"%d\\n" % os.getpid())  # at once: two that print mix their lines

@@ -29,8 +29,6 @@ from vinetrack.pipeline.workflow import (
 )
 
 # What the Snakefile is told before anything runs.
-
-
 ROOT = Path(__file__).parents[2]
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
 
@@ -155,8 +153,6 @@ def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path: P
 
 
 # `vinetrack run`: the chain from anywhere, its progress, its last lines, and whose results a folder holds.
-
-
 def test_results_lie_where_snakemake_puts_them_or_under_the_folder_named_and_are_renewed_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,8 +222,6 @@ def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path: 
 
 
 # Runs that were killed, and runs that live: whose lock is taken, and what is left behind.
-
-
 BEGIN = """
 import time
 from pathlib import Path

@@ -18,6 +18,7 @@ from PIL import Image
 
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.diagnosis.result import Candidate, Diagnosis
+from vinetrack.effects import catalogue
 from vinetrack.figures.registry import diagnosis_figures
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
@@ -25,25 +26,20 @@ from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build as report_trials
 from vinetrack.report.build import (
     Clip,
-    DiagnosisResult,
-    ModelResult,
     ReportContent,
     ReportFigure,
     ReportSection,
     ReportTable,
     TrackedRecording,
     build_report,
-    diagnosis_section,
     inline_picture,
     moved_table,
     paper_section,
     speed_sparkline,
-    upper_limit_table,
+    upper_limits,
 )
 
 # The report, from tables written by hand: its first screen, a single file, and no external requests.
-
-
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
 
@@ -151,7 +147,7 @@ def test_whatever_a_user_wrote_is_escaped(place: str) -> None:
             "figures": [ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL)],
             "clips": {"a": "overlays/a.mp4"},
             "clip": Clip("a", b"film", EVIL, b"frame"),
-            "model": result(messages=[EVIL], warnings=[EVIL]),
+            **result(messages=[EVIL], warnings=[EVIL]),
             "sections": [ReportSection("paper", EVIL, [EVIL], [ReportTable(EVIL, (EVIL,), [(EVIL,)])], [])],
         },
     }
@@ -229,8 +225,6 @@ def test_coordinates_are_shortened_and_images_keep_the_decimals_that_place_them(
 
 
 # The section on the diagnosis, for every verdict, for a refused diagnosis, and without one.
-
-
 def read(content: dict) -> Diagnosis:
     return Diagnosis.from_json(content)
 
@@ -243,7 +237,7 @@ def heading(html: str) -> str:
 
 def shown(content: dict, **changes: object) -> str:
     added = ["", *content.get("effects", [])]
-    return page(diagnosis=DiagnosisResult(read(content), ladder(*added), **changes))  # type: ignore[arg-type]
+    return page(diagnosis=replace(read(content), ladder=ladder(*added)), **changes)
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -259,24 +253,25 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
     inner = {one["href"][1:] for one in attributes if (one.get("href") or "").startswith("#")}
     assert inner <= set(ids)
     bare = {"verdict": verdict, "effects": [], "answer_set": [], "rounds": []}
-    assert heading(page(diagnosis=DiagnosisResult(read(bare)))).startswith(verdict)
+    assert heading(page(diagnosis=read(bare))).startswith(verdict)
 
 
 def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit() -> None:
     found = [list(row) for row in moved_table(moved()).rows]
     assert found == [["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"], ["γ", "–", "1.1700 ± 0.0040"]]
-    table = upper_limit_table(
-        [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))], {}
-    )
-    assert table.rows == [("leak", "k", "2.50 kPa")]
-    unfitted = candidate("leak", 1.0, numbers=[], largest={"leak.k": 2500.0, "leak.j": 1.0})
-    table = upper_limit_table([Candidate.from_json(unfitted)], {"leak.k": ("κ", "Pa")})
-    assert table.rows == [("leak", "κ", "2.50 kPa"), ("leak", "j", "1.00 SI")]
+    found = [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))]
+    assert upper_limits(found, {}) == [("leak", "k", "2.50 kPa")]
+    unfitted = candidate("pressure_drive", 1.0, numbers=[], largest={"pressure_drive.k": 1.0})
+    assert upper_limits([Candidate.from_json(unfitted)], catalogue()) == [("pressure drive", "k", "1.00 SI")]
+    (kappa,) = catalogue()["moving_average"].parameters
+    unfitted = candidate("moving_average", 1.0, numbers=[], largest={f"moving_average.{kappa.name}": 2.0})
+    (limit,) = upper_limits([Candidate.from_json(unfitted)], catalogue())
+    assert limit[1] == kappa.symbol
 
 
 def test_pictures_stand_in_the_parts_they_belong_to() -> None:
     figures = [ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in diagnosis_figures()]
-    html = page(diagnosis=DiagnosisResult(read(diagnosis()), ladder("", "a")), figures=figures)
+    html = page(diagnosis=replace(read(diagnosis()), ladder=ladder("", "a")), figures=figures)
     order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-missing_force"]
     order += ['id="candidates"', "figure-candidates", 'id="tied"', "figure-cosines", 'id="drift"', "figure-drift"]
     places = [html.index(f'id="{one}"' if one.startswith("figure") else f"<h2 {one}") for one in order]
@@ -300,7 +295,7 @@ def test_the_page_says_what_the_trials_could_have_seen() -> None:
     leak = replace(drag, effect="leak", symbol="1/τ", unit="1/s", largest=0.5)
     power = Power(24, 3.6, {"scores of all candidates": 0.003}, (leak, drag), {"static_yield": "no trace"})
     told = replace(read(diagnosis("adequate")), power=power)
-    html = page(diagnosis=DiagnosisResult(told))
+    html = page(diagnosis=told)
     part = html.partition('<h2 id="power">')[2].partition("<h2")[0]
     assert "raise a false alarm in at most 0.30 % of campaigns" in part
     assert "Detectable with 90 % power: air drag from C_D = 1.0." in part
@@ -308,15 +303,13 @@ def test_the_page_says_what_the_trials_could_have_seen() -> None:
     assert [row[0] for row in rows if row] == ["air drag", "leak"]
     assert rows[1][3:] == ["1.0", "3.0", "100 %", "inlet loss 26 %"]
     assert '<a href="#power">' in html
-    assert 'id="power"' not in page(diagnosis=DiagnosisResult(read(diagnosis("adequate"))))
-    wary = diagnosis_section(DiagnosisResult(replace(told, power=replace(power, wary="the model is far off"))))
-    assert wary is not None
-    assert not wary["power"]["table"]
+    assert 'id="power"' not in page(diagnosis=read(diagnosis("adequate")))
+    wary = page(diagnosis=replace(told, power=replace(power, wary="the model is far off")))
+    assert "The detectable size of every effect" in html
+    assert "The detectable size of every effect" not in wary
 
 
 # The section on the model in use, from tables written by hand.
-
-
 FIT = {
     "model": ["gravity", "eversion_damping"],
     "refused": None,
@@ -331,15 +324,15 @@ FIT = {
 }
 
 
-def result(**changes: object) -> ModelResult:
+def result(**changes: object) -> dict[str, object]:
     at = {"rms_final_velocity_m_s": 0.25, "replicate_floor_m": 1e-3, "worst_at_s": 0.07, "worst_at_m": 0.123}
     compared = pd.DataFrame({"condition": ["c0", "c1"], "rms_position_m": [3e-3, 4e-3], "ratio": [3.0, 4.0], **at})
     check = {"vine": ["v"], "n_steady": 0.37, "n_trajectory": 0.49, "B_steady": 6.44, "B_trajectory": 6.1, "z": 5.1}
-    return ModelResult(FitSummary.from_json({**FIT, **changes}), compared, pd.DataFrame(check))
+    return {"fit": FitSummary.from_json({**FIT, **changes}), "comparison": compared, "check": pd.DataFrame(check)}
 
 
 def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
-    html = page(model=result())
+    html = page(**result())
     text = re.sub(r"\s+", " ", re.sub("<[^>]+>", " ", html[html.index('id="model"') :]))
     assert "c1 4.00 1.00 4.0 0.250 70.0 123" in text
     assert "B v 6.44 ± 0.12 6.200 to 6.680 N·(s/m)ⁿ" in text
@@ -350,8 +343,6 @@ def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
 
 
 # The section on the paper's numbers: both tables, every row, and the explanation of the marks.
-
-
 def test_table_two_sets_departures_beside_the_errors() -> None:
     row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
     row |= {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}
@@ -366,8 +357,6 @@ def test_table_two_sets_departures_beside_the_errors() -> None:
 
 
 # Recordings and calibrations in the report, from entries written by hand.
-
-
 def recording() -> TrackedRecording:
     board = {"kind": "charuco", "image": "calibration/board.png", "mm_per_px": 0.2407, "scale_rel_sigma": 9e-5}
     board |= {"reprojection_px": 0.031, "n_corners": 52, "n_pictures": 1}

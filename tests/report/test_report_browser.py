@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from test_report import curves, page, trials, windows
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
 from vinetrack.figures.style import render
-from vinetrack.report.build import Clip, DiagnosisResult, ReportFigure, TrackedRecording
+from vinetrack.report.build import Clip, ReportFigure, TrackedRecording
 from vinetrack.video.write import write_clip
 
 pytest.importorskip("tornado", reason="the browser is driven through bokeh's server, which is not installed")
@@ -52,7 +53,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
         trial_figures=dict.fromkeys(names, pictures["before_after"]),
         recordings={name: TrackedRecording(pictures["ladder"], ["", "doubtful"]) for name in names},
         clip=Clip(names[0], (folder / "a.mp4").read_bytes(), "caption"),
-        diagnosis=DiagnosisResult(Diagnosis.from_json(diagnosis("ambiguous")), steps, moved()),
+        diagnosis=replace(Diagnosis.from_json(diagnosis("ambiguous")), ladder=steps),
+        moved=moved(),
     )
     path = folder / "report.html"
     path.write_text(html, encoding="utf-8")

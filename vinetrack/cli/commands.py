@@ -43,10 +43,10 @@ def _setup(folder: Path, page: bool, port: int | None, browser: bool, say: Say) 
 def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.pipeline.overlays_stage import TrackOptions, track_file
+    from vinetrack.pipeline.overlays_stage import track_file
 
     with waiting(f"tracking {recording.name}"):
-        return (), track_file(recording, TrackOptions(**options), say)
+        return (), track_file(recording, say, **options)
 
 
 @command()
@@ -256,8 +256,8 @@ def _power(target: Path, figure: Path | None, rows_file: Path | None, options: d
     import pandas as pd
 
     from vinetrack.core.tables import write_csv
+    from vinetrack.figures.style import check_figure, write_figure
     from vinetrack.pipeline.power_stage import PowerRequest, power_of_target, sheet_rows
-    from vinetrack.pipeline.predict_stage import check_figure, write_figure
 
     check_figure(figure)
     power = power_of_target(PowerRequest(target=target, **options))

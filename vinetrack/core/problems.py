@@ -67,9 +67,7 @@ class Problem:
 
 
 class UserError(Exception):
-    """An error that the user can correct: the message says what is wrong and what to do. The command line prints the
-    message of these errors; any other exception is an error in the program.
-    """
+    """An error that the user can correct, printed as its message; any other exception is a fault of the program."""
 
 
 class InputError(UserError):
@@ -89,9 +87,7 @@ class ExperimentError(UserError):
 
 
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
-    """Format problems as at most `limit` lines, errors first; the last line counts those omitted. A problem that
-    several trials share is reported once.
-    """
+    """Format problems, errors first and shared ones once, as at most `limit` lines; the last counts the rest."""
     ordered = sorted(_merged(problems), key=lambda problem: problem.severity != "error")
     if len(ordered) <= limit:
         return [str(problem) for problem in ordered]

@@ -46,9 +46,7 @@ SYSTEMATIC_OF_TRAVEL = 4e-4  # Smooth position error where the lens is unknown, 
 
 @dataclass(frozen=True)
 class PictureAxis:
-    """The growth axis of a trial in the picture: (x, y) of its ends, px; `width_m` is NaN if not given. `via_px` are
-    intermediate points of a curved path, in order.
-    """
+    """Growth axis of a trial in the picture: (x, y) of its ends and of points between, px; NaN for no width."""
 
     from_px: tuple[float, float]
     to_px: tuple[float, float]
@@ -156,9 +154,9 @@ def split_flags(flag: str) -> list[str]:
     return [part for part in flag.split(";") if part]
 
 
-def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:
-    """Return the mask of points that carry a flag. Shape (n_frames,)."""
-    return np.array([name in split_flags(str(flag)) for flag in flags], dtype=bool)
+def with_flag(flags: Iterable[str], *names: str) -> NDArray[np.bool_]:
+    """Return the mask of points that carry one of these flags. Shape (n_frames,)."""
+    return np.array([any(name in names for name in split_flags(str(flag))) for flag in flags], dtype=bool)
 
 
 def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
@@ -168,9 +166,7 @@ def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Track:
-    """Position of the leading edge at each frame of one trial. All arrays have shape (n_frames,). `lead_position_m` is
-    NaN where the edge was not found.
-    """
+    """The leading edge at each frame of one trial, shapes (n_frames,); its position is NaN where it was not found."""
 
     time_s: Floats
     lead_position_m: Floats
@@ -195,9 +191,7 @@ class Track:
 def plain_track(
     time_s: Floats, lead_position_m: Floats, *, sigma_m: Floats | None = None, pressure_Pa: Floats | None = None
 ) -> Track:
-    """Make a track of positions alone: without flags and pixels, and without errors unless given. Shapes: time_s,
-    lead_position_m, sigma_m, pressure_Pa (n_frames,).
-    """
+    """Make a track of positions alone, without errors unless given. Shapes of all arrays (n_frames,)."""
     unknown = np.full(len(time_s), np.nan)
     no_flag = np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}")
     return Track(time_s, lead_position_m, unknown if sigma_m is None else sigma_m, no_flag, unknown.copy(), pressure_Pa)
@@ -228,9 +222,7 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class Window:
-    """A window of a trial tested for steadiness by one rule: whether it was accepted, and the reason. `doubtful`: one
-    chosen by hand that is used though it is not shown to be steady.
-    """
+    """A window tested for steadiness by one rule; `doubtful`: used by the user's choice, though not shown steady."""
 
     rule: str
     accepted: bool

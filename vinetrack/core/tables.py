@@ -45,9 +45,7 @@ NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, o
 
 
 def missing_file_message(path: Path) -> tuple[str, str]:
-    """Return message and remedy for a missing file; a broken link, as to a disk that is not mounted, is named as such.
-    Returns message, remedy.
-    """
+    """Return message and remedy for a missing file; a broken link, as to an unmounted disk, is named as such."""
     if path.is_symlink():
         return (
             "is a link to something that does not exist",
@@ -320,9 +318,7 @@ def _find_decimal(cells: list[str], delimiter: str) -> str:
 
 
 def safe_join(folder: Path, relative: str) -> Path:
-    r"""Return the path of a file inside `folder`; only its text is checked, so a link may still lead outside.
-    Backslashes count as slashes.
-    """
+    """Path of a file inside `folder`, backslashes as slashes; its text is checked: a link may lead outside."""
     text = relative.strip().replace("\\", "/")
     # Control characters, surrogates, line and paragraph separators; unusual spaces are allowed: macOS writes them.
     if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
@@ -373,9 +369,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_csv(path: Path, frame: pd.DataFrame) -> None:
-    """Write a table atomically as CSV; missing numbers are `NaN`, missing text is blank. Floats are written with all
-    digits needed to read back the same value.
-    """
+    """Write a table atomically as CSV: all digits, `NaN` for missing numbers, blank for missing text."""
     text_columns = frame.columns[[dtype.kind not in "fiub" for dtype in frame.dtypes]]
     filled = frame.astype(dict.fromkeys(text_columns, object))
     filled[text_columns] = filled[text_columns].where(filled[text_columns].notna(), "")

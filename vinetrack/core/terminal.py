@@ -20,18 +20,12 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 
-def colour_wanted(stream: TextIO) -> bool:
-    """Whether to use colour on a stream."""
-    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
-        return False
-    return stream.isatty()
-
-
 def severity_first(line: str, stream: TextIO) -> str:
     """Return a line of `format_problems` with its first word in the colour of its severity."""
     word, colon, message = line.partition(":")
     colours = {"error": "31", "warning": "33"}  # Red and yellow, as codes of a terminal
-    if word not in colours or not colour_wanted(stream):
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty()
+    if plain or word not in colours:
         return line
     return f"\x1b[{colours[word]};1m{word}\x1b[0m{colon}{message}"
 
@@ -71,9 +65,7 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 class Progress(Generic[Item]):
-    """A progress bar with the remaining time, or a spinner with the elapsed time if the total is unknown. It appears
-    on standard error after half a second if that is a terminal; see `progress` and `waiting`.
-    """
+    """A bar with the time left, or a spinner; on standard error after half a second, if that is a terminal."""
 
     def __init__(self, items: Iterable[Item] | None, total: int | None, description: str, unit: str = "") -> None:
         from rich import progress as rich

@@ -15,17 +15,11 @@ from typing import Any
 
 # The four effects of the paper's equation of motion, Eq. (2): the default model, whatever columns the sheet has
 BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
-
 GRAVITY_M_S2 = 9.81  # Chosen: the rounded value of the paper; standard gravity, 9.80665, is smaller by 0.034 %
-
 AMBIENT_PRESSURE_PA = 101_325.0  # Standard atmosphere (ISO 2533)
-
 TEMPERATURE_K = 293.0  # Chosen: a laboratory at 20 °C
-
 AIR_DENSITY_KG_M3 = 1.20  # Derived: p/(R·T) = 101 325/(287 · 293) = 1.205, rounded
-
 FILM_DENSITY_KG_M3 = 1200.0  # Chosen: thermoplastic polyurethane film, 1100 to 1250
-
 GAS_CONSTANT_AIR_J_KG_K = 287.0  # Derived: 8.314 J/(mol·K) over 0.02896 kg/mol of dry air
 
 
@@ -86,9 +80,7 @@ def interval(bounds: Sequence[float | None] | None) -> str:
 
 
 def with_interval(value: float | None, bounds: Sequence[float | None] | None, shown: bool = True) -> str:
-    """Return `value (95 %: low to high)`, with decimals that suit the width; only the value if the bounds
-    are unknown or not to be `shown`.
-    """
+    """Return `value (95 %: low to high)`, with decimals that suit the width; without bounds the value."""
     if value is None or bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return number(value)
     low, high = (float(bound) for bound in bounds if bound is not None)
@@ -155,9 +147,7 @@ UNITS: dict[str, Unit] = {
 
 # Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is dimensionless
 DISPLAY_UNITS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "kg": ("g", 1e3), "1": ("", 1.0)}
-
 SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}  # Display units of sliders
-
 PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}  # Display units of predictions
 
 

@@ -18,21 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import IMAGES, Correction, Floats, Trial
-from vinetrack.core.tables import (
-    Table,
-    TableError,
-    file_size,
-    list_recordings,
-    missing_file_message,
-    parse_number,
-    read_table,
-    read_text,
-    safe_join,
-    with_value,
-    write_bytes,
-)
 from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import (
@@ -165,8 +153,8 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
         return None
     for key, relative in settings.paths:
         try:
-            safe_join(folder, relative)
-        except TableError as error:
+            tables.safe_join(folder, relative)
+        except tables.TableError as error:
             problems.append(Problem.from_error(error, SETTINGS, column=key, value=relative))
     for name in SHARED:
         value = getattr(settings, name)
@@ -176,7 +164,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
     return settings
 
 
-def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
+def _read_sheet(folder: Path, problems: list[Problem]) -> tables.Table | None:
     """Read the sheet as a table and check its columns; None if it cannot be read."""
     remedy = (
         f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
@@ -232,7 +220,7 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     if "pressure_kPa" in row.values or row.travel_ratio == 1:
         return
     column = "pressure_trace" if "pressure_trace" in row.values else "track"
-    path = safe_join(folder, row.values[column])
+    path = tables.safe_join(folder, row.values[column])
     try:
         pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
     except TrackError as error:
@@ -268,8 +256,8 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
     if not os.path.lexists(folder / CORRECTIONS_FILE):
         return {}, []
     try:
-        table = read_table(folder / CORRECTIONS_FILE)
-    except TableError as error:
+        table = tables.read_table(folder / CORRECTIONS_FILE)
+    except tables.TableError as error:
         return {}, [Problem.from_error(error, CORRECTIONS_FILE)]
     if missing := [name for name in CORRECTION_COLUMNS if name not in table.columns]:
         remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
@@ -280,19 +268,19 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
         column = "action"
         try:
             if row["action"] not in ("move", "drop", "confirm"):
-                raise TableError("is not an action", "write move, drop or confirm", code="not_a_choice")
+                raise tables.TableError("is not an action", "write move, drop or confirm", code="not_a_choice")
             column = "frame"
-            frame = parse_number(row["frame"], table.decimal)
+            frame = tables.parse_number(row["frame"], table.decimal)
             column = "edge_px"
-            edge_px = parse_number(row["edge_px"], table.decimal) if row["action"] == "move" else math.nan
+            edge_px = tables.parse_number(row["edge_px"], table.decimal) if row["action"] == "move" else math.nan
             column = "frame"
             if frame < 0 or frame != int(frame):
-                raise TableError("is not a frame number", "frames are counted 0, 1, 2, …", code="not_a_frame")
+                raise tables.TableError("is not a frame number", "frames are counted 0, 1, 2, …", code="not_a_frame")
             repeated = int(frame) in by_frame
             by_frame[int(frame)] = Correction(int(frame), row["action"], edge_px)
             if repeated:
-                raise TableError("is corrected twice", "keep one of the lines", code="twice")
-        except TableError as error:
+                raise tables.TableError("is corrected twice", "keep one of the lines", code="twice")
+        except tables.TableError as error:
             place: dict[str, Any] = {"line": line, "trial": row["trial"], "column": column, "value": row[column]}
             problems.append(Problem.from_error(error, CORRECTIONS_FILE, **place))
     return {name: tuple(by_frame[frame] for frame in sorted(by_frame)) for name, by_frame in by_trial.items()}, problems
@@ -330,9 +318,7 @@ CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure
 
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
-    """Return the rank of every trial, from 0, in the order in which they were run, shape (n_trials,), and whether the
-    sheet states that order.
-    """
+    """Return the rank of every trial, from 0, as they were run, shape (n_trials,), and whether the sheet says so."""
     order = np.array([trial.order for trial in trials], dtype=float)
     stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
     ranks = np.argsort(np.argsort(order)) if stated else np.arange(order.size)
@@ -398,8 +384,8 @@ def check_experiment(
         return list(error.problems)
     problems = list(experiment.problems)
     for key, relative in experiment.settings.paths:
-        if not (path := safe_join(experiment.folder, relative)).exists():
-            message, remedy = missing_file_message(path)
+        if not (path := tables.safe_join(experiment.folder, relative)).exists():
+            message, remedy = tables.missing_file_message(path)
             problems.append(Problem("no_file", message, key, file=SETTINGS, value=relative, remedy=remedy))
     problems += [*_order_problems(experiment.trials), *_in_no_row(experiment)]
     trial_problems: list[Problem] = []
@@ -433,7 +419,7 @@ def _in_no_row(experiment: Experiment) -> list[Problem]:
     named = {normal(path) for path in (*experiment.recordings, *(path for _, path in experiment.settings.paths))}
     named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
     named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in (".cih", ".cihx")}
-    found = [name for name in list_recordings(experiment.folder) if normal(name) not in named]
+    found = [name for name in tables.list_recordings(experiment.folder) if normal(name) not in named]
     if not found:
         return []
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
@@ -479,12 +465,12 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
             message, remedy = "is an empty folder", "put the frames in it"
             if any(path.iterdir()):
                 return []
-        elif file_size(path) == 0:
+        elif tables.file_size(path) == 0:
             message, remedy = "is an empty file", "copy it again"
         else:
             return []
     except (FileNotFoundError, ValueError):
-        code, (message, remedy) = "no_file", missing_file_message(path)
+        code, (message, remedy) = "no_file", tables.missing_file_message(path)
         if not path.is_symlink() and (close := closest_entry(path, named_videos)):
             remedy = f"did you mean {close}?"
     except OSError as error:
@@ -497,18 +483,16 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
 
 
 def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
-    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
-    ends of the file are kept; other encodings are converted to UTF-8.
-    """
+    """Set `model:` in `experiment.yaml`, its byte-order mark and line ends kept; return the path."""
     path, mark = folder / SETTINGS, b"\xef\xbb\xbf"
     before = path.read_bytes() if path.exists() else b""
-    text = read_text(path) if before else ""
+    text = tables.read_text(path) if before else ""
     listed = list(read_experiment_settings(path).effects) if before and files else []
     new = [name for name in files if name not in listed]
     if new:
-        text = with_value(text, "effects", [*listed, *new], path.name)
-    text = with_value(text, "model", names, path.name)
+        text = tables.with_value(text, "effects", [*listed, *new], path.name)
+    text = tables.with_value(text, "model", names, path.name)
     if b"\r\n" in before:
         text = text.replace("\n", "\r\n")
-    write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
+    tables.write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
     return path

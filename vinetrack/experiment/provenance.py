@@ -15,9 +15,7 @@ import vinetrack
 def describe_run(
     experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
 ) -> dict[str, Any]:
-    """Return the content of `provenance.json`. Returns mapping of JSON types: versions, platform, SHA-256 of every
-    input, model and settings.
-    """
+    """Return the content of `provenance.json`: versions, platform, SHA-256 of every input, model, settings."""
     libraries = ("numpy", "scipy", "pandas", "numba", "opencv-python-headless", "av", "scikit-image", "matplotlib")
     return {
         "vinetrack": vinetrack.__version__,

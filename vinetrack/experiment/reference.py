@@ -39,11 +39,6 @@ class Entry:
     measured: str = ""
 
 
-def column_entries() -> list[Entry]:
-    """Entries of all columns of the trial sheet, in the order of their declaration."""
-    return [Entry(c.name, c.unit, c.default, _bounds_of(c.name), c.meaning, c.measured) for c in COLUMNS.values()]
-
-
 def _bounds_of(column: str) -> str:
     """Allowed values of a column without its unit, which has a place of its own."""
     return COLUMNS[column].allowed.removesuffix(COLUMNS[column].unit).rstrip()
@@ -92,8 +87,9 @@ def _groups() -> tuple[tuple[str, str, list[Entry]], ...]:
     not_shared = ", ".join(name for name, column in COLUMNS.items() if not column.shared)
     title = f"Columns of trials.csv; all but {not_shared} may be set in experiment.yaml for all trials"
     run_title = "Keys of config/config.yaml, also --config key=value of snakemake"
+    columns = [Entry(c.name, c.unit, c.default, _bounds_of(c.name), c.meaning, c.measured) for c in COLUMNS.values()]
     return (
-        ("columns", title, column_entries()),
+        ("columns", title, columns),
         ("experiment", "Keys of experiment.yaml", list(setting_entries(ExperimentSettings))),
         ("picture", "Keys of calibration and axis in experiment.yaml", picture_entries()),
         ("run", run_title, list(setting_entries(RunSettings))),

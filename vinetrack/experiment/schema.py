@@ -158,15 +158,8 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
         raise CellError(error.message, error.remedy, column.allowed, error.code) from None
 
 
-def read_value(column: Column, value: Any) -> Any:
-    """Read a value of the settings like a cell of the sheet's column of the same name."""
-    return read_cell(column, str(value).strip())
-
-
 def read_range(column: Column, value: Any) -> tuple[float, float]:
-    """Read the two ends of a range, `low:high` or two numbers, each checked like a cell of the column. Returns low and
-    high, in the unit of the column.
-    """
+    """Read `low:high` or two numbers, each checked like a cell of the column and in its unit."""
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
         raise CellError("is not a range", "write low:high, such as 7:40", code="not_a_range")
@@ -180,7 +173,7 @@ def read_limit(column: Column, value: Any) -> float:
     """Read one number of `limits`, checked like a cell of the column."""
     if isinstance(value, bool | list | tuple | dict):
         raise CellError("holds something that is not a number", "write numbers only", code="not_a_number")
-    return float(str(read_value(column, value)))
+    return float(str(read_cell(column, str(value).strip())))
 
 
 def _check_number(column: Column, value: float) -> float:

@@ -38,9 +38,9 @@ from vinetrack.experiment.schema import (
     SHARED,
     SMALLEST_POINT_SPACING_PX,
     CellError,
+    read_cell,
     read_limit,
     read_range,
-    read_value,
 )
 
 
@@ -265,7 +265,7 @@ class ExperimentSettings(_SharedColumns):
             return value
         if isinstance(value, bool | list | dict):
             raise CellError("is not a single value", "write one, as in the sheet", code="not_a_value")
-        return read_value(column, value)
+        return read_cell(column, str(value).strip())
 
     @field_validator("model", "candidates", "effects")
     @classmethod
@@ -423,9 +423,7 @@ def _group(model: type[BaseModel], location: tuple[Any, ...]) -> type[BaseModel]
 
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Rename columns in other units to those of the sheet and convert their numbers, with a warning for each. A column
-    of the sheet without any value gives way to the same quantity in another unit.
-    """
+    """Convert columns in other units to those of the sheet, with a warning each; of two units the blank gives way."""
     problems: list[Problem] = []
     known = {other: (name, unit) for name in COLUMNS for other, unit in other_units(name).items()}
     taken = {name for name in table.columns if any(row[name] for row in table.rows)}
@@ -450,9 +448,7 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
 
 
 def _in_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> YamlDocument:
-    """Rename keys in other units, such as `pressure_psi`, to those of the settings and convert their numbers, with a
-    warning for each. Of two keys for one quantity a blank one gives way.
-    """
+    """Convert keys in other units to those of the settings, with a warning each; of two units the blank gives way."""
     content, lines = dict(document.content), dict(document.lines)
     groups: dict[str, Iterable[type[BaseModel]]] = {
         "": [ExperimentSettings],

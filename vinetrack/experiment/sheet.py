@@ -127,9 +127,7 @@ def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
 
 
 def closest_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
-    """Name of the entry of a missing file's folder that is most like its own, in upper or lower case, and not `taken`;
-    blank if there is none.
-    """
+    """Entry beside a missing file most like it, whatever its case, and not `taken`; blank if there is none."""
     try:
         names = {entry.name.lower(): entry.name for entry in sorted(path.parent.iterdir()) if entry not in taken}
     except (OSError, ValueError):
@@ -176,9 +174,7 @@ def check_row(row: Row, folder: Path) -> None:
 
 
 def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
-    """Report required cells that are blank, and return required columns that neither sheet nor settings have. The
-    latter are a fault of the sheet, which the caller reports once.
-    """
+    """Report required cells that are blank; return required columns that neither sheet nor settings have."""
     faulty = {problem.column for problem in row.problems if problem.severity == "error"}
     if "travel_ratio" in faulty:
         return set()
@@ -327,9 +323,7 @@ def planned_trial(
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
-    """Read the conditions of an experiment folder or of a single sheet, filmed or not. Rows with the same nominal
-    settings form one condition, represented by the first; rows with `use: no` are skipped.
-    """
+    """Read the conditions in use of a folder or sheet, filmed or not: the first row of each, or `every_row`."""
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
         remedy = (

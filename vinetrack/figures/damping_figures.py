@@ -16,36 +16,8 @@ import numpy as np
 
 from vinetrack.core import published
 from vinetrack.core.units import interval, number, with_interval
+from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
-from vinetrack.figures.style import (
-    BLUE,
-    DASHED,
-    GREEN,
-    INK,
-    MUTED,
-    ORANGE,
-    PAPER,
-    PURPLE,
-    VERMILLION,
-    VINE_COLOURS,
-    VINE_MARKERS,
-    VineStyle,
-    band,
-    column,
-    corner_text,
-    counted,
-    error_points,
-    legend_above,
-    line_key,
-    names_on_axis,
-    new_figure,
-    note_below,
-    plain_log_ticks,
-    small_title,
-    thinned,
-    up_from_zero,
-    vine_styles,
-)
 from vinetrack.narrative.diagnosis_text import METHOD_NAMES
 
 if TYPE_CHECKING:
@@ -53,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_METHOD_LINES = {"log_log": DASHED, "both_axes": "-"}
+_METHOD_LINES = {"log_log": st.DASHED, "both_axes": "-"}
 
 
 @figure("damping_law", "damping", "Steady force and steady speed", data="damping_points.csv")
@@ -66,8 +38,8 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
     drawable = points[(points["x_ss_m_s"] > 0) & (points["force_N"] > 0)]
     if drawable.empty:
         return None
-    styles = vine_styles(points["vine"])
-    fig = new_figure(8.6, 5.6)
+    styles = st.vine_styles(points["vine"])
+    fig = st.new_figure(8.6, 5.6)
     ax = fig.add_subplot()
     ax.set(xscale="log", yscale="log", xlabel="steady tail speed x_ss (m/s)", ylabel="force F = B·x_ssⁿ (N)")
     for vine, group in drawable.groupby("vine", sort=False):
@@ -80,7 +52,7 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
             if len(used):
                 colour, x_ss_m_s = styles[vine].colour, used["x_ss_m_s"].to_numpy()
                 _draw_law(ax, fit, vine, law["B"], x_ss_m_s, colour, _METHOD_LINES[method])
-    plain_log_ticks(ax)
+    st.plain_log_ticks(ax)
     fit = damping.get("both_axes") or {}
     refused = fit.get("n") is None or fit.get("refused")
     n = "" if refused else with_interval(fit["n"], fit.get("n_95"))
@@ -91,15 +63,20 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
     return fig
 
 
-def _draw_points(ax: Axes, points: pd.DataFrame, style: VineStyle, used: bool) -> None:
+def _draw_points(ax: Axes, points: pd.DataFrame, style: st.VineStyle, used: bool) -> None:
     """Points with bars of one standard error; the lower one ends above zero, which logarithmic axes cannot show."""
-    x, y = column(points, "x_ss_m_s"), column(points, "force_N")
-    x_sigma, y_sigma = (np.nan_to_num(column(points, name)) for name in ("x_ss_sigma_m_s", "force_sigma_N"))
+    x, y = st.column(points, "x_ss_m_s"), st.column(points, "force_N")
+    x_sigma, y_sigma = (np.nan_to_num(st.column(points, name)) for name in ("x_ss_sigma_m_s", "force_sigma_N"))
     bars: dict[str, Any] = {
         "xerr": [np.minimum(x_sigma, 0.9 * x), x_sigma],
         "yerr": [np.minimum(y_sigma, 0.9 * y), y_sigma],
     }
-    marker: dict[str, Any] = {"fmt": style.marker, "mfc": style.colour if used else PAPER, "mec": style.colour, "ms": 5}
+    marker: dict[str, Any] = {
+        "fmt": style.marker,
+        "mfc": style.colour if used else st.PAPER,
+        "mec": style.colour,
+        "ms": 5,
+    }
     ax.errorbar(
         x, y, color=style.colour, mew=1.1, elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3, **bars, **marker
     )
@@ -114,7 +91,7 @@ def _draw_law(ax: Axes, fit: dict[str, Any], vine: str, B: float, x_ss_m_s: np.n
     sigma = log_force_sigma(fit, vine, x)
     if sigma is not None:
         factor = np.exp(1.96 * sigma)
-        band(ax, x, force_N / factor, force_N * factor, colour, 0.16)
+        st.band(ax, x, force_N / factor, force_N * factor, colour, 0.16)
 
 
 def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.ndarray | None:
@@ -132,7 +109,7 @@ def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.
     return np.sqrt(np.maximum(variance, 0.0)) if np.isfinite(variance).all() else None
 
 
-def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styles: dict[str, VineStyle]) -> None:
+def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styles: dict[str, st.VineStyle]) -> None:
     """Vines with B and N, the first 14 of them, which with the methods fill the height of the figure."""
     laws = (damping.get("both_axes") or {}).get("vines") or {}
     handles = []
@@ -142,14 +119,16 @@ def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styl
         n_used = int(points.loc[points["vine"] == vine, "used"].sum())
         B = f"{breaks}B = {number(laws[vine]['B'])}" if vine in laws else ""
         label = f"{vine}{B}{', ' if B else breaks}N = {n_used}"
-        handles.append(line_key(label, color=styles[vine].colour, marker=styles[vine].marker, ls="none", ms=6))
+        handles.append(st.line_key(label, color=styles[vine].colour, marker=styles[vine].marker, ls="none", ms=6))
     if len(vines) > 14:
-        handles.append(line_key(f"and {len(vines) - 14} more vines", ls="none"))
+        handles.append(st.line_key(f"and {len(vines) - 14} more vines", ls="none"))
     if n_left := int((~points["used"].astype(bool)).sum()):
-        handles.append(line_key(f"not in the fit, N = {n_left}", color=MUTED, marker="o", mfc=PAPER, ls="none", ms=6))
+        handles.append(
+            st.line_key(f"not in the fit, N = {n_left}", color=st.MUTED, marker="o", mfc=st.PAPER, ls="none", ms=6)
+        )
     for method, name in METHOD_NAMES.items():
         if (damping.get(method) or {}).get("vines"):
-            handles.append(line_key(f"{name}\nand its 95 % band", color=INK, ls=_METHOD_LINES[method]))
+            handles.append(st.line_key(f"{name}\nand its 95 % band", color=st.INK, ls=_METHOD_LINES[method]))
     fig.legend(handles=handles, loc="outside right upper", fontsize=9, labelspacing=0.8, borderaxespad=0.8)
 
 
@@ -165,7 +144,7 @@ def draw_exponents(damping: dict[str, Any]) -> Figure | None:
     best = {vine: law for fit in fits.values() for vine, law in fit["vines"].items()}
     # At half an inch per vine, 40 make a figure of 22 in, the longest that a page shows whole.
     vines = sorted(best, key=lambda vine: (best[vine]["diameter_mm"], best[vine]["thickness_um"], vine))[:40]
-    fig = new_figure(9.4, 1.9 + max(0.5 * len(vines), 1.2))
+    fig = st.new_figure(9.4, 1.9 + max(0.5 * len(vines), 1.2))
     left, right = fig.subplots(1, 2, width_ratios=(1, 1.35))
     for method, fit in fits.items():
         label = f"{METHOD_NAMES[method]}: n = {with_interval(fit['n'], fit.get('n_95'))}"
@@ -177,12 +156,12 @@ def draw_exponents(damping: dict[str, Any]) -> Figure | None:
     left.set(ylim=(0.75, -0.75), yticks=[], xlabel="exponent n")
     left.spines["left"].set_visible(False)
     left.locator_params(axis="x", nbins=5)
-    legend_above(left)
+    st.legend_above(left)
     right.set(ylim=(len(vines) - 0.45, -0.55), xlabel="B, deviation from the value at the left (%)")
     B = {vine: with_interval(best[vine]["B"], best[vine].get("B_95"), shown=False) for vine in vines}
     labels = [f"{vine}\nB = {B[vine]}, N = {best[vine]['n_trials']}" for vine in vines]
-    names_on_axis(right, "y", labels, fontsize=9)
-    small_title(
+    st.names_on_axis(right, "y", labels, fontsize=9)
+    st.small_title(
         right, "thick: 95 %, from the scatter of trials; thin: with\nthe yield pressure's stated error; B in N·(s/m)ⁿ"
     )
     return fig
@@ -198,7 +177,7 @@ def _deviation(value: Any, best_B: float) -> Any:
 def _draw_estimate(
     ax: Axes, method: str, row: float, value: float, resampled: Any, total: Any, label: str | None = None
 ) -> None:
-    offset, colour, marker = {"log_log": (-0.17, VERMILLION, "s"), "both_axes": (0.17, BLUE, "o")}[method]
+    offset, colour, marker = {"log_log": (-0.17, st.VERMILLION, "s"), "both_axes": (0.17, st.BLUE, "o")}[method]
     y = row + offset
     for bounds, width in ((total, 1.3), (resampled, 4.0)):
         if bounds is not None and None not in bounds:
@@ -219,7 +198,7 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
     kinds = [kind for kind in titles if scaling.get(kind)]
     if not kinds:
         return None
-    fig = new_figure(6.6 if len(kinds) == 1 else 11.0, 5.2)
+    fig = st.new_figure(6.6 if len(kinds) == 1 else 11.0, 5.2)
     for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
         families = scaling[kind][:4]  # four families have twelve lines of legend above the axes
         along = {"diameter_mm": "diameter (mm)", "thickness_um": "wall thickness (µm)"}[families[0]["along"]]
@@ -229,26 +208,28 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
         pairs = [pair for family in families for pair in zip(family["vines"], family["sizes"], strict=True)]
         printed = [(size, published["B"][vine]) for vine, size in pairs if published and vine in published["B"]]
         if published and printed:
-            ax.plot(*zip(*printed, strict=True), "D", mfc="none", mec=MUTED, ms=11, mew=1.3, label=published["source"])
+            ax.plot(
+                *zip(*printed, strict=True), "D", mfc="none", mec=st.MUTED, ms=11, mew=1.3, label=published["source"]
+            )
         sizes = sorted({size for _, size in pairs})
         ax.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
-        plain_log_ticks(ax)
+        st.plain_log_ticks(ax)
         if len(sizes) <= 8:
             ax.set_xticks(sizes)
         left_out = len(scaling[kind]) - len(families)
         title = titles[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
-        legend_above(ax, title=title, alignment="left")
-    note_below(fig, note)
+        st.legend_above(ax, title=title, alignment="left")
+    st.note_below(fig, note)
     return fig
 
 
 def _draw_B_family(ax: Axes, family: dict[str, Any], index: int) -> None:
-    colour = VINE_COLOURS[index]
+    colour = st.VINE_COLOURS[index]
     sizes, B = np.array(family["sizes"], dtype=float), np.array(family["B"], dtype=float)
     low, high = np.array(family["B_95"], dtype=float).T
     refused = f"\nno line: {family['refused']}" if family.get("refused") else ""
     label = f"B with 95 % interval, N = {B.size} vines{refused}"
-    error_points(ax, sizes, B, np.clip([B - low, high - B], 0, None), index, label, elinewidth=1.3, zorder=3)
+    st.error_points(ax, sizes, B, np.clip([B - low, high - B], 0, None), index, label, elinewidth=1.3, zorder=3)
     span = np.geomspace(sizes.min() / 1.15, sizes.max() * 1.15, 100)
     if power := family["power"]:
         label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}), R² {number(power['R2'])}"
@@ -257,7 +238,7 @@ def _draw_B_family(ax: Axes, family: dict[str, Any], index: int) -> None:
         straight = line["intercept"] + line["slope"] * span
         drawn = straight > 0.5 * B.min()
         label = f"straight line, intercept {number(line['intercept'])}, R² {number(line['R2'])}"
-        ax.plot(span[drawn], straight[drawn], color=colour, lw=1.3, ls=DASHED, label=label)
+        ax.plot(span[drawn], straight[drawn], color=colour, lw=1.3, ls=st.DASHED, label=label)
 
 
 @figure("speed_scaling", "damping", "Steady speed against size", data="conditions.csv")
@@ -271,7 +252,7 @@ def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure | None
     families = (scaling.get("steady_speed") or [])[:5]  # each pressure has three lines of legend above the axes
     if not families:
         return None
-    fig = new_figure(11.0, 5.2 + 0.45 * len(families))
+    fig = st.new_figure(11.0, 5.2 + 0.45 * len(families))
     left, right = fig.subplots(1, 2)
     for i, family in enumerate(families):
         _draw_speed_family(left, family, "x_ss{}_m_s", family, i)
@@ -281,16 +262,16 @@ def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure | None
     labels = {"Speed": "steady tail speed x_ss (m/s)", "Speed over diameter": "x_ss / diameter (1/s)"}
     for ax, (title, label) in zip((left, right), labels.items(), strict=True):
         ax.set(xlabel="diameter (mm)", ylabel=label)
-        up_from_zero(ax, x=True)
-        legend_above(ax, title=title + more, alignment="left", fontsize=9)
+        st.up_from_zero(ax, x=True)
+        st.legend_above(ax, title=title + more, alignment="left", fontsize=9)
     single = any(count == 1 for family in families for count in family["n_steady"])
     of_single = "The error bar of a single trial does not include replicate scatter." if single else ""
-    note_below(fig, " ".join(filter(None, [note, of_single])))
+    st.note_below(fig, " ".join(filter(None, [note, of_single])))
     return fig
 
 
 def _draw_speed_family(ax: Axes, family: dict[str, Any], key: str, lines: dict[str, Any], index: int) -> None:
-    colour = VINE_COLOURS[index]
+    colour = st.VINE_COLOURS[index]
     sizes, values, errors = (
         np.array(family[name], dtype=float) for name in ("sizes", key.format(""), key.format("_sigma"))
     )
@@ -300,14 +281,14 @@ def _draw_speed_family(ax: Axes, family: dict[str, Any], key: str, lines: dict[s
     else:
         slope = f"{number(power['slope'], 2)} ({interval(power['slope_95'])}), p = {number(power['p'], 2)}"
         trend = f"power (dashed) {slope}\nline (full): R² {number(line['R2'])}, p = {number(line['p'], 2)}"
-    n = f"{counted([sizes.size], 'vine')} of {counted([int(count) for count in family['n_steady']], 'trial')}"
+    n = f"{st.counted([sizes.size], 'vine')} of {st.counted([int(count) for count in family['n_steady']], 'trial')}"
     label = f"{family['pressure_kPa']:.4g} kPa, N = {n}\n{trend}"
-    error_points(ax, sizes, values, errors, index, label, elinewidth=1.3)
+    st.error_points(ax, sizes, values, errors, index, label, elinewidth=1.3)
     span = np.linspace(0.8 * sizes.min(), 1.1 * sizes.max(), 100)
     if line:
         ax.plot(span, line["intercept"] + line["slope"] * span, color=colour, lw=1.5)
     if power:
-        ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.3, ls=DASHED)
+        ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.3, ls=st.DASHED)
 
 
 # Sizes that the efficiency is drawn against: label of the axis, name and unit
@@ -335,7 +316,7 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure | None:
     family, n_left = families[0], len(families) - 1
     along = [name for name in _SIZES if len(set(family[name])) > 1]
     shown = [key for key in definitions if np.any(np.array(family[key], dtype=float) > 0)]
-    fig = new_figure(0.9 + 3.6 * len(shown), 1.0 + 3.5 * len(along))
+    fig = st.new_figure(0.9 + 3.6 * len(shown), 1.0 + 3.5 * len(along))
     axes = fig.subplots(len(along), len(shown), squeeze=False, sharey=True)
     for row, x in zip(axes, along, strict=True):
         for ax, key in zip(row, shown, strict=True):
@@ -350,10 +331,10 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure | None:
     more = f"; {n_left} more {'family' if n_left == 1 else 'families'} in scaling.json" if n_left else ""
     title = (
         f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
-        f"N = {counted(counts, 'trial')} per point{error}{more}"
+        f"N = {st.counted(counts, 'trial')} per point{error}{more}"
     )
     fig.suptitle(title, fontsize=11, x=0.01, ha="left")
-    note_below(fig, note)
+    st.note_below(fig, note)
     return fig
 
 
@@ -364,7 +345,7 @@ def _draw_efficiency(ax: Axes, family: dict[str, Any], key: str, x: str) -> None
         chosen = np.flatnonzero(others == size)
         chosen = chosen[np.argsort(sizes[chosen])]
         label = f"{size:.4g} {_SIZES[other][2]}"
-        error_points(ax, sizes[chosen], 100 * values[chosen], 100 * errors[chosen], i, label, ls="-", ms=5.5, lw=1.2)
+        st.error_points(ax, sizes[chosen], 100 * values[chosen], 100 * errors[chosen], i, label, ls="-", ms=5.5, lw=1.2)
     ax.set(xlabel=_SIZES[x][0], xlim=(0, 1.12 * sizes.max()))
     trend = family["trend"][key]
     words = ""
@@ -373,7 +354,7 @@ def _draw_efficiency(ax: Axes, family: dict[str, Any], key: str, x: str) -> None
     elif x in trend:
         power, spread, p = trend[x]["power"], interval(trend[x]["power_95"]), number(trend[x]["p"], 2)
         words = f"power of the {_SIZES[x][1]} {number(power, 2)}\n({spread}), p = {p}"
-    corner_text(ax, 0.03, 0.03, words, fontsize=8.5)
+    st.corner_text(ax, 0.03, 0.03, words, fontsize=8.5)
 
 
 # ------------------------------------------------------------------------------
@@ -403,7 +384,7 @@ def draw_paper_damping(points: pd.DataFrame, damping: Mapping[str, Any]) -> Figu
     steady = [scaled[scaled[wanted] & (scaled[x] > 0) & (scaled[y] > 0)] for _, x, y, wanted, _ in panels]
     if not any(map(len, steady)):
         return None
-    fig = new_figure(12.0, 6.2)
+    fig = st.new_figure(12.0, 6.2)
     axes = fig.subplots(1, 2, sharex=True, sharey=True)
     for ax, part, (method, x, y, _, title) in zip(axes, steady, panels, strict=True):
         law = damping.get(method) or {}
@@ -413,7 +394,7 @@ def draw_paper_damping(points: pd.DataFrame, damping: Mapping[str, Any]) -> Figu
         ax.set_xlabel("steady tail speed x_ss (m/s)")
     axes[0].set_ylabel("growth force above yield (N)")
     for ax in axes:
-        plain_log_ticks(ax)
+        st.plain_log_ticks(ax)
         if ax.get_legend_handles_labels()[0]:
             ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, fontsize=9)
     return fig
@@ -425,13 +406,13 @@ def _draw_force_panel(ax: Axes, points: pd.DataFrame, x: str, y: str, law: Mappi
         part = points[points["scale"] == scale]
         if not len(part):
             continue
-        colour = VINE_COLOURS[i % len(VINE_COLOURS)]
+        colour = st.VINE_COLOURS[i % len(st.VINE_COLOURS)]
         fitted = (law.get("vines") or {}).get(str(part["vine"].iloc[0])) or {}
         label = f"R = {scale}: B {number(fitted.get('B'))}, printed {B:g}; N = {len(part)}"
-        ax.plot(part[x], part[y], VINE_MARKERS[i], mfc=PAPER, mec=colour, ms=5, mew=1.1, ls="none", label=label)
+        ax.plot(part[x], part[y], st.VINE_MARKERS[i], mfc=st.PAPER, mec=colour, ms=5, mew=1.1, ls="none", label=label)
         span = np.geomspace(float(part[x].min()) / 1.2, float(part[x].max()) * 1.2, 50)
         printed = "printed B and n" if scale == max(published.DAMPING_B) else None
-        ax.plot(span, B * span**published.EXPONENT, color=INK, lw=1.2, ls=DASHED, label=printed)
+        ax.plot(span, B * span**published.EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
         if fitted and law.get("n"):
             ax.plot(span, fitted["B"] * span ** law["n"], color=colour, lw=1.4)
 
@@ -448,7 +429,7 @@ def draw_paper_position(
     pressures = sorted(paper_motions["pressure_kPa"].unique())
     if not pressures:
         return None
-    fig = new_figure(12.0, 5.2)
+    fig = st.new_figure(12.0, 5.2)
     axes = fig.subplots(1, len(pressures), squeeze=False, sharey=True)[0]
     for ax, pressure_kPa in zip(axes, pressures, strict=True):
         at_pressure = paper_motions[paper_motions["pressure_kPa"] == pressure_kPa]
@@ -479,28 +460,28 @@ def _draw_departures(ax: Axes, curves: Mapping[str, pd.DataFrame]) -> None:
 
     def time_at(curve: pd.DataFrame) -> np.ndarray:
         """Times at which a motion passes each position; 1000 s for positions that it does not reach."""
-        grown_cm = column(curve, "lead_position_m", 100)
-        when = np.interp(position_cm, grown_cm, column(curve, "time_s"))
+        grown_cm = st.column(curve, "lead_position_m", 100)
+        when = np.interp(position_cm, grown_cm, st.column(curve, "time_s"))
         return np.where(position_cm <= grown_cm.max() + 1e-9, when, 1e3)
 
     refilled = "chamber not refilled,\nisothermal to adiabatic"
-    for slack, colour, label in (("", ORANGE, refilled), ("_slack", PURPLE, "both")):
+    for slack, colour, label in (("", st.ORANGE, refilled), ("_slack", st.PURPLE, "both")):
         slow, fast = (time_at(curves[f"depletion_{pace}{slack}"]) for pace in ("slow", "fast"))
         ax.fill_betweenx(position_cm, slow, fast, color=colour, alpha=0.3, lw=0, label=label)
     for name, style, label in (
-        ("slack", {"color": GREEN, "lw": 1.6, "ls": DASHED}, "tail that\ncannot push"),
-        ("eq2", {"color": INK, "lw": 1.8}, "Eq. (2) with the\nprinted numbers"),
+        ("slack", {"color": st.GREEN, "lw": 1.6, "ls": st.DASHED}, "tail that\ncannot push"),
+        ("eq2", {"color": st.INK, "lw": 1.8}, "Eq. (2) with the\nprinted numbers"),
     ):
         ax.plot(curves[name]["time_s"], 100 * curves[name]["lead_position_m"], label=label, **style)
 
 
 def _draw_mean(ax: Axes, mean: pd.DataFrame) -> None:
-    part = thinned(mean, 40)
-    time_s, position_cm = column(part, "time_s"), column(part, "lead_position_m", 100)
-    sigma_cm = np.nan_to_num(column(part, "lead_position_sigma_m", 100))
-    band(ax, time_s, position_cm - sigma_cm, position_cm + sigma_cm, BLUE, 0.2)
+    part = st.thinned(mean, 40)
+    time_s, position_cm = st.column(part, "time_s"), st.column(part, "lead_position_m", 100)
+    sigma_cm = np.nan_to_num(st.column(part, "lead_position_sigma_m", 100))
+    st.band(ax, time_s, position_cm - sigma_cm, position_cm + sigma_cm, st.BLUE, 0.2)
     label = f"mean of {int(mean['n_trials'].iloc[0])} trials,\n± one trial's scatter"
-    ax.plot(time_s, position_cm, "o", color=BLUE, ms=3.2, mec=MUTED, mew=0.3, label=label)
+    ax.plot(time_s, position_cm, "o", color=st.BLUE, ms=3.2, mec=st.MUTED, mew=0.3, label=label)
 
 
 @figure("paper_reservoir", "paper", "Pressure lost by a chamber", data="paper_pressures.csv")
@@ -509,19 +490,19 @@ def draw_paper_reservoir(paper_pressures: pd.DataFrame) -> Figure:
     applies to absolute pressure, so that a change of volume by 3.4 % reduces the gauge pressure by 15 to 71 %, not
     by 3.4 %. The refill rate of the regulator is not published.
     """
-    fig = new_figure(8.2, 4.8)
+    fig = st.new_figure(8.2, 4.8)
     ax = fig.add_subplot()
     for i, (pressure_kPa, at_pressure) in enumerate(paper_pressures.groupby("pressure_kPa")):
         by_name = {str(name): part for name, part in at_pressure.groupby("departure")}
-        low, high = (column(by_name[f"depletion_{pace}"], "gauge_left", 100) for pace in ("fast", "slow"))
-        growth_mm = column(by_name["depletion_slow"], "lead_position_m", 1e3)
+        low, high = (st.column(by_name[f"depletion_{pace}"], "gauge_left", 100) for pace in ("fast", "slow"))
+        growth_mm = st.column(by_name["depletion_slow"], "lead_position_m", 1e3)
         label = f"{float(str(pressure_kPa)):g} kPa: −{100 - high[-1]:.0f} to −{100 - low[-1]:.0f} %"
-        band(ax, growth_mm, low, high, VINE_COLOURS[i], 0.35, label=label)
-        ax.plot(growth_mm, high, color=VINE_COLOURS[i], lw=1.4)
+        st.band(ax, growth_mm, low, high, st.VINE_COLOURS[i], 0.35, label=label)
+        ax.plot(growth_mm, high, color=st.VINE_COLOURS[i], lw=1.4)
     allowed = 100 * (1 - published.CHAMBER_ALLOWED)
-    ax.axhline(allowed, color=INK, lw=1.0, ls=DASHED, label=f"{100 * published.CHAMBER_ALLOWED:g} %, as allowed")
+    ax.axhline(allowed, color=st.INK, lw=1.0, ls=st.DASHED, label=f"{100 * published.CHAMBER_ALLOWED:g} %, as allowed")
     relative = 100 / (1 + published.CHAMBER_CHANGE)
-    ax.axhline(relative, color=MUTED, lw=1.0, ls=":", label=f"as printed: P₁V₁/V₂, {100 - relative:.1f} %")
+    ax.axhline(relative, color=st.MUTED, lw=1.0, ls=":", label=f"as printed: P₁V₁/V₂, {100 - relative:.1f} %")
     ax.set(xlabel="growth (mm)", ylabel="gauge pressure left (%)", ylim=(0, 104), xlim=(0, None))
     ax.set_title(
         f"{published.CHAMBER_L:g} L, 24 mm × {published.LONGEST_VINE_MM:g} mm vine, nothing refilling it:\n"
@@ -538,7 +519,7 @@ def draw_paper_rms(paper: pd.DataFrame, paper_departures: pd.DataFrame) -> Figur
     simulated by Eq. (2), come only from scatter of vines and pressures. A departure that changes nothing at a
     pressure is not drawn there.
     """
-    fig = new_figure(11.0, 4.9)
+    fig = st.new_figure(11.0, 4.9)
     left, right = fig.subplots(1, 2)
     ours = paper.drop_duplicates("row").set_index("row")["ours"]
     of_figure = dict(iter(paper_departures.groupby("figure")))
@@ -556,16 +537,16 @@ def _draw_rms_panel(ax: Axes, printed: dict[int, float], ours: pd.Series, row: s
     least = 0.01  # 0.1 mm and 1 cm/s, a hundredth of the printed errors
     places = np.arange(len(printed), dtype=float)
     ax.set_yscale("log")
-    ax.plot(places - 0.3, list(printed.values()), "D", color=INK, ms=8, label="published")
+    ax.plot(places - 0.3, list(printed.values()), "D", color=st.INK, ms=8, label="published")
     found = [float(ours.get(row.format(kPa), np.nan)) for kPa in printed]
-    ax.plot(places - 0.15, found, "o", mfc="none", mec=BLUE, mew=1.8, ms=8, label="ours")
+    ax.plot(places - 0.15, found, "o", mfc="none", mec=st.BLUE, mew=1.8, ms=8, label="ours")
 
     def sizes(name: str) -> np.ndarray:
         of_name = departures[departures["departure"] == name]
         near = [of_name.loc[np.isclose(of_name["pressure_kPa"], kPa), "size"] for kPa in printed]
         return np.array([float(size.iloc[0]) if len(size) else np.nan for size in near])
 
-    for k, ((label, names), colour) in enumerate(zip(CAUSES.items(), (ORANGE, GREEN, PURPLE), strict=True)):
+    for k, ((label, names), colour) in enumerate(zip(CAUSES.items(), (st.ORANGE, st.GREEN, st.PURPLE), strict=True)):
         low, high = np.maximum(sizes(names[0]), least), sizes(names[-1])
         shown = high >= least
         middle = np.sqrt(low * np.maximum(high, least))
@@ -575,7 +556,7 @@ def _draw_rms_panel(ax: Axes, printed: dict[int, float], ours: pd.Series, row: s
     ax.set_xticks(places, [f"{kPa:g} kPa" for kPa in printed])
     ax.grid(visible=False, axis="x")
     ax.set_xlim(-0.6, len(printed) - 0.4)
-    plain_log_ticks(ax, "y")
+    st.plain_log_ticks(ax, "y")
 
 
 @figure("paper_fig5", "paper", "Fig. 5: final speed and payload", data="paper_speeds.csv")
@@ -588,27 +569,27 @@ def draw_paper_speeds(paper_speeds: pd.DataFrame, paper_speed_curves: pd.DataFra
     reached = reached[reached.groupby("pressure_kPa")["payload_g"].transform("nunique") > 1]
     if not len(reached):
         return None
-    fig = new_figure(6.6, 4.8)
+    fig = st.new_figure(6.6, 4.8)
     ax = fig.add_subplot()
     for i, (pressure_kPa, group) in enumerate(reached.groupby("pressure_kPa")):
         speed, sigma = (group[f"final_lead_velocity{part}_m_s"] for part in ("", "_sigma"))
-        error_points(ax, group["payload_g"], speed, sigma, i, f"{float(str(pressure_kPa)):.4g} kPa")
+        st.error_points(ax, group["payload_g"], speed, sigma, i, f"{float(str(pressure_kPa)):.4g} kPa")
         near = np.isclose(paper_speed_curves["pressure_kPa"], float(str(pressure_kPa)))
         curve = paper_speed_curves[near].sort_values("payload_g")
         label = "Eq. (2), B proportional to the wall" if i == 0 else None
-        style: dict[str, Any] = {"color": VINE_COLOURS[i % len(VINE_COLOURS)], "lw": 1.5, "label": label}
+        style: dict[str, Any] = {"color": st.VINE_COLOURS[i % len(st.VINE_COLOURS)], "lw": 1.5, "label": label}
         ax.plot(curve["payload_g"], curve["final_lead_velocity_m_s"], **style)
     counts = reached["n_final"].astype(int).tolist()
     ax.set(xlabel="payload (g)", ylabel="speed of the leading edge (m/s)")
-    up_from_zero(ax)
+    st.up_from_zero(ax)
     error = ", ± standard error" if max(counts) > 1 else ""
     title = f"{reached['vine'].iloc[0]}, after {reached['final_at_mm'].iloc[0]:.4g} mm\n"
-    title += f"N = {counted(counts, 'trial')} per point{error}"
-    legend_above(ax, 2, title=title, alignment="left", fontsize=9)
+    title += f"N = {st.counted(counts, 'trial')} per point{error}"
+    st.legend_above(ax, 2, title=title, alignment="left", fontsize=9)
     note = (
         "B of this vine and the payloads other than 35.6 g are not printed; the paper shows its points only in a plot"
     )
-    note_below(fig, note)
+    st.note_below(fig, note)
     return fig
 
 

@@ -15,30 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.units import number
+from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
-from vinetrack.figures.style import (
-    BLUE,
-    DASHED,
-    GREEN,
-    INK,
-    MUTED,
-    ORANGE,
-    VERMILLION,
-    VINE_MARKERS,
-    band,
-    column,
-    fitting_size,
-    line_key,
-    names_on_axis,
-    new_figure,
-    page_legend,
-    panel_grid,
-    plain_log_ticks,
-    rows,
-    small_title,
-    thinned,
-    with_minus,
-)
 from vinetrack.narrative.verdict_text import estimates_text, listed_names
 from vinetrack.results.folder_layout import Results, empty_table, read_diagnosis, read_result
 
@@ -50,8 +28,8 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Floats
     from vinetrack.diagnosis.result import Diagnosis, Round
 
-BEFORE, AFTER = VERMILLION, BLUE
-AHEAD, BEHIND = BLUE, VERMILLION  # Colours of a vine ahead of the model, and behind it
+BEFORE, AFTER = st.VERMILLION, st.BLUE
+AHEAD, BEHIND = st.BLUE, st.VERMILLION  # Colours of a vine ahead of the model, and behind it
 TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
 
 # ------------------------------------------------------------------------------
@@ -59,9 +37,9 @@ TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
 
 # Columns of `ladder.csv`, with label, colour, marker and line style
 _ERRORS = {
-    "rms_in_sample_m": ("in sample", BLUE, "o", "-"),
-    "rms_left_out_m": ("on left-out conditions", VERMILLION, "s", "-"),
-    "rms_highest_pressure_m": ("on the left-out highest pressure", GREEN, "^", DASHED),
+    "rms_in_sample_m": ("in sample", st.BLUE, "o", "-"),
+    "rms_left_out_m": ("on left-out conditions", st.VERMILLION, "s", "-"),
+    "rms_highest_pressure_m": ("on the left-out highest pressure", st.GREEN, "^", st.DASHED),
 }
 
 
@@ -75,9 +53,9 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     """
     if not len(ladder):
         return None
-    errors_mm = {key: column(ladder, key, 1e3) for key in _ERRORS}
-    floor_mm = column(ladder, "floor_m", 1e3)
-    fig = new_figure(max(5.2, 2.4 + 1.55 * len(ladder)), 3.9)  # names of effects are wrapped at 18 letters
+    errors_mm = {key: st.column(ladder, key, 1e3) for key in _ERRORS}
+    floor_mm = st.column(ladder, "floor_m", 1e3)
+    fig = st.new_figure(max(5.2, 2.4 + 1.55 * len(ladder)), 3.9)  # names of effects are wrapped at 18 letters
     ax = fig.add_subplot()
     ax.set(yscale="log", ylabel="error of position, rms (mm)", xlim=(-0.5, len(ladder) - 0.5))
     known = np.concatenate([*errors_mm.values(), floor_mm])
@@ -90,17 +68,17 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     known_floor_mm = floor_mm[np.isfinite(floor_mm) & (floor_mm > 0)]
     if known_floor_mm.size:
         floor = float(known_floor_mm[-1])  # an error in the shaded range says nothing about the model
-        ax.axhspan(ax.get_ylim()[0], floor, color=MUTED, alpha=0.16, lw=0, zorder=0)
-        ax.axhline(floor, color=MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
+        ax.axhspan(ax.get_ylim()[0], floor, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
+        ax.axhline(floor, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
         frame = (("axes fraction", "data"), "offset points")
         words = f"replicate scatter: {number(floor)} mm"
-        ax.annotate(words, (0.015, floor), (0, -4), *frame, color=MUTED, va="top", fontsize=9)
+        ax.annotate(words, (0.015, floor), (0, -4), *frame, color=st.MUTED, va="top", fontsize=9)
     handles = []
     for key, (name, colour, marker, line) in _ERRORS.items():
         style: dict[str, Any] = {"marker": marker, "color": colour, "ls": line}
         ax.plot(np.arange(len(ladder)), errors_mm[key], ms=7, zorder=3, **style)
         if np.isfinite(errors_mm[key]).any():
-            handles.append(line_key(name, ms=6, **style))
+            handles.append(st.line_key(name, ms=6, **style))
     _write_values(ax, errors_mm)
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
@@ -109,9 +87,9 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         labels.append("+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False)))
     ax.set_xticks(range(len(ladder)), labels)
     ax.grid(axis="x", visible=False)
-    plain_log_ticks(ax, "y")
+    st.plain_log_ticks(ax, "y")
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.02, 1.0)}
-    ax.legend(handles=handles, fontsize=9, labelspacing=0.25, labelcolor=INK, **place)
+    ax.legend(handles=handles, fontsize=9, labelspacing=0.25, labelcolor=st.INK, **place)
     return fig
 
 
@@ -145,36 +123,34 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
     models: dict[str, tuple[str, Any, str]] = {"model_before_m": (BEFORE, (0, (5, 2)), "initial model")}
     if np.isfinite(before_after["model_after_m"]).any():
         models["model_after_m"] = (AFTER, "-", f"with {added}" if added else "after")
-    fig = new_figure(5.2, 4.3)  # two such figures fit side by side on a page of 11 in
+    fig = st.new_figure(5.2, 4.3)  # two such figures fit side by side on a page of 11 in
     growth, misfit = fig.subplots(2, 1, sharex=True, height_ratios=(2.1, 1))
     parts = []
     for _, part in before_after.groupby("trial", sort=False):
         begins_s = -0.06 * float(part["time_s"].iloc[-1])
-        parts.append(thinned(part[part["time_s"] >= begins_s], 160))
-        time_ms, measured_mm = column(parts[-1], "time_s", 1e3), column(parts[-1], "lead_position_m", 1e3)
-        growth.plot(time_ms, measured_mm, ".", color=MUTED, ms=4.5, mew=0)
+        parts.append(st.thinned(part[part["time_s"] >= begins_s], 160))
+        time_ms, measured_mm = st.column(parts[-1], "time_s", 1e3), st.column(parts[-1], "lead_position_m", 1e3)
+        growth.plot(time_ms, measured_mm, ".", color=st.MUTED, ms=4.5, mew=0)
         for model, (colour, line, _) in models.items():
-            misfit.plot(time_ms, measured_mm - column(parts[-1], model, 1e3), color=colour, lw=1.3, ls=line)
+            misfit.plot(time_ms, measured_mm - st.column(parts[-1], model, 1e3), color=colour, lw=1.3, ls=line)
     for part in parts:
         for model, (colour, line, _) in models.items():
-            growth.plot(column(part, "time_s", 1e3), column(part, model, 1e3), color=colour, lw=1.6, ls=line)
-    misfit.axhline(0, color=INK, lw=0.8)
+            growth.plot(st.column(part, "time_s", 1e3), st.column(part, model, 1e3), color=colour, lw=1.6, ls=line)
+    misfit.axhline(0, color=st.INK, lw=0.8)
     growth.set_ylabel("growth (mm)")
     misfit.set(xlabel="time since release (ms)", ylabel="misfit (mm)")
     growth.set_title(worst, fontsize=10)
-    handles = [line_key(f"measured, N = {len(parts)}", color=MUTED, marker=".", ls="none", ms=8)]
+    handles = [st.line_key(f"measured, N = {len(parts)}", color=st.MUTED, marker=".", ls="none", ms=8)]
     for model, (colour, line, words) in models.items():
         handles.append(
-            line_key(f"{words}: {number(1e3 * rms_m(before_after, model), 2)} mm rms", color=colour, ls=line)
+            st.line_key(f"{words}: {number(1e3 * rms_m(before_after, model), 2)} mm rms", color=colour, ls=line)
         )
     growth.legend(handles=handles, loc="lower right", fontsize=9, borderaxespad=0.2, labelspacing=0.3)
     return fig
 
 
 def rms_m(trials: pd.DataFrame, model: str) -> float:
-    """Return the root mean square error of position of a model after release, m. Returns all trials have the same
-    weight, as in `comparison.csv`; NaN without a prediction.
-    """
+    """Root mean square error of a model after release, m, every trial with one weight; NaN without prediction."""
     squares = [
         float(np.mean((part["lead_position_m"] - part[model]) ** 2))
         for _, part in trials[trials["time_s"] >= 0].groupby("trial", sort=False)
@@ -187,9 +163,9 @@ def rms_m(trials: pd.DataFrame, model: str) -> float:
 
 # By role of a candidate: label, colour and opacity
 _ROLES = {
-    "answer": ("in the answer set", BLUE, 1.0),
-    "physical": ("explains less", MUTED, 0.75),
-    "measurement": ("fault of the measurement", ORANGE, 0.75),
+    "answer": ("in the answer set", st.BLUE, 1.0),
+    "physical": ("explains less", st.MUTED, 0.75),
+    "measurement": ("fault of the measurement", st.ORANGE, 0.75),
 }
 
 
@@ -205,27 +181,27 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
     if not drawn:
         return None
     heights_in = [0.33 * len(table) + 0.95 for _, table in drawn]
-    fig = new_figure(8.6, sum(heights_in) + 0.35)
+    fig = st.new_figure(8.6, sum(heights_in) + 0.35)
     axes = fig.subplots(len(drawn), 1, squeeze=False, height_ratios=heights_in)[:, 0]
     for ax, (title, table) in zip(axes, drawn, strict=True):
         _draw_round(ax, title, table)
     axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
-    present = {row.role for _, table in drawn for row in rows(table)}
+    present = {row.role for _, table in drawn for row in st.rows(table)}
     handles = [
         Patch(facecolor=colour, alpha=alpha, label=words)
         for role, (words, colour, alpha) in _ROLES.items()
         if role in present
     ]
     if any((table["status"] == "screened").any() for _, table in drawn):
-        handles.append(Patch(facecolor="none", edgecolor=MUTED, label="predicted, not fitted"))
-    page_legend(fig, handles, len(handles), handlelength=1.3)
+        handles.append(Patch(facecolor="none", edgecolor=st.MUTED, label="predicted, not fitted"))
+    st.page_legend(fig, handles, len(handles), handlelength=1.3)
     return fig
 
 
 def _drawable(table: pd.DataFrame) -> pd.DataFrame:
     """Rows with a finite gain or score and their roles: the answer set first, then by bar length; twelve at most."""
-    gain = np.sqrt(np.maximum(column(table, "delta_chi2"), 0.0))
-    score = np.abs(column(table, "sigma"))
+    gain = np.sqrt(np.maximum(st.column(table, "delta_chi2"), 0.0))
+    score = np.abs(st.column(table, "sigma"))
     # A predicted gain may have the wrong sign of the parameter or too small a noise; the score accounts for both.
     fitted = (table["status"] == "refitted").to_numpy() & np.isfinite(gain)
     height = np.where(fitted | ~np.isfinite(score), gain, score)
@@ -237,17 +213,17 @@ def _drawable(table: pd.DataFrame) -> pd.DataFrame:
 
 def _draw_round(ax: Axes, title: str, table: pd.DataFrame) -> None:
     longest = max(float(table["height"].max()), 1.0)
-    for i, row in enumerate(rows(table)):
+    for i, row in enumerate(st.rows(table)):
         colour = _ROLES[row.role][1]
         fill = colour if row.status == "refitted" else "none"
         alpha = None if row.in_answer_set else 0.75
         ax.barh(i, row.height, height=0.62, color=fill, edgecolor=colour, lw=1.2, alpha=alpha)
         words = " ".join(part for part in (row.size, "" if row.plausible else "(not plausible)") if part)
         if words:
-            style: dict[str, Any] = {"va": "center", "fontsize": 9, "color": INK if row.in_answer_set else MUTED}
+            style: dict[str, Any] = {"va": "center", "fontsize": 9, "color": st.INK if row.in_answer_set else st.MUTED}
             words = textwrap.shorten(words, 62, placeholder="…")
             ax.annotate(words, (row.height, i), (5, 0), textcoords="offset points", **style)
-    names_on_axis(ax, "y", [str(name).replace("_", " ") for name in table["effect"]])
+    st.names_on_axis(ax, "y", [str(name).replace("_", " ") for name in table["effect"]])
     for label, chosen in zip(ax.get_yticklabels(), table["in_answer_set"], strict=True):
         label.set_fontweight("bold" if chosen else "normal")
     ax.set(ylim=(len(table) - 0.4, -0.6), xlim=(0, 1.75 * longest))
@@ -267,32 +243,32 @@ def draw_cosines(cosines: pd.DataFrame) -> Figure | None:
     # 22 cells of 0.36 in, which hold two digits of 7.5 pt, make a square of 8 in.
     effects = list(dict.fromkeys([*cosines["other"], *cosines["effect"]]))[:22]
     place, n = {name: i for i, name in enumerate(effects)}, len(effects)
-    fig = new_figure(0.36 * n + 2.3, 0.36 * n + 2.0)
+    fig = st.new_figure(0.36 * n + 2.3, 0.36 * n + 2.0)
     ax = fig.add_subplot()
     for effect, other, value in cosines.itertuples(index=False):
         if effect not in place or other not in place or not math.isfinite(value):
             continue
         i, j = place[effect], place[other]
-        colour, tied = BLUE if value > 0 else VERMILLION, abs(value) >= TIED_COSINE
+        colour, tied = st.BLUE if value > 0 else st.VERMILLION, abs(value) >= TIED_COSINE
         alpha = min(abs(value), 1.0) ** 2 * 0.8
         ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=colour, alpha=alpha, lw=0))
         if tied:
-            ax.add_patch(Rectangle((j - 0.45, i - 0.45), 0.9, 0.9, facecolor="none", edgecolor=INK, lw=1.4))
-        words = with_minus(value, ".2f").replace("0.", ".", 1)
+            ax.add_patch(Rectangle((j - 0.45, i - 0.45), 0.9, 0.9, facecolor="none", edgecolor=st.INK, lw=1.4))
+        words = st.with_minus(value, ".2f").replace("0.", ".", 1)
         ax.text(j, i, words, ha="center", va="center", fontsize=7.5, fontweight="bold" if tied else "normal")
     names = [str(name).replace("_", " ") for name in effects]
-    size = min(fitting_size(name, 115, 9, bold=False) for name in names)
+    size = min(st.fitting_size(name, 115, 9, bold=False) for name in names)
     ax.set_xticks(range(n - 1), names[:-1], rotation=55, ha="right", rotation_mode="anchor", fontsize=size)
     ax.set_yticks(range(1, n), names[1:], fontsize=size)
     ax.set(xlim=(-0.5, n - 1.5), ylim=(n - 0.5, 0.5), aspect="equal")
     ax.tick_params(length=0)
     ax.grid(visible=False)
-    small_title(ax, f"cosine; framed: tied (|cos| ≥ {TIED_COSINE:g})")
+    st.small_title(ax, f"cosine; framed: tied (|cos| ≥ {TIED_COSINE:g})")
     return fig
 
 
 # Colour, line and offset of the models in the figure of drifts
-_MODELS = {"before": (BEFORE, DASHED, -0.06), "after": (AFTER, "-", 0.06)}
+_MODELS = {"before": (BEFORE, st.DASHED, -0.06), "after": (AFTER, "-", 0.06)}
 
 
 @figure("drift", "drift", "Parameters that change with a condition", data="drift")
@@ -308,20 +284,20 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
     shown = known[known["model"] == "before"] if (known["model"] == "before").any() else known
     panels = list(dict.fromkeys(zip(shown["parameter"], shown["against"], strict=True)))[:6]
     vines = [vine for vine in dict.fromkeys(known["vine"]) if vine]
-    markers = {vine: VINE_MARKERS[i % len(VINE_MARKERS)] for i, vine in enumerate(vines)} | {"": "o"}
+    markers = {vine: st.VINE_MARKERS[i % len(st.VINE_MARKERS)] for i, vine in enumerate(vines)} | {"": "o"}
     n_columns = min(len(panels), 3)
-    fig = new_figure(1.0 + 3.2 * n_columns, 0.9 + 2.6 * math.ceil(len(panels) / n_columns))
-    for ax, (parameter, against) in zip(panel_grid(fig, len(panels), n_columns), panels, strict=True):
+    fig = st.new_figure(1.0 + 3.2 * n_columns, 0.9 + 2.6 * math.ceil(len(panels) / n_columns))
+    for ax, (parameter, against) in zip(st.panel_grid(fig, len(panels), n_columns), panels, strict=True):
         chosen = known[(known["parameter"] == parameter) & (known["against"] == against)]
         _draw_drift_panel(ax, chosen, str(against), markers)
     fig.supylabel("value / common law", fontsize=11)
     handles = [
-        line_key(f"{model}: with {added}" if model == "after" and added else model, color=colour, marker="o", ms=5)
+        st.line_key(f"{model}: with {added}" if model == "after" and added else model, color=colour, marker="o", ms=5)
         for model, (colour, _, _) in _MODELS.items()
         if (known["model"] == model).any()
     ]
-    handles += [line_key(vine, color=MUTED, marker=markers[vine], ls="none") for vine in vines]
-    page_legend(fig, handles[:10], min(len(handles), 4))
+    handles += [st.line_key(vine, color=st.MUTED, marker=markers[vine], ls="none") for vine in vines]
+    st.page_legend(fig, handles[:10], min(len(handles), 4))
     return fig
 
 
@@ -341,13 +317,13 @@ def _draw_drift_panel(ax: Axes, groups: pd.DataFrame, against: str, markers: dic
         for vine, of_vine in [("", of_model)] if by_vine else of_model.groupby("vine", sort=False):
             ordered = of_vine.sort_values("level")
             places = np.array([names.index(name) for name in ordered["vine"]], dtype=float) + offset
-            x = places if by_vine else column(ordered, "level", factor)
+            x = places if by_vine else st.column(ordered, "level", factor)
             style: dict[str, Any] = {"color": colour, "marker": markers.get(str(vine), "o"), "ms": 5, "elinewidth": 1.0}
             ls = "none" if by_vine else line
             ax.errorbar(x, ordered["ratio"], ordered["ratio_sigma"], lw=1.1, ls=ls, **style)
-    ax.axhline(1, color=INK, lw=0.8)
+    ax.axhline(1, color=st.INK, lw=0.8)
     count = int(groups.loc[groups["model"] == groups["model"].iloc[0], "n_trials"].sum())
-    small_title(ax, f"{groups['symbol'].iloc[0]} against {name}, N = {count}", fontsize=9.5)
+    st.small_title(ax, f"{groups['symbol'].iloc[0]} against {name}, N = {count}", fontsize=9.5)
     ax.set_xlabel(f"{name} ({unit})" if unit else name, fontsize=10)
     if by_vine:
         ax.set_xticks(range(len(names)), names, fontsize=8)
@@ -369,7 +345,7 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     from matplotlib.patches import Patch
 
     names = {"misfit_before_m": "before", "misfit_after_m": f"after: with {added}" if added else "after"}
-    shown = [c for c in names if len(where) and np.isfinite(column(where, c)).any()]
+    shown = [c for c in names if len(where) and np.isfinite(st.column(where, c)).any()]
     if not shown:
         return None
     known_mm = 1e3 * np.abs(where[shown].to_numpy(dtype=float))
@@ -380,10 +356,10 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     largest = set(square.sort_values(ascending=False, kind="stable").index[:48])
     labels = [str(label) for label in counts.index if label in largest]
     numbered = len(labels) <= 26  # with more, the figure is scaled down until numbers of 7.5 pt cannot be read
-    fig = new_figure(2.6 + 4.3 * len(shown), 0.3 * len(labels) + 1.75)
+    fig = st.new_figure(2.6 + 4.3 * len(shown), 0.3 * len(labels) + 1.75)
     axes = fig.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for ax, name in zip(axes, shown, strict=True):
-        _draw_cells(ax, where.assign(misfit_mm=column(where, name, 1e3)), labels, full_mm, numbered)
+        _draw_cells(ax, where.assign(misfit_mm=st.column(where, name, 1e3)), labels, full_mm, numbered)
         ax.set_title(names[name], fontsize=10)
         ax.set_xlabel("along the growth (%)")
     axes[0].set_yticks(range(len(labels)), [f"{label}, N = {int(counts[label])}" for label in labels], fontsize=9)
@@ -391,12 +367,12 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     handles = [
         Patch(facecolor=AHEAD, alpha=0.85, label="measured is ahead of the model"),
         Patch(facecolor=BEHIND, alpha=0.85, label="measured is behind"),
-        Patch(facecolor=MUTED, alpha=0.2, label=words),
+        Patch(facecolor=st.MUTED, alpha=0.2, label=words),
     ]
     if len(counts) > len(labels):
         words = f"the {len(labels)} of {len(counts)} conditions with the largest misfit"
         handles.append(Patch(alpha=0.0, label=words))
-    page_legend(fig, handles, 3 if len(shown) > 1 else 2, handlelength=1.3)
+    st.page_legend(fig, handles, 3 if len(shown) > 1 else 2, handlelength=1.3)
     return fig
 
 
@@ -404,7 +380,7 @@ def _draw_cells(ax: Axes, table: pd.DataFrame, labels: Sequence[str], full_mm: f
     """One row of cells a condition; they become transparent with decreasing misfit, so that the page shows through."""
     from matplotlib.patches import Rectangle
 
-    for row in rows(table):
+    for row in st.rows(table):
         if row.condition_label not in labels or not np.isfinite(row.misfit_mm):
             continue
         y = labels.index(row.condition_label)
@@ -414,8 +390,8 @@ def _draw_cells(ax: Axes, table: pd.DataFrame, labels: Sequence[str], full_mm: f
         ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, **cell))
         beyond = not abs(row.misfit_mm) <= 2e3 * row.scatter_m  # an unknown scatter (NaN) explains no misfit
         if numbered and beyond and depth > 0.06:
-            words = with_minus(row.misfit_mm, "+.0f" if abs(row.misfit_mm) >= 9.95 else "+.1f")
-            ax.text(left + width / 2, y, words, ha="center", va="center", fontsize=7.5, color=INK)
+            words = st.with_minus(row.misfit_mm, "+.0f" if abs(row.misfit_mm) >= 9.95 else "+.1f")
+            ax.text(left + width / 2, y, words, ha="center", va="center", fontsize=7.5, color=st.INK)
     ax.set(xlim=(0, 100), ylim=(len(labels) - 0.45, -0.55))
     ax.grid(visible=False)
     ax.tick_params(axis="y", length=0)
@@ -442,20 +418,20 @@ def draw_missing_force(missing_force: pd.DataFrame) -> Figure | None:
     if not panels:
         return None
     n_columns = min(len(panels), 2)
-    fig = new_figure(1.0 + 4.0 * n_columns, 0.5 + 2.7 * math.ceil(len(panels) / n_columns))
-    for ax, against in zip(panel_grid(fig, len(panels), n_columns, sharey=True), panels, strict=True):
+    fig = st.new_figure(1.0 + 4.0 * n_columns, 0.5 + 2.7 * math.ceil(len(panels) / n_columns))
+    for ax, against in zip(st.panel_grid(fig, len(panels), n_columns, sharey=True), panels, strict=True):
         words, factor = _FORCE_AXES[against]
         points = missing_force[missing_force["against"] == against].sort_values("value")
         single, mean = points[points["condition"] != ""], points[points["condition"] == ""]
         for _, curve in single.groupby("condition", sort=False):
-            ax.plot(factor * curve["value"], curve["force_N"], color=MUTED, lw=0.9, alpha=0.8)
+            ax.plot(factor * curve["value"], curve["force_N"], color=st.MUTED, lw=0.9, alpha=0.8)
         if len(mean):
-            style: dict[str, Any] = {"color": BLUE, "marker": "o", "ms": 4, "lw": 1.5, "elinewidth": 1}
-            ax.errorbar(factor * mean["value"], mean["force_N"], np.nan_to_num(column(mean, "sigma_N")), **style)
-        ax.axhline(0, color=INK, lw=0.8)
+            style: dict[str, Any] = {"color": st.BLUE, "marker": "o", "ms": 4, "lw": 1.5, "elinewidth": 1}
+            ax.errorbar(factor * mean["value"], mean["force_N"], np.nan_to_num(st.column(mean, "sigma_N")), **style)
+        ax.axhline(0, color=st.INK, lw=0.8)
         ax.set_xlabel(words)
         if len(single):
-            small_title(ax, f"N = {single['condition'].nunique()} conditions", color=MUTED)
+            st.small_title(ax, f"N = {single['condition'].nunique()} conditions", color=st.MUTED)
     fig.supylabel("missing force (N)", fontsize=11)
     return fig
 
@@ -479,15 +455,15 @@ def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     on_grid = learned_force["condition"].fillna("") == ""
     grid, along = learned_force[on_grid], learned_force[~on_grid]
     if len(variables) == 1:
-        fig = new_figure(6.4, 3.6)
+        fig = st.new_figure(6.4, 3.6)
         _draw_curve(fig.subplots(), grid, along, variables[0])
-        page_legend(fig, None, 3)
+        st.page_legend(fig, None, 3)
         return fig
-    fig = new_figure(9.6, 4.4)
+    fig = st.new_figure(9.6, 4.4)
     left, right = fig.subplots(1, 2, sharex=True, sharey=True)
     _draw_map(left, grid, along, variables, "force_N", "missing force (N)")
     _draw_map(right, grid, along, variables, "sigma_N", "its standard error (N)")
-    small_title(left, f"grey: trials, N = {along['condition'].nunique()} conditions", color=MUTED)
+    st.small_title(left, f"grey: trials, N = {along['condition'].nunique()} conditions", color=st.MUTED)
     right.set_ylabel("")
     return fig
 
@@ -495,15 +471,17 @@ def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
 def _draw_curve(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variable: str) -> None:
     words, factor = _FORCE_AXES[variable]
     seen = grid[grid["trials"] > 0].sort_values(variable)
-    at, force, half = column(seen, variable, factor), column(seen, "force_N"), column(seen, "sigma_N", 1.96)
-    band(ax, at, force - half, force + half, BLUE, label="95 % band")
-    ax.plot(at, force, color=BLUE, lw=1.8, label="learned force")
-    ax.axhline(0, color=INK, lw=0.8)
+    at, force, half = st.column(seen, variable, factor), st.column(seen, "force_N"), st.column(seen, "sigma_N", 1.96)
+    st.band(ax, at, force - half, force + half, st.BLUE, label="95 % band")
+    ax.plot(at, force, color=st.BLUE, lw=1.8, label="learned force")
+    ax.axhline(0, color=st.INK, lw=0.8)
     places, label = (
-        column(along, variable, factor),
+        st.column(along, variable, factor),
         f"range of the trials, N = {along['condition'].nunique()} conditions",
     )
-    ax.plot(places, np.full(places.size, 0.02), "|", color=MUTED, ms=6, transform=ax.get_xaxis_transform(), label=label)
+    ax.plot(
+        places, np.full(places.size, 0.02), "|", color=st.MUTED, ms=6, transform=ax.get_xaxis_transform(), label=label
+    )
     ax.set(xlabel=words, ylabel="missing force (N)")
     ax.margins(x=0.01)
 
@@ -519,17 +497,17 @@ def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list
     x, y = x_factor * wide[name].columns.to_numpy(float), y_factor * wide[name].index.to_numpy(float)
     signed = name == "force_N"
     most = max(float(np.nanmax(np.abs(values))), 1e-12)
-    colours = (VERMILLION, "#ffffff", BLUE) if signed else ("#ffffff", MUTED)
+    colours = (st.VERMILLION, "#ffffff", st.BLUE) if signed else ("#ffffff", st.MUTED)
     levels = MaxNLocator(22 if signed else 11).tick_values(-most if signed else 0.0, most)
     colour_map = LinearSegmentedColormap.from_list("force", colours)
     filled = ax.contourf(x, y, values, levels=levels, cmap=colour_map, alpha=0.85)
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if high > low:
-        lines = ax.contour(x, y, values, levels=np.linspace(low, high, 7)[1:-1], colors=INK, linewidths=0.7)
-        ax.clabel(lines, fmt=lambda force: with_minus(force, ".2g"), fontsize=8)
+        lines = ax.contour(x, y, values, levels=np.linspace(low, high, 7)[1:-1], colors=st.INK, linewidths=0.7)
+        ax.clabel(lines, fmt=lambda force: st.with_minus(force, ".2g"), fontsize=8)
     for _, course in along.groupby("condition", sort=False):
         at = x_factor * course[variables[0]], y_factor * course[variables[1]]
-        ax.plot(*at, color=MUTED, lw=0.5, alpha=0.7)
+        ax.plot(*at, color=st.MUTED, lw=0.5, alpha=0.7)
     ax.figure.colorbar(filled, ax=ax).set_label(label)
     ax.set(xlabel=x_words, ylabel=y_words, xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.grid(visible=False)
@@ -588,7 +566,7 @@ def assemble_tables(
     located: pd.DataFrame,
     drifting: pd.DataFrame,
     force: pd.DataFrame,
-    learned: pd.DataFrame | None = None,
+    learned: pd.DataFrame,
 ) -> DiagnosisTables:
     """Assemble the data of the figures."""
     import pandas as pd
@@ -610,7 +588,7 @@ def assemble_tables(
         rounds=rounds,
         worst=labels.get(worst, worst),
         added=listed_names(diagnosis.effects),
-        learned_force=pd.DataFrame() if learned is None else learned,
+        learned_force=learned,
     )
 
 

@@ -9,42 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected
+from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected, with_flag
 from vinetrack.core.units import with_error
+from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
-from vinetrack.figures.style import (
-    DASHED,
-    GREEN,
-    GRID,
-    INK,
-    MUTED,
-    RULE_COLOURS,
-    RULE_NAMES,
-    VERMILLION,
-    band,
-    column,
-    corner_text,
-    fitting_size,
-    look,
-    names_on_axis,
-    new_figure,
-    page_columns,
-    page_labels,
-    panel_font,
-    panel_grid,
-    plain_log_ticks,
-    rows,
-    small_title,
-    thinned,
-    vine_styles,
-)
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-MAX_CONDITION_PANELS = 60  # Chosen: in rows of nine they are 1.2 in wide, the narrowest that has room for its label
 
 # ------------------------------------------------------------------------------
 # All trials: speed against growth in small panels, replicates superposed, steady windows thick.
@@ -65,9 +38,10 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     n_points = min(max(12_000 // len(tables), 15), 150)  # 12,000 points in all keep the SVG below a megabyte
     curves = {}
     for name, table in tables.items():
-        part = thinned(table, n_points)
+        part = st.thinned(table, n_points)
         curves[name] = part.assign(growth_mm=1e3 * (part["lead_position_m"] - part["lead_position_m"].min()))
-    by_condition = shown["condition"].nunique() <= MAX_CONDITION_PANELS
+    # 60 (chosen): in rows of nine they are 1.2 in wide, the narrowest that has room for its label
+    by_condition = shown["condition"].nunique() <= 60
     if by_condition:
         order = {name: i for i, name in enumerate(dict.fromkeys(shown["vine"]))}
         ordered = shown.assign(order=shown["vine"].map(order)).sort_values(["order", "pressure_kPa"], kind="stable")
@@ -75,11 +49,11 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
         panels = [(str(part["condition_label"].iloc[0]), part) for _, part in groups]
     else:
         panels = [(str(vine), part) for vine, part in shown.groupby("vine", sort=False)][:max_panels]
-    n_columns = page_columns(len(panels), 10)
-    font = panel_font(n_columns)
+    n_columns = st.page_columns(len(panels), 10)
+    font = st.panel_font(n_columns)
     row_in = min(max(0.72 * 11.0 / n_columns, 1.15), 3.6)
-    fig = new_figure(11.0, math.ceil(len(panels) / n_columns) * row_in + 1.15)
-    axes = panel_grid(fig, len(panels), n_columns, sharex=True, sharey=not by_condition)
+    fig = st.new_figure(11.0, math.ceil(len(panels) / n_columns) * row_in + 1.15)
+    axes = st.panel_grid(fig, len(panels), n_columns, sharex=True, sharey=not by_condition)
     colours = _colours(fig, shown, by_condition)
     for ax, (label, part) in zip(axes, panels, strict=True):
         _draw_panel(ax, label, part, curves, colours, font)
@@ -95,7 +69,7 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     title = f"{len(curves)} {'trial' if len(curves) == 1 else 'trials'}, {what}; thick: steady by the gated rule"
     title += f"; {missing} without positions" if missing else ""
     title += f"; the first {max_panels} panels" if len(panels) == max_panels else ""
-    page_labels(fig, "growth (mm)", "leading-edge speed (m/s)", title)
+    st.page_labels(fig, "growth (mm)", "leading-edge speed (m/s)", title)
     return fig
 
 
@@ -105,13 +79,13 @@ def _colours(fig: Figure, trials: pd.DataFrame, by_condition: bool) -> dict[str,
     from matplotlib.colors import Normalize
 
     if by_condition:
-        styles = vine_styles(trials["vine"])
-        return {row.trial: styles[row.vine].colour for row in rows(trials)}
+        styles = st.vine_styles(trials["vine"])
+        return {row.trial: styles[row.vine].colour for row in st.rows(trials)}
     scale = ScalarMappable(Normalize(trials["pressure_kPa"].min(), trials["pressure_kPa"].max()), "cividis")
     bar = fig.colorbar(scale, ax=fig.axes, fraction=0.02, pad=0.01, aspect=40)
     bar.set_label("pressure (kPa)")
     bar.outline.set_visible(False)
-    return {row.trial: scale.to_rgba(row.pressure_kPa) for row in rows(trials)}
+    return {row.trial: scale.to_rgba(row.pressure_kPa) for row in st.rows(trials)}
 
 
 def _draw_panel(
@@ -122,7 +96,7 @@ def _draw_panel(
     colours: Mapping[str, Any],
     font: float,
 ) -> None:
-    for row in rows(trials):
+    for row in st.rows(trials):
         if row.trial not in curves:
             continue
         curve, colour = curves[row.trial], colours[row.trial]
@@ -131,11 +105,11 @@ def _draw_panel(
         if len(steady) > 1:
             at = steady["growth_mm"], steady["lead_velocity_m_s"]
             ax.plot(*at, color=colour, lw=2.2, solid_capstyle="butt")
-    small_title(ax, textwrap.shorten(label, 30, placeholder="…") if font > 8 else label, fontsize=font, pad=3)
-    corner_text(ax, 0.98, 0.05, f"N = {len(trials)}", ha="right", fontsize=font - 1)
+    st.small_title(ax, textwrap.shorten(label, 30, placeholder="…") if font > 8 else label, fontsize=font, pad=3)
+    st.corner_text(ax, 0.98, 0.05, f"N = {len(trials)}", ha="right", fontsize=font - 1)
     if n_failed := int((trials["status"] == "failed").sum()):
-        corner_text(ax, 0.98, 0.2, f"{n_failed} failed", ha="right", fontsize=font - 1, color=VERMILLION)
-    ax.tick_params(labelsize=font - 0.5, colors=INK)
+        st.corner_text(ax, 0.98, 0.2, f"{n_failed} failed", ha="right", fontsize=font - 1, color=st.VERMILLION)
+    ax.tick_params(labelsize=font - 0.5, colors=st.INK)
     ax.locator_params(nbins=4)
 
 
@@ -144,7 +118,7 @@ def _limit_speed(ax: Axes, curves: Sequence[pd.DataFrame], logarithmic: bool = F
     if not curves:
         ax.set_yticks([])
         return
-    speeds_m_s = [column(curve, "lead_velocity_m_s") for curve in curves]
+    speeds_m_s = [st.column(curve, "lead_velocity_m_s") for curve in curves]
     speed_m_s = np.concatenate(speeds_m_s)
     moving_m_s = speed_m_s[speed_m_s > 0]
     top = float(np.percentile(moving_m_s, 99)) if moving_m_s.size else 1.0
@@ -152,7 +126,7 @@ def _limit_speed(ax: Axes, curves: Sequence[pd.DataFrame], logarithmic: bool = F
         medians = [float(np.nanmedian(of_curve)) for of_curve in speeds_m_s]
         ax.set_yscale("log")
         ax.set_ylim(0.5 * min(median for median in medians if median > 0), 1.5 * top)
-        plain_log_ticks(ax, "y")
+        st.plain_log_ticks(ax, "y")
     else:
         ax.set_ylim(0, 1.15 * top)
 
@@ -164,24 +138,22 @@ def _limit_speed(ax: Axes, curves: Sequence[pd.DataFrame], logarithmic: bool = F
 # text below; their x_ss is drawn across the curve where it was measured.
 
 
-@look()
+@st.look()
 def draw_trial_motion(
     title: str, track: pd.DataFrame, kinematics: pd.DataFrame, windows: pd.DataFrame, travel_ratio: float = 2.0
 ) -> Figure | None:
     """Draw one trial."""
     if kinematics.empty:
         return None
-    flags = track["flag"].fillna("").astype(str)
-    unusable = flags.map(lambda flag: bool(UNUSABLE_FLAGS.intersection(flag.split(";")))).to_numpy(dtype=bool)
-    by_hand = hand_corrected(track["flag"].fillna(""))
+    unusable, by_hand = with_flag(track["flag"], *UNUSABLE_FLAGS), hand_corrected(track["flag"])
     counts = f"{len(kinematics)} points"
     counts += f", {unusable.sum()} left out (×)" if unusable.any() else ""
     counts += f", {by_hand.sum()} corrected by hand (○)" if by_hand.any() else ""
-    notes = [(MUTED, counts), *(line for row in rows(windows) for line in _verdict(row))]
+    notes = [(st.MUTED, counts), *(line for row in st.rows(windows) for line in _verdict(row))]
     line_in = 0.175  # of 8.8 pt
     text_in, strip_in = line_in * len(notes) + 0.1, 0.24 * max(len(windows), 1)
     height_in = 1.75 + 2.1 + strip_in + text_in + 1.2
-    fig = new_figure(7.2, height_in, layout=None)
+    fig = st.new_figure(7.2, height_in, layout=None)
 
     def row_of_axes(bottom_in: float, tall_in: float, **keywords: Any) -> Axes:
         return fig.add_axes((0.125, bottom_in / height_in, 0.765, tall_in / height_in), **keywords)
@@ -194,7 +166,7 @@ def draw_trial_motion(
         ax.yaxis.set_label_coords(-0.095, 0.5)
     strip.xaxis.set_label_coords(0.5, -0.29 / strip_in)
     _draw_position(lead, track, kinematics, unusable, by_hand)
-    lead.set_title(title, pad=8, fontsize=fitting_size(title, 0.8 * 72 * 7.2, 11))
+    lead.set_title(title, pad=8, fontsize=st.fitting_size(title, 0.8 * 72 * 7.2, 11))
     _draw_speed(speed, kinematics, windows, travel_ratio)
     _draw_strip(strip, windows)
     _share_ticks(strip, (lead, speed))
@@ -211,36 +183,38 @@ def _share_ticks(below: Axes, above: Sequence[Axes]) -> None:
     for ax in above:
         ax.xaxis.set_visible(False)
         across = ax.get_xaxis_transform()
-        ax.vlines(ticks, 0, 1, color=GRID, lw=0.7, zorder=0.5, transform=across)
+        ax.vlines(ticks, 0, 1, color=st.GRID, lw=0.7, zorder=0.5, transform=across)
         ax.plot(
-            ticks, [0] * len(ticks), ls="none", marker=3, ms=3.5, mew=0.8, color=INK, transform=across, clip_on=False
+            ticks, [0] * len(ticks), ls="none", marker=3, ms=3.5, mew=0.8, color=st.INK, transform=across, clip_on=False
         )
 
 
 def _draw_position(
     ax: Axes, track: pd.DataFrame, kinematics: pd.DataFrame, unusable: np.ndarray, by_hand: np.ndarray
 ) -> None:
-    time_s, position_mm = column(track, "time_s"), column(track, "lead_position_m", 1e3)
+    time_s, position_mm = st.column(track, "time_s"), st.column(track, "lead_position_m", 1e3)
     step = max(len(track) // 300, 1)
-    ax.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=MUTED, ms=3.5, mew=0)
+    ax.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=st.MUTED, ms=3.5, mew=0)
     if (unusable & np.isfinite(position_mm)).any():
-        ax.plot(time_s[unusable], position_mm[unusable], "x", color=VERMILLION, ms=4, mew=1)
+        ax.plot(time_s[unusable], position_mm[unusable], "x", color=st.VERMILLION, ms=4, mew=1)
     if by_hand.any():
-        ax.plot(time_s[by_hand], position_mm[by_hand], "o", color=GREEN, ms=4, fillstyle="none", mew=1)
-    ax.plot(kinematics["time_s"], 1e3 * kinematics["lead_position_m"], "-", color=INK, lw=1.1)
+        ax.plot(time_s[by_hand], position_mm[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", mew=1)
+    ax.plot(kinematics["time_s"], 1e3 * kinematics["lead_position_m"], "-", color=st.INK, lw=1.1)
     ax.set_ylabel("leading edge (mm)")
 
 
 def _draw_speed(ax: Axes, kinematics: pd.DataFrame, windows: pd.DataFrame, travel_ratio: float) -> None:
-    time_s, speed_m_s = column(kinematics, "time_s"), column(kinematics, "lead_velocity_m_s")
-    two_sigma_m_s = column(kinematics, "lead_velocity_sigma_m_s", 2.0)
-    band(ax, time_s, speed_m_s - two_sigma_m_s, speed_m_s + two_sigma_m_s, MUTED, 0.28)
-    ax.plot(time_s, speed_m_s, color=INK, lw=1.3)
-    for row in rows(windows):
+    time_s, speed_m_s = st.column(kinematics, "time_s"), st.column(kinematics, "lead_velocity_m_s")
+    two_sigma_m_s = st.column(kinematics, "lead_velocity_sigma_m_s", 2.0)
+    st.band(ax, time_s, speed_m_s - two_sigma_m_s, speed_m_s + two_sigma_m_s, st.MUTED, 0.28)
+    ax.plot(time_s, speed_m_s, color=st.INK, lw=1.3)
+    for row in st.rows(windows):
         if np.isfinite(row.x_ss_m_s):
             level = row.x_ss_m_s / travel_ratio
             style = "-" if row.accepted else (0, (1.5, 1.2))
-            ax.plot([row.from_s, row.to_s], [level, level], color=RULE_COLOURS[row.rule], ls=style, lw=3.2, alpha=0.9)
+            ax.plot(
+                [row.from_s, row.to_s], [level, level], color=st.RULE_COLOURS[row.rule], ls=style, lw=3.2, alpha=0.9
+            )
     ax.set_ylim(*_speed_limits(speed_m_s, two_sigma_m_s))
     ax.set_ylabel("leading edge (m/s)")
     if travel_ratio != 1:
@@ -270,14 +244,14 @@ def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[flo
 def _draw_strip(ax: Axes, windows: pd.DataFrame) -> None:
     ax.set_xlabel("time (s)")
     ax.set_ylim(len(windows) - 0.4, -0.6)
-    names_on_axis(ax, "y", ["by hand" if rule == "user" else rule for rule in windows["rule"]], fontsize=9)
-    for i, row in enumerate(rows(windows)):
-        colour = RULE_COLOURS[row.rule]
+    st.names_on_axis(ax, "y", ["by hand" if rule == "user" else rule for rule in windows["rule"]], fontsize=9)
+    for i, row in enumerate(st.rows(windows)):
+        colour = st.RULE_COLOURS[row.rule]
         if np.isfinite(row.from_s) and np.isfinite(row.to_s):
             fill = colour if row.accepted else "none"
             ax.barh(i, row.to_s - row.from_s, left=row.from_s, height=0.56, color=fill, edgecolor=colour, lw=1.3)
         else:
-            ax.axhline(i, color=GRID, lw=1, ls=":")
+            ax.axhline(i, color=st.GRID, lw=1, ls=":")
 
 
 def _verdict(row: Any) -> list[tuple[str, str]]:
@@ -287,10 +261,10 @@ def _verdict(row: Any) -> list[tuple[str, str]]:
         parts.append(f"x_ss {with_error(row.x_ss_m_s, row.x_ss_sigma_m_s)} m/s (tail)")
     if isinstance(row.reason, str) and row.reason:
         parts.append(row.reason)
-    sentence = f"{RULE_NAMES[row.rule]}: " + ", ".join(parts)
+    sentence = f"{st.RULE_NAMES[row.rule]}: " + ", ".join(parts)
     unbroken = sentence.replace(" %", "\N{NO-BREAK SPACE}%").replace(" m/s", "\N{NO-BREAK SPACE}m/s")
     lines = textwrap.wrap(unbroken, 106, subsequent_indent="    ", max_lines=2)
-    return [(RULE_COLOURS[row.rule], line) for line in lines]
+    return [(st.RULE_COLOURS[row.rule], line) for line in lines]
 
 
 # ------------------------------------------------------------------------------
@@ -332,36 +306,36 @@ def _model_panels(
     y_label: str,
     if_added: str,
 ) -> Figure | None:
-    known = [row for row in rows(comparison) if row.condition in trajectories]
+    known = [row for row in st.rows(comparison) if row.condition in trajectories]
     farthest = sorted(known, key=lambda row: -np.nan_to_num(row.rms_position_m))[:60]  # in rows of eight, 1.4 in wide
     chosen = {row.condition for row in farthest}
     shown = [row for row in known if row.condition in chosen]
     if not shown:
         return None
-    n_columns = page_columns(len(shown), 8)
+    n_columns = st.page_columns(len(shown), 8)
     n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
     n_points = min(max(12_000 // n_trials, 25), 150)
-    styles = vine_styles([row.vine for row in shown])
-    font = panel_font(n_columns)
+    styles = st.vine_styles([row.vine for row in shown])
+    font = st.panel_font(n_columns)
     panel_in = min(11.0 / n_columns, 6.0)
     row_in = min(max(0.78 * panel_in, 1.35), 3.6)
-    fig = new_figure(n_columns * panel_in, math.ceil(len(shown) / n_columns) * row_in + 0.95)
-    for ax, row in zip(panel_grid(fig, len(shown), n_columns), shown, strict=True):
+    fig = st.new_figure(n_columns * panel_in, math.ceil(len(shown) / n_columns) * row_in + 0.95)
+    for ax, row in zip(st.panel_grid(fig, len(shown), n_columns), shown, strict=True):
         parts = _moving(trajectories[row.condition], n_points)
         draw(ax, parts, styles[row.vine].colour)
         label = str(row.condition_label)
-        small_title(ax, label, fontsize=fitting_size(label, 72 * (panel_in - 0.45), font, bold=False), pad=3)
+        st.small_title(ax, label, fontsize=st.fitting_size(label, 72 * (panel_in - 0.45), font, bold=False), pad=3)
         times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
         words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {len(parts)}"
-        corner_text(ax, words=words, fontsize=font - 1.5, **corner)
-        ax.tick_params(labelsize=font - 0.5, colors=INK)
+        st.corner_text(ax, words=words, fontsize=font - 1.5, **corner)
+        ax.tick_params(labelsize=font - 0.5, colors=st.INK)
         ax.locator_params(nbins=4)
     title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
     if "model_after_m" in trajectories[shown[0].condition]:
         title += if_added
     if len(known) > len(shown):
         title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
-    page_labels(fig, x_label, y_label, textwrap.fill(title, int(n_columns * panel_in * 11)))
+    st.page_labels(fig, x_label, y_label, textwrap.fill(title, int(n_columns * panel_in * 11)))
     return fig
 
 
@@ -369,10 +343,10 @@ def _moving(table: pd.DataFrame, n_points: int) -> list[pd.DataFrame]:
     """Each trial from shortly before model or measurement moves, thinned for a small panel."""
     parts = []
     for _, part in table.groupby("trial", sort=False):
-        time_s, growth_m = column(part, "time_s"), column(part, "lead_position_m")
+        time_s, growth_m = st.column(part, "time_s"), st.column(part, "lead_position_m")
         begun = growth_m >= growth_m[0] + 0.01 * (np.max(growth_m) - growth_m[0])
         first_s = min(0.0, float(np.min(time_s[begun])))
-        parts.append(thinned(part[time_s >= first_s - 0.05 * (time_s[-1] - first_s)], n_points))
+        parts.append(st.thinned(part[time_s >= first_s - 0.05 * (time_s[-1] - first_s)], n_points))
     return parts
 
 
@@ -382,21 +356,21 @@ def _longest(parts: list[pd.DataFrame]) -> pd.DataFrame:
 
 def _draw_positions(ax: Axes, parts: list[pd.DataFrame], colour: str) -> None:
     longest = _longest(parts)
-    time_ms = column(longest, "time_s", 1e3)
-    mean_mm, sigma_mm = column(longest, "replicates_mean_m", 1e3), column(longest, "replicates_sigma_m", 1e3)
-    band(ax, time_ms, mean_mm - sigma_mm, mean_mm + sigma_mm, colour)
+    time_ms = st.column(longest, "time_s", 1e3)
+    mean_mm, sigma_mm = st.column(longest, "replicates_mean_m", 1e3), st.column(longest, "replicates_sigma_m", 1e3)
+    st.band(ax, time_ms, mean_mm - sigma_mm, mean_mm + sigma_mm, colour)
     for part in parts:
         ax.plot(1e3 * part["time_s"], 1e3 * part["lead_position_m"], color=colour, lw=0.8)
-    ax.plot(time_ms, column(longest, "model_position_m", 1e3), color=INK, lw=1.5, ls=DASHED)
+    ax.plot(time_ms, st.column(longest, "model_position_m", 1e3), color=st.INK, lw=1.5, ls=st.DASHED)
     if "model_after_m" in longest:
-        ax.plot(time_ms, column(longest, "model_after_m", 1e3), color=INK, lw=1.5)
+        ax.plot(time_ms, st.column(longest, "model_after_m", 1e3), color=st.INK, lw=1.5)
 
 
 def _draw_residuals(ax: Axes, parts: list[pd.DataFrame], colour: str) -> None:
     by_growth = _longest(parts).sort_values("replicates_mean_m")
-    sigma_mm = column(by_growth, "replicates_sigma_m", 1e3)
-    band(ax, column(by_growth, "replicates_mean_m", 1e3), -sigma_mm, sigma_mm, colour)
-    ax.axhline(0, color=INK, lw=1.0, ls=DASHED)
+    sigma_mm = st.column(by_growth, "replicates_sigma_m", 1e3)
+    st.band(ax, st.column(by_growth, "replicates_mean_m", 1e3), -sigma_mm, sigma_mm, colour)
+    ax.axhline(0, color=st.INK, lw=1.0, ls=st.DASHED)
     for part in parts:
         residual_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
         ax.plot(1e3 * part["lead_position_m"], residual_mm, color=colour, lw=0.9)

@@ -16,25 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import UNUSABLE_FLAGS, Floats, hand_corrected
+from vinetrack.core.records import FLAGS, UNUSABLE_FLAGS, Floats, hand_corrected, with_flag
 from vinetrack.core.units import number
+from vinetrack.figures import style as st
 from vinetrack.figures.registry import figure
-from vinetrack.figures.style import (
-    DASHED,
-    GREEN,
-    INK,
-    MUTED,
-    ORANGE,
-    SKY,
-    VERMILLION,
-    VINE_COLOURS,
-    legend_above,
-    look,
-    new_figure,
-    note_below,
-    small_title,
-    with_minus,
-)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -85,13 +70,13 @@ def draw_pixel_places(subpixel_px: Floats) -> Figure | None:
     half_width = 2 * math.sqrt(even * (1 - 1 / bins))
     amplitude, chance = periodic_error(subpixel_px)
     comparison = "more than chance" if amplitude > chance else "no more than chance"
-    fig = new_figure(6.6, 3.6)
+    fig = st.new_figure(6.6, 3.6)
     ax = fig.subplots()
-    ax.hist(subpixel_px, bins=bins, range=(0, 1), color=VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
-    ax.axhspan(even - half_width, even + half_width, color=MUTED, alpha=0.25, lw=0)
-    ax.axhline(even, color=MUTED, ls=DASHED)
+    ax.hist(subpixel_px, bins=bins, range=(0, 1), color=st.VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
+    ax.axhspan(even - half_width, even + half_width, color=st.MUTED, alpha=0.25, lw=0)
+    ax.axhline(even, color=st.MUTED, ls=st.DASHED)
     ax.set(xlabel="position within a pixel (px)", ylabel="edges", xlim=(0, 1), title=f"N = {count} frames")
-    note_below(
+    st.note_below(
         fig,
         f"The error that is periodic with one pixel has an amplitude of {number(amplitude, 2)} px, {comparison}: "
         f"{number(chance, 2)} px are exceeded by chance in 5 % of cases.",
@@ -103,7 +88,7 @@ def draw_pixel_places(subpixel_px: Floats) -> Figure | None:
 # One recording: its strip through time with the tracked edge, and the edge on the first, middle and last frame.
 
 
-@look()
+@st.look()
 def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     """Draw the strip of one tracked recording."""
     n = len(tracking.pictures)
@@ -112,7 +97,7 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     scaled = np.isfinite(m_per_px)
     below_in = tall_in + (1.35 if scaled else 0.8)
     height_in = below_in + 2.95
-    fig = new_figure(7.2, height_in, layout=None)
+    fig = st.new_figure(7.2, height_in, layout=None)
 
     def panel(left_in: float, bottom_in: float, width_in: float, tall_in: float) -> Axes:
         return fig.add_axes((left_in / 7.2, bottom_in / height_in, width_in / 7.2, tall_in / height_in))
@@ -125,8 +110,8 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
         scale = panel(0.75, below_in - 0.54, 6.38, 0.0)
         scale.set(xlabel="along the growth axis (mm)", xlim=[1e3 * m_per_px * px for px in ax.get_xlim()], yticks=[])
         scale.spines["left"].set_visible(False)
-    legend_above(ax, 2)
-    small_title(ax, title, loc="right", fontsize=10, color=MUTED)
+    st.legend_above(ax, 2)
+    st.small_title(ax, title, loc="right", fontsize=10, color=st.MUTED)
     for i, (frame, picture) in enumerate(tracking.pictures):
         _draw_frame(panel(0.04 + 7.2 * i / n, 0.05, wide_in, tall_in), tracking, frame, picture)
     return fig
@@ -143,26 +128,24 @@ def _draw_kymograph(ax: Axes, tracking: Tracking) -> None:
     extent = (-0.5, strip.shape[1] - 0.5, float(shown_ms[-1]) + half_ms, float(shown_ms[0]) - half_ms)
     ax.imshow(small, aspect="auto", extent=extent, cmap="gray", vmin=dark, vmax=light, interpolation="none")
     edge, by_hand = track.edge_px, hand_corrected(track.flag)
-    odd = flagged(track.flag) & ~by_hand
+    odd = with_flag(track.flag, *set(FLAGS) - {"before_release"}) & ~by_hand
     fine = ~odd & ~by_hand & np.isfinite(edge)
-    ax.plot(edge[fine], time_ms[fine], color=ORANGE, linewidth=1.0, label=f"leading edge, N = {int(fine.sum())}")
+    ax.plot(edge[fine], time_ms[fine], color=st.ORANGE, linewidth=1.0, label=f"leading edge, N = {int(fine.sum())}")
     if odd.any():
         shown = odd & np.isfinite(edge)
         label = f"flagged, N = {int(odd.sum())}"
-        ax.plot(edge[shown], time_ms[shown], "x", color=SKY, markersize=4, markeredgewidth=1.1, label=label)
+        ax.plot(edge[shown], time_ms[shown], "x", color=st.SKY, markersize=4, markeredgewidth=1.1, label=label)
     if by_hand.any():
         before = edge if track.tracked_px is None else track.tracked_px
-        ax.plot(before[by_hand], time_ms[by_hand], "+", color=SKY, markersize=5, markeredgewidth=1.0)
+        ax.plot(before[by_hand], time_ms[by_hand], "+", color=st.SKY, markersize=5, markeredgewidth=1.0)
         label = f"corrected by hand, N = {int(by_hand.sum())}"
-        ax.plot(edge[by_hand], time_ms[by_hand], "o", color=GREEN, markersize=4, fillstyle="none", label=label)
+        ax.plot(edge[by_hand], time_ms[by_hand], "o", color=st.GREEN, markersize=4, fillstyle="none", label=label)
     ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)" if timed else "frame")
     ax.grid(visible=False)
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """Return a picture reduced to at most `largest_px` pixels per side by averaging, ignoring NaN. Shapes: picture
-    (height, width) → (≤ largest_px, ≤ largest_px).
-    """
+    """Return a picture averaged to at most `largest_px` pixels per side, ignoring NaN. Shape (height, width)."""
     for axis in (0, 1):
         step = -(-picture.shape[axis] // largest_px)
         if step > 1:
@@ -174,13 +157,6 @@ def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
     return picture
 
 
-def flagged(flag: Any) -> np.ndarray:
-    """Return a mask, shape (n_frames,), of the frames with any flag except `before_release`. Shapes: flag (n_frames,) →
-    (n_frames,).
-    """
-    return np.array([bool(set(str(entry).split(";")) - {"before_release", ""}) for entry in flag], dtype=bool)
-
-
 def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
     height, width = picture.shape
     whole = (-0.5, width - 0.5, height - 0.5, -0.5)
@@ -189,7 +165,7 @@ def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -
     ax.grid(visible=False)
     if tracking.axis.bends:
         path = tracking.axis.points(np.arange(0.0, tracking.axis.length_px, 3.0))
-        ax.plot(path[:, 0], path[:, 1], color=SKY, linewidth=0.8, linestyle=":")
+        ax.plot(path[:, 0], path[:, 1], color=st.SKY, linewidth=0.8, linestyle=":")
     track = tracking.track
     edge = float(track.edge_px[frame]) if frame < track.edge_px.size else np.nan
     if np.isfinite(edge):
@@ -197,17 +173,17 @@ def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -
         half = half if np.isfinite(half) else 0.25 * min(height, width)
         ends = np.array([tracking.axis.points(np.array(edge), across) for across in (-half, half)])
         unusable = bool(UNUSABLE_FLAGS.intersection(str(track.flag[frame]).split(";")))
-        ax.plot(ends[:, 0], ends[:, 1], color=SKY if unusable else VERMILLION, linewidth=1.8)
+        ax.plot(ends[:, 0], ends[:, 1], color=st.SKY if unusable else st.VERMILLION, linewidth=1.8)
     ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     at = f", {1e3 * track.time_s[frame]:.1f} ms" if np.isfinite(track.time_s[frame]) else ""
-    small_title(ax, f"frame {frame}{at}", color=INK)
+    st.small_title(ax, f"frame {frame}{at}", color=st.INK)
 
 
 # ------------------------------------------------------------------------------
 # Frames of a clip.
 
 # Okabe and Ito's yellow, vermillion and sky blue: distinguishable by everyone, on any grey
-TRACKED, BEFORE, AFTER = "#F0E442", VERMILLION, SKY
+TRACKED, BEFORE, AFTER = "#F0E442", st.VERMILLION, st.SKY
 _BAR, _BAR_INK, _GREY = "#16191e", "#f2f4f7", "#9aa3b0"
 
 
@@ -227,9 +203,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class ClipView:
-    """Layout shared by all frames of a clip. `size_px` is width and height of the recording; `mm_per_px` its scale
-    along the axis; `slowed` the factor of the slow motion.
-    """
+    """Layout of all frames of a clip: size of the recording, scale along the axis, factor of the slow motion."""
 
     title: str
     axis: Axis
@@ -259,9 +233,7 @@ class ClipView:
         return 1.1 * self.line_px + 1.35 * self.line_px * row
 
     def at(self, along_px: Any, across_px: float = 0.0) -> Any:
-        """Places of the clip along the axis. Pixel centres are at integers in the recording, at half-integers in the
-        clip.
-        """
+        """Places of the clip along the axis; pixel centres are at integers in the recording, at halves in the clip."""
         return (self.axis.points(along_px, across_px) + 0.5) * self.zoom - 0.5
 
 
@@ -354,18 +326,16 @@ def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time
     width, font = view.picture_px[0], _font(view.line_px)
     for i, edge in enumerate(edges):
         if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
-            words = f"{with_minus(edge.off_mm[frame], '+.1f')} mm"
+            words = f"{st.with_minus(edge.off_mm[frame], '+.1f')} mm"
             pen.text((0.6 * width, view.row_y(i)), words, font=font, fill=_BAR_INK, anchor="rm")
     words = f"frame {frame}"
     if math.isfinite(time_ms):
         before = " (before release)" if time_ms < 0 else ""
-        words = f"{with_minus(time_ms, '.1f')} ms{before}, {view.slowed:.3g} times slower"
+        words = f"{st.with_minus(time_ms, '.1f')} ms{before}, {view.slowed:.3g} times slower"
     pen.text((width - view.line_px, view.row_y(1)), words, font=font, fill=_GREY, anchor="rm")
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
-    """Return grey levels stretched so that `low` is black and `high` white. Shapes: picture (height, width) → (height,
-    width).
-    """
+    """Return grey levels, shape (height, width), stretched so that `low` is black and `high` white."""
     stretched = (picture.astype(np.float32) - low) * (255.0 / max(high - low, 1e-9))
     return np.clip(np.round(stretched), 0, 255).astype(np.uint8)

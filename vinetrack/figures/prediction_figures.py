@@ -8,24 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.style import (
-    BLUE,
-    DASHED,
-    GRID,
-    INK,
-    MUTED,
-    VERMILLION,
-    VINE_COLOURS,
-    VINE_MARKERS,
-    band,
-    column,
-    fitting_size,
-    look,
-    names_on_axis,
-    new_figure,
-    plain_log_ticks,
-    small_title,
-)
+from vinetrack.figures import style as st
 from vinetrack.narrative.diagnosis_text import size_text
 from vinetrack.narrative.verdict_text import spaced_name
 
@@ -43,14 +26,14 @@ _LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter t
 # Figures of designs: the fastest vine, and the pressure loss of a chamber.
 
 
-@look()
+@st.look()
 def draw_choice(choices: Sequence[Choice]) -> Figure:
     """Draw the films side by side: speed against diameter, and the certainty of the choice."""
-    fig = new_figure(9.6, 4.4, layout=None)
+    fig = st.new_figure(9.6, 4.4, layout=None)
     curves, bars = fig.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     films = [f"{1e6 * choice.thickness_m:g}" for choice in choices]
     for k, (choice, film) in enumerate(zip(choices, films, strict=True)):
-        colour, marker = VINE_COLOURS[k % len(VINE_COLOURS)], VINE_MARKERS[k % len(VINE_MARKERS)]
+        colour, marker = st.VINE_COLOURS[k % len(st.VINE_COLOURS)], st.VINE_MARKERS[k % len(st.VINE_MARKERS)]
         final, diameter_mm = choice.prediction.final, 1e3 * choice.prediction.inputs.trial.diameter_m
         curves.plot(1e3 * choice.others[:, 0], choice.others[:, 1], color=colour, label=f"{film} µm")
         curves.plot(diameter_mm, final.median, marker, color=colour, ms=8, clip_on=False)
@@ -62,41 +45,39 @@ def draw_choice(choices: Sequence[Choice]) -> Figure:
     label = f"{final.name} (m/s)" if final.y_over_L == 1 else f"{final.name}\nat y/L = {final.y_over_L:g} (m/s)"
     fastest = max(choice.prediction.final.high for choice in choices)
     curves.set(xlabel="diameter (mm)", ylabel=label, ylim=(0.0, 1.12 * fastest))
-    small_title(curves, "best length and pressure at each diameter", fontsize=10)
+    st.small_title(curves, "best length and pressure at each diameter", fontsize=10)
     curves.legend(title="film", fontsize=9.5)
     bars.set(xlabel="film (µm)", xlim=(-0.6, len(films) - 0.4))
     bars.set_xticks(range(len(films)), films)
-    small_title(bars, "90 % band; percentage of draws in which it is the fastest", fontsize=10)
+    st.small_title(bars, "90 % band; percentage of draws in which it is the fastest", fontsize=10)
     fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
-    fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=MUTED, fontsize=8.8)
+    fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=st.MUTED, fontsize=8.8)
     return fig
 
 
-@look()
+@st.look()
 def draw_reservoir(
     volumes_m3: np.ndarray, losses: Mapping[str, np.ndarray], loss: float, swept_m3: float, chosen_m3: float
 ) -> Figure:
-    """Draw the fraction of the gauge pressure that a closed chamber loses while a vine grows, by two gas laws, against
-    its volume. Shapes: volumes_m3, losses (n_volumes,).
-    """
+    """Draw the part of its gauge pressure that a closed chamber loses to a vine. Shapes (n_volumes,)."""
     # Below 10 mL the axis is in millilitres, so that its ticks need no exponent.
     factor, unit = (1e3, "L") if volumes_m3[0] >= 1e-5 else (1e6, "mL")
-    fig = new_figure(7.2, 4.4)
+    fig = st.new_figure(7.2, 4.4)
     ax = fig.subplots()
-    for (law, lost), colour, style in zip(losses.items(), (BLUE, VERMILLION), ("-", DASHED), strict=True):
+    for (law, lost), colour, style in zip(losses.items(), (st.BLUE, st.VERMILLION), ("-", st.DASHED), strict=True):
         ax.plot(factor * volumes_m3, 100 * lost, color=colour, ls=style, label=law)
     slow, fast = losses.values()
-    band(ax, factor * volumes_m3, 100 * slow, 100 * fast, MUTED, 0.12)
+    st.band(ax, factor * volumes_m3, 100 * slow, 100 * fast, st.MUTED, 0.12)
     words: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9.5}
-    ax.axhline(100 * loss, color=INK, lw=1.0)
+    ax.axhline(100 * loss, color=st.INK, lw=1.0)
     at = (0.99, 100 * loss), (0, 3), ("axes fraction", "data")
     ax.annotate(f"allowed: {100 * loss:g} %", *at, ha="right", **words)
     if volumes_m3[0] < chosen_m3 < volumes_m3[-1]:
-        ax.axvline(factor * chosen_m3, color=MUTED, lw=1.2)
+        ax.axvline(factor * chosen_m3, color=st.MUTED, lw=1.2)
         at = (factor * chosen_m3, 0.97), (5, 0), ("data", "axes fraction")
         ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", *at, va="top", **words)
     ax.set(xscale="log", xlim=(factor * volumes_m3[0], factor * volumes_m3[-1]), ylim=(0.0, min(800 * loss, 100.0)))
-    plain_log_ticks(ax, "x")
+    st.plain_log_ticks(ax, "x")
     ax.set_xlabel(f"volume of the chamber ({unit}); of the grown vine {factor * swept_m3:.3g} {unit}")
     ax.set_ylabel("gauge pressure lost (%)")
     ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.9))
@@ -107,14 +88,14 @@ def draw_reservoir(
 # Predictions, and the motion with and without one effect.
 
 
-@look()
+@st.look()
 def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str], at_fraction: float) -> Figure:
     """Draw one condition with the uncertainty budget of its final speed, or several conditions superposed."""
-    drawn = predictions[: len(VINE_COLOURS)]
+    drawn = predictions[: len(st.VINE_COLOURS)]
     width_in = 9.6
-    fig = new_figure(width_in, 7.2, layout=None)
+    fig = st.new_figure(width_in, 7.2, layout=None)
     axes = fig.subplots(2, 2)
-    for colour, prediction in zip(VINE_COLOURS, drawn, strict=False):
+    for colour, prediction in zip(st.VINE_COLOURS, drawn, strict=False):
         _draw_curves(axes, prediction.curve, colour)
     _label_prediction(axes, drawn, at_fraction)
     if len(drawn) == 1:
@@ -122,16 +103,16 @@ def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str
     else:
         ax = axes[1, 1]  # the condition of each colour, instead of the bars
         ax.set_axis_off()
-        for k, (colour, title) in enumerate(zip(VINE_COLOURS, titles, strict=False)):
+        for k, (colour, title) in enumerate(zip(st.VINE_COLOURS, titles, strict=False)):
             y = 0.97 - 0.155 * k
             ax.plot([0.0, 0.07], [y - 0.025] * 2, color=colour, lw=3, transform=ax.transAxes, clip_on=False)
             ax.text(0.1, y, textwrap.fill(title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
-        if (n_more := len(titles) - len(VINE_COLOURS)) > 0:
-            ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=MUTED)
+        if (n_more := len(titles) - len(st.VINE_COLOURS)) > 0:
+            ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=st.MUTED)
     title = titles[0] if len(drawn) == 1 else f"{len(titles)} conditions"
-    fig.text(0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * width_in, 12))
+    fig.text(0.075, 0.955, title, fontweight="bold", fontsize=st.fitting_size(title, 0.9 * 72 * width_in, 12))
     words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
-    fig.text(0.075, 0.012, words, color=MUTED, fontsize=8.8)
+    fig.text(0.075, 0.012, words, color=st.MUTED, fontsize=8.8)
     fig.align_ylabels(axes[:, 0])
     fig.subplots_adjust(left=0.075, right=0.985, top=0.91, bottom=0.105, hspace=0.3, wspace=0.27)
     return fig
@@ -140,8 +121,8 @@ def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str
 def _draw_curves(axes: np.ndarray, table: pd.DataFrame, colour: str) -> None:
     """Position against time; speed and tension against growth."""
     position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
-    y_mm, along = column(table, "lead_position_m", 1e3), column(table, "y_over_L")
-    times_ms = [column(table, name, 1e3) for name in ("time_low_90_s", "time_s", "time_high_90_s")]
+    y_mm, along = st.column(table, "lead_position_m", 1e3), st.column(table, "y_over_L")
+    times_ms = [st.column(table, name, 1e3) for name in ("time_low_90_s", "time_s", "time_high_90_s")]
     # The axis ends with the slow limit, but at most at four times the end of the median.
     early, middle, late = (float(np.max(t[np.isfinite(t)], initial=0.0)) for t in times_ms)
     last = min(late, 4 * middle) if middle > 0 else early or 1.0
@@ -151,8 +132,8 @@ def _draw_curves(axes: np.ndarray, table: pd.DataFrame, colour: str) -> None:
     position.plot(times_ms[1][come], y_mm[come], color=colour)
     position.set_xlim(0.0, max(last, position.get_xlim()[1] if position.lines[1:] else 0.0))
     for ax, name, unit in ((speed, "lead_velocity", "m_s"), (tension, "tension", "N")):
-        low, high = (column(table, f"{name}_{side}_90_{unit}") for side in ("low", "high"))
-        band(ax, along, low, high, colour, 0.18)
+        low, high = (st.column(table, f"{name}_{side}_90_{unit}") for side in ("low", "high"))
+        st.band(ax, along, low, high, colour, 0.18)
         ax.plot(along, table[f"{name}_{unit}"], color=colour)
 
 
@@ -162,21 +143,21 @@ def _label_prediction(axes: np.ndarray, drawn: Sequence[VinePrediction], at_frac
     position.set_ylim(bottom=0.0)
     for ax, label in ((speed, "speed of the leading edge ẏ (m/s)"), (tension, "tension of the tail (N)")):
         ax.set(xlabel="growth y/L", ylabel=label, xlim=(0.0, 1.0))
-        ax.axvline(at_fraction, color=MUTED, lw=0.9, ls=DASHED)
+        ax.axvline(at_fraction, color=st.MUTED, lw=0.9, ls=st.DASHED)
     low, high = speed.get_ylim()
     speed.set_ylim(max(low, 0.0), high)
-    at: dict[str, Any] = {"transform": speed.get_xaxis_transform(), "ha": "right", "fontsize": 9, "color": MUTED}
+    at: dict[str, Any] = {"transform": speed.get_xaxis_transform(), "ha": "right", "fontsize": 9, "color": st.MUTED}
     speed.text(at_fraction - 0.015, 0.03, f"y/L = {at_fraction:g}", **at)
     lowest = min(prediction.curve["tension_low_90_N"].min() for prediction in drawn)
     # Compression below 1 % of the largest tension is rounding of the simulation.
     if lowest < -0.01 * max(prediction.curve["tension_high_90_N"].max() for prediction in drawn):
-        tension.axhline(0.0, color=INK, lw=0.8)
-        small_title(tension, "below 0 the model predicts compression in the tail", fontsize=9.5, color=MUTED)
+        tension.axhline(0.0, color=st.INK, lw=0.8)
+        st.small_title(tension, "below 0 the model predicts compression in the tail", fontsize=9.5, color=st.MUTED)
     ends = [float(prediction.curve["time_s"].replace(np.inf, np.nan).max()) for prediction in drawn]
     if max(ends) > _LOG_RATIO * min(ends):
         position.set_xscale("log")
         position.set_xlim(left=10.0 * min(ends))
-        plain_log_ticks(position, "x")
+        st.plain_log_ticks(position, "x")
 
 
 def _draw_shares(ax: Axes, prediction: VinePrediction) -> None:
@@ -184,8 +165,8 @@ def _draw_shares(ax: Axes, prediction: VinePrediction) -> None:
     low, median, high = prediction.final.low, prediction.final.median, prediction.final.high
     bars = [("all inputs", low, high), *((share.name, share.low, share.high) for share in prediction.shares)]
     for k, (_, start, stop) in enumerate(bars):
-        ax.barh(k, stop - start, left=start, height=0.55, color=BLUE, alpha=0.85 if k == 0 else 0.4, lw=0)
-    ax.axvline(median, color=INK, lw=1.0)
+        ax.barh(k, stop - start, left=start, height=0.55, color=st.BLUE, alpha=0.85 if k == 0 else 0.4, lw=0)
+    ax.axvline(median, color=st.INK, lw=1.0)
     names = [textwrap.fill(name if len(name) <= 15 else name.replace("_", " "), 15) for name, _, _ in bars]
     ax.set_yticks(range(len(bars)), names, fontsize=8.8)
     ax.invert_yaxis()
@@ -193,26 +174,26 @@ def _draw_shares(ax: Axes, prediction: VinePrediction) -> None:
     ax.use_sticky_edges = False
     if low > 0 and high > _LOG_RATIO * low:
         ax.set_xscale("log")
-        plain_log_ticks(ax, "x")
+        st.plain_log_ticks(ax, "x")
     ax.grid(visible=False, axis="y")
     ax.set_xlabel(f"{prediction.final.name} (m/s)")
     ax.set_title("Uncertainty budget", fontsize=10.5)
 
 
-@look()
+@st.look()
 def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     """Draw position and speed of the leading edge with and without one effect, and the difference."""
-    time_ms = column(table, "time_s", 1e3)
+    time_ms = st.column(table, "time_s", 1e3)
     width_in = 7.2
-    fig = new_figure(width_in, 7.0, layout=None)
+    fig = st.new_figure(width_in, 7.0, layout=None)
     position, speed, gap = fig.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
     for axes, key, factor in ((position, "position_m", 1e3), (speed, "velocity_m_s", 1.0)):
-        axes.plot(time_ms, column(table, f"without_{key}", factor), color=MUTED, lw=2.4, label="without")
-        axes.plot(time_ms, column(table, f"with_{key}", factor), color=BLUE, label="with")
-    difference_mm = column(table, "difference_m", 1e3)
-    gap.axhline(0.0, color=INK, lw=0.8)
-    gap.plot(time_ms, difference_mm, color=VERMILLION)
-    band(gap, time_ms, 0.0, difference_mm, VERMILLION, 0.15)
+        axes.plot(time_ms, st.column(table, f"without_{key}", factor), color=st.MUTED, lw=2.4, label="without")
+        axes.plot(time_ms, st.column(table, f"with_{key}", factor), color=st.BLUE, label="with")
+    difference_mm = st.column(table, "difference_m", 1e3)
+    gap.axhline(0.0, color=st.INK, lw=0.8)
+    gap.plot(time_ms, difference_mm, color=st.VERMILLION)
+    st.band(gap, time_ms, 0.0, difference_mm, st.VERMILLION, 0.15)
     # Up to the 99th percentile, since a jump at the start or a divergence would hide the rest
     speeds = np.concatenate([table["without_velocity_m_s"], table["with_velocity_m_s"]])
     bottom, top = (1.15 * float(np.quantile(speeds, share)) for share in (0.01, 0.99))
@@ -221,11 +202,11 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     speed.set_ylabel("its speed ẏ (m/s)")
     gap.set(xlabel="time since release (ms)", ylabel="difference (mm)")
     title = name + (f": {size}" if size else "")
-    fig.text(0.12, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.52 * 72 * width_in, 11))
+    fig.text(0.12, 0.955, title, fontweight="bold", fontsize=st.fitting_size(title, 0.52 * 72 * width_in, 11))
     position.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     fig.align_ylabels()
     fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.135, hspace=0.14)
-    fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=MUTED, fontsize=8.8, va="bottom")
+    fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=st.MUTED, fontsize=8.8, va="bottom")
     return fig
 
 
@@ -236,11 +217,9 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
 # at the end of each row in the unit of the effect.
 
 
-@look()
+@st.look()
 def draw_power(power: Power) -> Figure | None:
-    """Draw the power to detect each effect against its size; first what is detected at the smallest fraction of its
-    plausible size.
-    """
+    """Draw the power to detect each effect against its size, in the order of what is detected first."""
     from matplotlib.colors import LinearSegmentedColormap
 
     entries = sorted(power.effects, key=lambda one: abs((one.size_at(0.9) - one.zero) / (one.largest - one.zero)))
@@ -252,29 +231,29 @@ def draw_power(power: Power) -> Figure | None:
     probabilities = np.array([
         [one.probability_at(one.zero + part * (one.largest - one.zero)) for part in parts] for one in entries
     ])  # fmt: skip
-    fig = new_figure(9.6, 0.31 * n + 1.75)
+    fig = st.new_figure(9.6, 0.31 * n + 1.75)
     ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
     edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, n_columns + 1)
-    shades = LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", BLUE, "#003f66"])
+    shades = LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", st.BLUE, "#003f66"])
     mesh = ax.pcolormesh(edges, np.arange(n + 1) - 0.5, probabilities, cmap=shades, vmin=0, vmax=1, rasterized=True)
     ax.set(xscale="log", xlim=(least, most), ylim=(n - 0.5, -0.5), xlabel="size relative to the largest plausible")
     ax.grid(visible=False)
     ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])
     # A white line below the dots keeps them visible on the dark part of the map.
     ax.axvline(1.0, color="white", linewidth=2.2)
-    ax.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
-    names_on_axis(ax, "y", [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
+    ax.axvline(1.0, color=st.INK, linewidth=1.2, linestyle=":")
+    st.names_on_axis(ax, "y", [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
     for row in range(1, n):
-        ax.axhline(row - 0.5, color=GRID, linewidth=0.7)
+        ax.axhline(row - 0.5, color=st.GRID, linewidth=0.7)
     # Sizes in the unit of each effect; grey beyond the plausible range
     sizes.set_axis_off()
     sizes.set(xlim=(0, 1), ylim=(n - 0.5, -0.5))
     for x, words in ((0.0, "50 %\npower"), (0.35, "90 %\npower"), (0.7, "largest\nplausible")):
-        sizes.text(x, -0.65, words, va="bottom", fontsize=9, color=INK)
+        sizes.text(x, -0.65, words, va="bottom", fontsize=9, color=st.INK)
     for row, one in enumerate(entries):
         for x, value in ((0.0, one.size_at(0.5)), (0.35, one.size_at(0.9)), (0.7, one.largest)):
             beyond = x == 0.7 or abs(value - one.zero) > abs(one.largest - one.zero)
-            sizes.text(x, row, size_text(one, value), va="center", fontsize=9, color=MUTED if beyond else INK)
+            sizes.text(x, row, size_text(one, value), va="center", fontsize=9, color=st.MUTED if beyond else st.INK)
     bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
     bar.set_label("power: probability of detection (%)")
     bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])

@@ -227,9 +227,7 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
 def with_final_model(
     trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None
 ) -> dict[str, pd.DataFrame]:
-    """Add the predictions of the final model to trajectories, if effects were added. Returns with a column
-    `model_after_m`, m, if the table has as many rows as the prediction.
-    """
+    """Add the positions of the final model, `model_after_m`, m, to trajectories of as many rows."""
     if diagnosed is None or not diagnosed.added or not len(diagnosed.trials):
         return dict(trajectories)
     final_m = {

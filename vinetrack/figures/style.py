@@ -18,6 +18,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import write_bytes
+
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
@@ -130,6 +133,21 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
     return files
 
 
+def write_figure(fig: Figure, path: Path) -> None:
+    """Write a figure in the format that the suffix names."""
+    check_figure(path)
+    form = path.suffix.lower().removeprefix(".")
+    write_bytes(path, render(fig, [form])[form])
+
+
+def check_figure(path: Path | None) -> None:
+    """Check the suffix of an output figure before anything is computed."""
+    figure_formats = (".png", ".svg", ".pdf")
+    if path is not None and path.suffix.lower() not in figure_formats:
+        remedy = f"end it in one of {', '.join(figure_formats)}"
+        raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])
+
+
 # ------------------------------------------------------------------------------
 # Colours of pages with a light and a dark scheme, and their mapping from the colours of figures.
 
@@ -222,9 +240,7 @@ def line_key(label: str, **style: Any) -> Line2D:
 
 
 def error_points(ax: Axes, x: ArrayLike, y: ArrayLike, sigma: ArrayLike, index: int, label: str, **style: Any) -> None:
-    """Draw points with error bars in the colour and with the marker of a group of vines or conditions. Shapes: x, y,
-    sigma (n_points,).
-    """
+    """Draw points with error bars, colour and marker by group. Shapes: x, y, sigma (n_points,)."""
     properties: dict[str, Any] = {"ms": 6, "capsize": 3, **style}
     colour, marker = VINE_COLOURS[index % len(VINE_COLOURS)], VINE_MARKERS[index % len(VINE_MARKERS)]
     bars = np.nan_to_num(np.asarray(sigma, dtype=float))
@@ -260,9 +276,7 @@ def note_below(fig: Figure, note: str) -> None:
 
 
 def up_from_zero(ax: Axes, *, x: bool = False) -> None:
-    """Let the axes begin at zero and end 8 % above the largest value. A margin in proportion to the range of the data
-    would vanish for two points of nearly equal value.
-    """
+    """Let the axes begin at zero and end 8 % above the largest value, however little the data vary."""
     ax.set_ylim(0, 1.08 * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
     if x:
         ax.set_xlim(0, 1.08 * ax.dataLim.x1 if ax.dataLim.x1 > 0 else None)

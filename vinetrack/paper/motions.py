@@ -40,9 +40,7 @@ def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> fl
 
 
 def gauge_left(gauge_Pa: float, change: Any, gamma: float = 1.0) -> Any:
-    """Return the fraction of the gauge pressure left after the volume has grown by the fraction `change`, one or many.
-    P_abs V^γ is constant, with absolute pressure.
-    """
+    """Fraction of the gauge pressure left after the volume has grown by `change`: P_abs V^γ is constant."""
     absolute_Pa = gauge_Pa + AMBIENT_PRESSURE_PA
     return (absolute_Pa * (1 + change) ** -gamma - AMBIENT_PRESSURE_PA) / gauge_Pa
 
@@ -192,9 +190,7 @@ def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, floa
 
 
 def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[float, dict[int, float]]:
-    """Apply the published rule to noise-free motions of these trials, simulated with the printed B and n.
-    Returns n, B.
-    """
+    """Apply the published rule to noise-free motions with the printed B and n; return the n and B it finds."""
     departure = Departure("", gamma=gamma)
     # 10.0: duration of the simulated motions, s (chosen)
     time_s = np.arange(0, 10.0, 1 / published.CAPTURE_FPS)
@@ -237,15 +233,8 @@ def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
 
 POSITION_COLUMNS = ("condition", "pressure_kPa", "n_trials", "rms_mean_m", "rms_single_m")
 SPEED_COLUMNS = (
-    "condition",
-    "vine",
-    "pressure_kPa",
-    "payload_g",
-    "n_final",
-    "final_at_mm",
-    "final_lead_velocity_m_s",
-    "final_lead_velocity_sigma_m_s",
-    "eq2_lead_velocity_m_s",
+    *("condition", "vine", "pressure_kPa", "payload_g", "n_final", "final_at_mm"),
+    *("final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s", "eq2_lead_velocity_m_s"),
 )
 MEAN_COLUMNS = ("pressure_kPa", "time_s", "lead_position_m", "lead_position_sigma_m", "n_trials")
 
@@ -258,9 +247,7 @@ class Rest(NamedTuple):
 
 
 def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
-    """Find the trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload. Returns trials
-    of one condition each, by pressure in kPa.
-    """
+    """Trials of Fig. 4, the 24 mm × 200 µm vine with the paper's payload, by pressure in kPa; one condition each."""
     conditions: dict[float, list[Trial]] = {}
     for pressure_kPa in published.POSITION_RMS_CM:
         alike = [trial for trial in trials if _is(trial, published.THICKNESS_UM[4], pressure_kPa, published.PAYLOAD_G)]
@@ -270,9 +257,7 @@ def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
 
 
 def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
-    """Find the trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload. Returns
-    trials by condition.
-    """
+    """Trials of Fig. 5, 24 mm × 150 µm vines at the paper's pressures with any payload, by condition."""
     conditions: dict[str, list[Trial]] = {}
     for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
         for trial in trials:
@@ -353,9 +338,7 @@ def position_errors(
 def final_speeds(
     conditions: Mapping[str, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
-    """Average the speed of the leading edge at the paper's 12 cm, and compute it by Eq. (2), columns
-    `SPEED_COLUMNS`.
-    """
+    """Average the lead speed at the paper's 12 cm, and compute it by Eq. (2); columns `SPEED_COLUMNS`."""
     rows = []
     at_m = published.FINAL_SPEED_AT_MM / 1e3
     for condition, trials in conditions.items():

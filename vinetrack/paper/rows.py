@@ -171,9 +171,7 @@ def _median(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentResults:
-    """Results of an experiment: tables and files of its results folder, by their names there. `mark` is `SIMULATED` or
-    `MEASURED`.
-    """
+    """Files of a results folder, by their names there; `mark` is `SIMULATED` or `MEASURED`."""
 
     mark: str
     damping: Mapping[str, Any]

@@ -5,31 +5,33 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.experiment.folder import Experiment
+from vinetrack.core.tables import TableError, safe_join, write_text
+from vinetrack.core.units import BASE_EFFECTS
+from vinetrack.diagnosis.propose import effect_text, propose, table_text
+from vinetrack.diagnosis.result import UNEXPLAINED
+from vinetrack.dynamics.model import check_needs, make_model
+from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
+from vinetrack.effects import Effect, EffectError, catalogue, explanation, find_effect, listing, own_effects, remember
+from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.settings import read_experiment_settings
+from vinetrack.figures.prediction_figures import draw_effect
+from vinetrack.figures.style import check_figure, write_figure
+from vinetrack.narrative.diagnosis_text import proposal_lines
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis
-
-if TYPE_CHECKING:
-    from vinetrack.effects import Effect
 
 
 def describe_effects(
     name: str | None, experiment: Path | None, figure: Path | None
 ) -> tuple[list[str], list[dict[str, Any]]]:
     """List all effects, or explain one and draw it. Returns lines, and the same for a program."""
-    from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
-    from vinetrack.effects import catalogue, explanation, find_effect, listing
-    from vinetrack.figures.prediction_figures import draw_effect
-
     own = {} if experiment is None else effects_of(experiment)
     if name is not None:
         effect = find_effect(name, own)
         shown, lines = [effect], explanation(effect)
         if figure is not None:
-            from vinetrack.pipeline.predict_stage import check_figure, write_figure
-
             check_figure(figure)
             drawing = draw_effect(effect.name, size_words(effect), reference_words(effect), effect_motion(effect))
             write_figure(drawing, figure)
@@ -54,10 +56,6 @@ def describe_effects(
 
 def effects_of(experiment: Path) -> Mapping[str, Effect]:
     """Load and test the user's own effects of an experiment."""
-    from vinetrack.core.tables import TableError, safe_join
-    from vinetrack.effects import own_effects
-    from vinetrack.experiment.settings import read_experiment_settings
-
     settings = read_experiment_settings(experiment / "experiment.yaml")
     try:
         return own_effects([safe_join(experiment, path) for path in settings.effects])
@@ -66,14 +64,7 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
 
 
 def model_problems(experiment: Path) -> list[Problem]:
-    """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`. Returns nothing for
-    the base model, nor if the experiment cannot be read, which `check_experiment` reports.
-    """
-    from vinetrack.core.units import BASE_EFFECTS
-    from vinetrack.dynamics.model import check_needs, make_model
-    from vinetrack.effects import EffectError, find_effect
-    from vinetrack.experiment.folder import read_experiment
-
+    """Find problems of the effects that a readable experiment names in `model`, `candidates` or `effects`."""
     try:
         read = read_experiment(experiment, strict=False)
     except ExperimentError:
@@ -112,13 +103,6 @@ class WrittenProposal:
 
 def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> WrittenProposal:
     """Write the force law that explains a misfit which no effect of the catalogue explains, or else a learned table."""
-    from vinetrack.core.tables import write_text
-    from vinetrack.diagnosis.propose import effect_text, propose, table_text
-    from vinetrack.diagnosis.result import UNEXPLAINED
-    from vinetrack.dynamics.model import make_model
-    from vinetrack.effects import own_effects, remember
-    from vinetrack.narrative.diagnosis_text import proposal_lines
-
     results = Results(folder)
     diagnosis = read_diagnosis(results)
     if diagnosis is None:

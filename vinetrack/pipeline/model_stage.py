@@ -18,9 +18,46 @@ import numpy as np
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
+from vinetrack.core.terminal import table as aligned
 from vinetrack.core.units import with_error
-from vinetrack.narrative.diagnosis_text import contradicted_in_words, power_brief, sentences_of, to_go_on, verdict_line
+from vinetrack.diagnosis.drift import drift_groups
+from vinetrack.diagnosis.ladder import (
+    COMPARISON_COLUMNS,
+    LADDER_COLUMNS,
+    MOVED_COLUMNS,
+    Comparison,
+    candidates_of,
+    compare,
+    in_sample,
+    initial_fit,
+    moved,
+    with_host,
+)
+from vinetrack.diagnosis.propose import add
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
+from vinetrack.dynamics.audit import Audit, audit, measured_motion
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import EffectError, own_effects
+from vinetrack.experiment.folder import Experiment
+from vinetrack.experiment.settings import RunSettings
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_damping
+from vinetrack.inference.fit_summary import FitSummary, summary_of
+from vinetrack.inference.solving import assemble
+from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
+from vinetrack.narrative.diagnosis_text import (
+    added_in_words,
+    contradicted_in_words,
+    power_brief,
+    sentences_of,
+    to_go_on,
+    verdict_line,
+)
 from vinetrack.narrative.verdict_text import settled_rows, summary_facts
+from vinetrack.pipeline.stages import Job
+from vinetrack.pipeline.trials import model_of
+from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results.folder_layout import (
     Results,
     ResultsError,
@@ -31,17 +68,11 @@ from vinetrack.results.folder_layout import (
     read_json,
     read_result,
 )
+from vinetrack.tracks.frame_timing import mean_speed
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.ladder import Comparison
-    from vinetrack.diagnosis.result import Diagnosis
-    from vinetrack.dynamics.audit import Audit
-    from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import RunSettings
-    from vinetrack.inference.fit_result import Fit, TrialFit
-    from vinetrack.pipeline.stages import Job
 
 log = logging.getLogger(__name__)
 
@@ -54,15 +85,7 @@ def fit_and_diagnose(job: Job) -> list[str]:
 
 
 def fit_model(job: Job) -> Fit | None:
-    """Fit the model in use to all trials. Writes `fit.json`, whose `refused` is None or the reason, `comparison.csv`,
-    `comparison/`, `model_check.csv` and `audit.csv`. Returns the fit for a diagnosis.
-    """
-    from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS, compare
-    from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
-    from vinetrack.inference.fit_data import FitError
-    from vinetrack.inference.fit_result import CHECK_COLUMNS, check_damping
-    from vinetrack.inference.fit_summary import FitSummary, summary_of
-
+    """Fit the model in use, write the fit and what it is compared with; return it for a diagnosis."""
     experiment, results = job.experiment, Results(job.results)
     damping = read_json(results.damping)
     pairs, kinematics = measured_trials(experiment, results)
@@ -102,11 +125,6 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     """Fit the model in use once: the fit as a diagnosis starts from it, and with intervals near bounds. A body that
     falls by gravity alone, whose fitted g tests the whole chain, is fitted otherwise than for a diagnosis.
     """
-    from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
-    from vinetrack.effects import own_effects
-    from vinetrack.inference.solving import assemble
-    from vinetrack.pipeline.trials import model_of
-
     model, settings = model_of(experiment), experiment.settings
     checked = own_effects([experiment.folder / path for path in settings.effects])
     candidates = candidates_of(model, settings.candidates, checked)
@@ -121,8 +139,6 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
 def _audit(
     fit: Fit, comparison: Comparison, pairs: list[tuple[Trial, Track]], kinematics: dict[str, Kinematics]
 ) -> Audit:
-    from vinetrack.dynamics.audit import audit, measured_motion
-
     tracks = {trial.name: track for trial, track in pairs}
     motions = []
     for trial in comparison.trials:
@@ -134,10 +150,6 @@ def _audit(
 
 def _reason(error: Exception) -> str:
     """Return why there is no fit or verdict; the traceback of an unexpected exception goes to the log."""
-    from vinetrack.dynamics.simulate import SimulationError
-    from vinetrack.effects import EffectError
-    from vinetrack.inference.fit_data import FitError
-
     if isinstance(error, FitError | EffectError | SimulationError):
         return str(error)
     log.exception("no fit or no diagnosis could be made")
@@ -146,8 +158,6 @@ def _reason(error: Exception) -> str:
 
 def comparison_lines(folder: Path) -> list[str]:
     """Return `comparison.csv` as aligned lines for the terminal, or the reason why it is empty."""
-    from vinetrack.core.terminal import table as aligned
-
     results = Results(folder)
     fit, table = read_fit(results), read_result(results.comparison)
     if fit.refused:
@@ -183,12 +193,7 @@ Pairs = Sequence[tuple[Trial, Track]]
 
 
 def diagnose_results(job: Job, fitted: Fit | None) -> None:
-    """Diagnose the trials of a results folder, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and the
-    folder `diagnosis`.
-    """
-    from vinetrack.diagnosis.ladder import LADDER_COLUMNS
-    from vinetrack.diagnosis.result import Diagnosis
-
+    """Diagnose the trials, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and `diagnosis/`."""
     results = Results(job.results)
     try:
         diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
@@ -209,9 +214,7 @@ def diagnose_results(job: Job, fitted: Fit | None) -> None:
 def diagnosed(
     experiment: Experiment, results: Results, report: Report, fitted: Fit | None = None
 ) -> tuple[Diagnosis, Pairs]:
-    """The diagnosis with the model, candidates, user effects and limits that the experiment states, and with what
-    recordings and speeds contradict in its sheet; and its trials.
-    """
+    """The diagnosis as the experiment asks for it, with what contradicts its sheet; and its trials."""
     from vinetrack.diagnosis.diagnose import diagnose
 
     pairs, _ = measured_trials(experiment, results)
@@ -234,12 +237,7 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
 
 
 def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
-    """Return a sentence for each column of the sheet that recordings or speeds contradict. Returns by name of the
-    column.
-    """
-    from vinetrack.planning.predictive_inputs import pressure_problems
-    from vinetrack.tracks.frame_timing import mean_speed
-
+    """Return a sentence for each column of the sheet that recordings or speeds contradict, by its name."""
     noted: dict[str, list[tuple[str, str]]] = {}
     for trial, _ in pairs:
         for entry in read_json(results.analysed(trial.name)).get("contradictions", []):
@@ -255,9 +253,6 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 
 def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
-    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
-    from vinetrack.inference.fit_summary import summary_of
-
     folder = _emptied(results.folder / "diagnosis")
     has_added = len(diagnosis.fits) > 1
     parameter_changes = moved(diagnosis.fits, ("", *diagnosis.effects)) if has_added else empty_table(MOVED_COLUMNS)
@@ -277,8 +272,6 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
 
 def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:
     """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
-    from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
-
     laws: dict[str, Any] = {}
     if len(diagnosis.fits) > 1:
         motions = look_at_motions(pairs, settings)
@@ -292,8 +285,6 @@ def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataF
 
 def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     """Return the tables of the initial model's misfit and of the missing force, by file name."""
-    from vinetrack.diagnosis.drift import drift_groups
-
     tables = {"missing_force.csv": diagnosis.force_table, "learned_force.csv": diagnosis.learned_table}
     if (failure := diagnosis.failure) is not None:
         tables |= {
@@ -313,8 +304,6 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
     """
     import pandas as pd
 
-    from vinetrack.diagnosis.ladder import in_sample
-
     final = {} if after is before else {one.name: one.predicted_position_m for one in in_sample(after).trials}
     found = []
     for one in in_sample(before).trials:
@@ -327,10 +316,6 @@ def predictions(before: Fit, after: Fit) -> list[tuple[TrialFit, pd.DataFrame]]:
 def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) -> list[str]:
     """Add an effect to the model and refit; the errors are appended to `ladder.csv`."""
     import pandas as pd
-
-    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved
-    from vinetrack.diagnosis.propose import add
-    from vinetrack.narrative.diagnosis_text import added_in_words
 
     results = Results(folder)
     pairs, _ = measured_trials(experiment, results)

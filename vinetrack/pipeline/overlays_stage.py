@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,21 +17,22 @@ from vinetrack.core.problems import INTERNAL_ERROR, UserError
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, hand_corrected, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.units import number
+from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
-from vinetrack.figures.style import GREEN
+from vinetrack.experiment.sheet import closest_entry
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
+from vinetrack.figures.style import GREEN, render
 from vinetrack.narrative.verdict_text import spaced_name
-from vinetrack.pipeline.trials import map_unordered
+from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.video.axis import Axis
+from vinetrack.video.curved_axis import axis_entry, axis_from_entry
+from vinetrack.video.frames import CONTAINERS, IMAGES, Recording, RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.survey import Measurement, measure_recording
+from vinetrack.video.write import write_clip
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from vinetrack.experiment.folder import Experiment
-    from vinetrack.figures.overlay import ClipView, Edge
-    from vinetrack.pipeline.stages import Job
-    from vinetrack.video.axis import Axis
-    from vinetrack.video.frames import Recording
-    from vinetrack.video.survey import Measurement
 
 
 log = logging.getLogger(__name__)
@@ -42,9 +42,7 @@ FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a p
 
 
 def draw_overlays(job: Job) -> list[str]:
-    """Write the clips that the settings request; return a line for every clip that could not be made. A recording that
-    cannot be drawn does not stop the others. The folder is created even without clips.
-    """
+    """Write the clips that the settings request; return a line for every clip that could not be made."""
     experiment, results, settings = job.experiment, Results(job.results), job.settings.overlays
     results.overlays.mkdir(parents=True, exist_ok=True)
     chosen = chosen_trials(experiment, results, settings.of)
@@ -55,8 +53,6 @@ def draw_overlays(job: Job) -> list[str]:
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
     """Write the clip of one trial of a results folder with the settings of its run; return its path."""
-    from vinetrack.experiment.folder import read_experiment
-
     results = Results(folder)
     provenance = read_json(results.provenance)
     read = read_experiment(experiment or Path(str(provenance["experiment"])))
@@ -98,9 +94,6 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
 
 def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
     """Write the clip of one trial; return its path."""
-    from vinetrack.video.curved_axis import axis_from_entry
-    from vinetrack.video.frames import RecordingError, inspect_recording
-
     track, analysed = read_result(results.track(trial.name)), read_json(results.analysed(trial.name))
     shown, line = frames_to_show(track), analysed.get("axis")
     if line is None:
@@ -126,9 +119,6 @@ def _write_clip(
     since_s: Floats, shown: range, settings: OverlaySettings,
 ) -> None:  # fmt: skip
     """Write a clip of the shown frames; `since_s` is the time since release. Shapes: since_s (n_frames,)."""
-    from vinetrack.figures.overlay import ClipView
-    from vinetrack.video.write import write_clip
-
     rate = 1.0 / float(np.median(np.diff(since_s))) if len(since_s) > 1 else math.nan
     play_fps, stride = playback_rate(len(shown), settings.seconds)
     size = recording.width, recording.height
@@ -150,9 +140,7 @@ def frames_to_show(track: pd.DataFrame) -> range:
 
 
 def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
-    """Return playback rate and stride of a clip that lasts about `seconds`. Returns play_fps (frames per second),
-    stride (every how many frames of the recording one is shown).
-    """
+    """Return frames per second of a clip of about `seconds`, and of how many frames of the film it shows one."""
     fastest_fps, slowest_fps = 30.0, 4.0  # Limits of the playback rate of a clip, frames per second (chosen)
     stride = max(round(n_frames / seconds / fastest_fps), 1)
     return float(np.clip(n_frames / stride / seconds, slowest_fps, fastest_fps)), stride
@@ -162,9 +150,6 @@ def draw_over(
     recording: Recording, view: ClipView, edges: list[Edge], time_ms: Floats, shown: range, stride: int
 ) -> Iterator[NDArray[np.uint8]]:
     """Draw edges over the frames of a recording. Shapes: time_ms (n_frames,)."""
-    from vinetrack.figures.overlay import compose, levels
-    from vinetrack.video.frames import iterate_frames
-
     low = high = 0.0
     for frame, picture in enumerate(iterate_frames(recording)):
         if frame >= shown.stop:
@@ -177,9 +162,7 @@ def draw_over(
 
 
 def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
-    """Return the shift of each frame along the axis due to camera shake, px; 0 for a camera at rest. Shape
-    (n_frames,).
-    """
+    """Return the shift of each frame along the axis by camera shake, px, shape (n_frames,); 0 at rest."""
     shake_px = np.zeros(n_frames)
     stored_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
     shake_px[: stored_px.size] = stored_px
@@ -187,11 +170,7 @@ def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
 
 
 def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
-    """Return the tracked edge, the predicted edges if there are any, and the time of release, s. Returns edges,
-    release_s.
-    """
-    from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
-
+    """Return the tracked edge, the predicted edges if there are any, and the time of release, s."""
     edge_px = track["edge_px"].to_numpy(dtype=float)
     edges, first_moving = [Edge("tracked edge", TRACKED, edge_px)], frames_to_show(track).start + MARGIN_FRAMES
     release_s = float(track["time_s"].iloc[min(first_moving, len(track) - 1)])
@@ -212,16 +191,14 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
                 edges.append(Edge(label, colour, to_px(position_m), 1e3 * (position_m - measured_m)))
         fitted = read_fit(results).trials if results.fit.exists() else {}
         release_s = fitted[trial].release_s if trial in fitted else release_s
-    by_hand = hand_corrected(track["flag"].fillna(""))
+    by_hand = hand_corrected(track["flag"])
     if by_hand.any():
         edges.append(Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan), by_hand=True))
     return edges, release_s
 
 
 def position_to_px(track: pd.DataFrame) -> Any:
-    """Return the conversion from metres to pixels along the axis, fitted to the points of a track. It is a quadratic
-    polynomial, since lens distortion and tilt make it slightly nonlinear.
-    """
+    """Return the quadratic (lens, tilt) that converts metres to pixels along the axis, fitted to a track."""
     both = track[["lead_position_m", "edge_px"]].dropna()
     metres, px = both["lead_position_m"].to_numpy(dtype=float), both["edge_px"].to_numpy(dtype=float)
     if len(both) < FEWEST_POINTS or np.ptp(metres) <= 0:
@@ -234,39 +211,19 @@ def position_to_px(track: pd.DataFrame) -> Any:
 # The command `vinetrack track`: the leading edge of a single recording as a table, a strip figure and a clip.
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackOptions:
-    """Options of the command; NaN and None for those not given. `capture_fps` is the rate, `exposure_us` the exposure
-    of a frame. The scale is `mm_per_px`, or the `calibration:` of the settings file `calibration`. `body`: the object
-    moves as a whole. `out` is the output folder.
+def track_file(
+    path: Path, say: Callable[[str], None], *, capture_fps: float = math.nan, exposure_us: float = math.nan,
+    mm_per_px: float = math.nan, calibration: Path | None = None, axis: PictureAxis | None = None,
+    frames_used: tuple[int, int] | None = None, body: bool = False, out: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Track the leading edge of one recording; write table, strip and clip in `out`. NaN and None for what is not
+    given; the scale is `mm_per_px` or the `calibration:` of a settings file. Returns facts, units in the keys.
     """
-
-    capture_fps: float = math.nan
-    exposure_us: float = math.nan
-    mm_per_px: float = math.nan
-    calibration: Path | None = None
-    axis: PictureAxis | None = None
-    frames_used: tuple[int, int] | None = None
-    body: bool = False
-    out: Path | None = None
-
-    @property
-    def scaled(self) -> bool:
-        """Whether there is a scale, so that positions are also given in metres."""
-        return math.isfinite(self.mm_per_px) or self.calibration is not None
-
-
-def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) -> dict[str, Any]:
-    """Track the leading edge of one recording; write its table, strip and clip. Returns mapping with facts about the
-    file, results of tracking, and paths of output files, units in the keys.
-    """
-    from vinetrack.video.frames import RecordingError, inspect_recording
-    from vinetrack.video.survey import measure_recording
-
-    settings, folder = _calibration(options)
+    settings, folder = _calibration(calibration, mm_per_px)
+    scaled = math.isfinite(mm_per_px) or calibration is not None
     try:
         recording = inspect_recording(_recording_path(path))
-        rate = _capture_fps(recording, options)
+        rate = _capture_fps(recording, capture_fps)
         recording_facts = _recording_facts(recording, rate)
         for line in _recording_lines(recording_facts):
             say(line)
@@ -275,12 +232,12 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
             video=recording.path,
             capture_fps=rate if math.isfinite(rate) else 1.0,
             capture_fps_is_playback=True,
-            exposure_s=options.exposure_us / 1e6 if math.isfinite(rate) else math.nan,
+            exposure_s=exposure_us / 1e6 if math.isfinite(rate) else math.nan,
             # Without a scale, the unit of length is one pixel.
-            m_per_px=options.mm_per_px / 1e3 if options.scaled else 1.0,
-            travel_ratio=1.0 if options.body else 2.0,
-            axis=options.axis,
-            frames_used=options.frames_used,
+            m_per_px=mm_per_px / 1e3 if scaled else 1.0,
+            travel_ratio=1.0 if body else 2.0,
+            axis=axis,
+            frames_used=frames_used,
         )
         measurement = measure_recording(trial, settings, folder)
     except RecordingError as error:
@@ -289,9 +246,9 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
         tracking = measurement.tracking
         untimed = replace(tracking.track, time_s=np.full(len(tracking.track.time_s), math.nan))
         measurement = replace(measurement, tracking=replace(tracking, track=untimed))
-    table = _table(measurement, options.scaled)
-    written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled)
-    tracking_facts = _tracking_facts(measurement, table, options, rate)
+    table = _table(measurement, scaled)
+    written = _write(out or Path(f"{recording.path.stem}_track"), measurement, table, scaled)
+    tracking_facts = _tracking_facts(measurement, table, axis is not None, scaled, rate)
     for line in _tracking_lines(tracking_facts):
         say(line)
     say("Written: " + ", ".join(map(str, written.values())))
@@ -300,13 +257,9 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
 
 def _recording_path(path: Path) -> Path:
     """Return the path if it can be a single recording."""
-    from vinetrack.video.frames import CONTAINERS, IMAGES
-
     if not path.exists():
-        parent = path.parent
-        names = sorted(entry.name for entry in parent.iterdir()) if parent.is_dir() else []
-        near = difflib.get_close_matches(path.name, names, 1, 0.5)
-        remedy = f"did you mean {parent / near[0]}?" if near else "check its folder and its name"
+        near = closest_entry(path)
+        remedy = f"did you mean {path.with_name(near)}?" if near else "check its folder and its name"
         raise UserError(f"{path}: there is no such file or folder; {remedy}")
     if path.is_dir():
         inside = sorted(entry for entry in path.iterdir() if entry.is_file() and not entry.name.startswith("."))
@@ -319,13 +272,12 @@ def _recording_path(path: Path) -> Path:
     return path
 
 
-def _calibration(options: TrackOptions) -> tuple[ExperimentSettings, Path]:
+def _calibration(file: Path | None, mm_per_px: float) -> tuple[ExperimentSettings, Path]:
     """Return settings with only the calibration, and the folder to which the path of its picture is relative."""
-    if options.calibration is None:
+    if file is None:
         return ExperimentSettings(), Path()
-    if math.isfinite(options.mm_per_px):
+    if math.isfinite(mm_per_px):
         raise UserError("--mm-per-px and --calibration are two scales: give one")
-    file = options.calibration
     if file.is_dir():
         file = file / "experiment.yaml"
     if not file.is_file():
@@ -336,14 +288,14 @@ def _calibration(options: TrackOptions) -> tuple[ExperimentSettings, Path]:
     return ExperimentSettings(calibration=calibration), file.parent
 
 
-def _capture_fps(recording: Recording, options: TrackOptions) -> float:
+def _capture_fps(recording: Recording, given_fps: float) -> float:
     """Capture rate, Hz: that stated by the file, else that given by the user; NaN if neither is known."""
     stated_fps = recording.capture_fps
     if stated_fps is None:
-        return options.capture_fps
-    if math.isfinite(options.capture_fps) and abs(options.capture_fps / stated_fps - 1) > 1e-3:
+        return given_fps
+    if math.isfinite(given_fps) and abs(given_fps / stated_fps - 1) > 1e-3:
         raise UserError(
-            f"{recording.path.name}: --capture-fps is {options.capture_fps:g}, but the file states a capture rate of "
+            f"{recording.path.name}: --capture-fps is {given_fps:g}, but the file states a capture rate of "
             f"{stated_fps:g}; leave --capture-fps out"
         )
     return stated_fps
@@ -407,9 +359,6 @@ def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
 
 
 def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: bool) -> dict[str, Path]:
-    from vinetrack.figures.overlay import TRACKED, Edge, draw_strip
-    from vinetrack.figures.style import render
-
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; name a folder with --out")
     tracking, recording = measurement.tracking, measurement.recording
@@ -428,18 +377,14 @@ def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: 
 
 
 def _tracking_facts(
-    measurement: Measurement, table: pd.DataFrame, options: TrackOptions, rate: float
+    measurement: Measurement, table: pd.DataFrame, axis_given: bool, scaled: bool, rate: float
 ) -> dict[str, Any]:
-    from vinetrack.video.curved_axis import axis_entry
-
     tracking = measurement.tracking
     edge_px = tracking.track.edge_px
-    usable = np.isfinite(edge_px)
-    for flag in UNUSABLE_FLAGS:
-        usable &= ~with_flag(tracking.track.flag, flag)
+    usable = np.isfinite(edge_px) & ~with_flag(tracking.track.flag, *UNUSABLE_FLAGS)
     moving = usable & ~with_flag(tracking.track.flag, "before_release")
     frame = np.flatnonzero(usable)
-    scale = measurement.m_per_px if options.scaled else math.nan
+    scale = measurement.m_per_px if scaled else math.nan
     growth_px = float(np.ptp(edge_px[usable])) if usable.any() else math.nan
     steps = np.diff(edge_px[frame]) / np.diff(frame) if frame.size > 1 else np.full(1, math.nan)
     sigma = table["edge_sigma_px"].to_numpy()[moving]
@@ -448,7 +393,7 @@ def _tracking_facts(
         "n_frames": len(edge_px),
         "n_known": int(usable.sum()),
         "axis": axis_entry(axis),
-        "axis_given": options.axis is not None,
+        "axis_given": axis_given,
         "mm_per_px": 1e3 * scale,
         "scale_rel_sigma": measurement.scale_rel_sigma,
         "tube_width_px": tracking.tube_width_px,

@@ -7,18 +7,18 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL
 from vinetrack.core.tables import PROVENANCE
-from vinetrack.core.terminal import progress, waiting
+from vinetrack.core.terminal import Progress, progress, waiting
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.campaign_power import (
     CampaignDesign,
+    SimulatedDiagnosis,
     design_of_fit,
     fitted_tests,
     planned_tests,
@@ -36,19 +36,14 @@ from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.settings import Limits
 from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, PlannedTrials, expected_systematic_m, planned_sheet
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_data import pairs_of
+from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.pipeline.predict_stage import effects_of_plan
-from vinetrack.pipeline.trials import map_unordered
+from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 from vinetrack.planning.simulated_campaigns import FilmingPlan
 from vinetrack.results.folder_layout import Results, measured_trials, read_diagnosis, read_source_experiment
-
-if TYPE_CHECKING:
-    from vinetrack.core.terminal import Progress
-    from vinetrack.diagnosis.campaign_power import SimulatedDiagnosis
-    from vinetrack.inference.fit_data import Pairs
 
 
 @dataclass(frozen=True)
@@ -199,9 +194,7 @@ def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[
 
 @in_one_blas_thread
 def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
-    """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns; of
-    those in memory, of a fit or with the base model, where they are given.
-    """
+    """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
     with waiting("calculating the power of the trials"):
         if given is None:
             campaign = campaign_of_target(request)

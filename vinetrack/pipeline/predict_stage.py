@@ -13,7 +13,7 @@ import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems, remark
 from vinetrack.core.records import Trial
-from vinetrack.core.tables import STANDARD_OUTPUT, write_bytes, write_csv, write_json
+from vinetrack.core.tables import STANDARD_OUTPUT, write_csv, write_json
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE
@@ -24,7 +24,7 @@ from vinetrack.experiment.schema import COLUMNS, CellError, option, read_cell
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
-from vinetrack.figures.style import render
+from vinetrack.figures.style import check_figure, write_figure
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.narrative.diagnosis_text import speed_band_text, trial_text, value_in_unit, volume_text
@@ -61,7 +61,7 @@ from vinetrack.planning.predictive_inputs import (
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 # ------------------------------------------------------------------------------
@@ -128,9 +128,7 @@ class PredictionRequest:
 
 @dataclass(frozen=True)
 class PredictionBasis:
-    """What predictive inputs are made from: planned trials, stated values, and a fit if there is one; `heading` stands
-    over everything predicted from it.
-    """
+    """Planned trials, stated values, a fit if there is one; `heading` stands over everything predicted from them."""
 
     planned: PlannedTrials
     stated: StatedValues
@@ -226,21 +224,6 @@ def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
             band = "–" if entry.low == entry.high else f"{low} to {high}"
             rows.append((entry.symbol, median, band, display_unit(entry.unit, PREDICTION_UNITS)[0], str(entry.origin)))
     return rows
-
-
-def write_figure(fig: Figure, path: Path) -> None:
-    """Write a figure in the format that the suffix names."""
-    check_figure(path)
-    form = path.suffix.lower().removeprefix(".")
-    write_bytes(path, render(fig, [form])[form])
-
-
-def check_figure(path: Path | None) -> None:
-    """Check the suffix of an output figure before anything is computed."""
-    figure_formats = (".png", ".svg", ".pdf")
-    if path is not None and path.suffix.lower() not in figure_formats:
-        remedy = f"end it in one of {', '.join(figure_formats)}"
-        raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])
 
 
 @dataclass(frozen=True)
@@ -401,20 +384,13 @@ FILMS = "--films-um"
 
 
 def read_range(column: str, text: str) -> tuple[float, float]:
-    """Read a range from `low:high` or one number, each checked like a cell of the column. Returns low, high : float,
-    SI.
-    """
+    """Read `low:high` or one number, each checked like a cell of the column; return both in SI."""
     values = [_cell(column, part) for part in text.split(":")]
     if len(values) > 2:
         raise _refusal(column, text, "is not a range", "write low:high, such as 5:25")
     if values[0] > values[-1]:
         raise _refusal(column, text, "ends before it begins", "write the lower value first")
     return values[0], values[-1]
-
-
-def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
-    """Read a list of numbers joined by commas, each checked like a cell of the column. Returns without repetitions."""
-    return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
 
 
 def _cell(column: str, text: str, name: str = "") -> float:
@@ -449,7 +425,7 @@ def design_vine(
     check_figure(figure)
     basis = read_basis(request, needed=("pressure_kPa",))
     room = Room(
-        films_m=read_list("thickness_um", films, FILMS),
+        films_m=tuple(dict.fromkeys(_cell("thickness_um", part, FILMS) for part in films.split(",") if part.strip())),
         diameter_m=read_range("diameter_mm", diameter),
         length_m=read_range("length_mm", length),
         pressure_Pa=basis.planned.trials[0].pressure_Pa,
@@ -543,9 +519,7 @@ def design_reservoir(
     at_fraction: float,
     figure: Path | None = None,
 ) -> tuple[list[str], dict[str, Any]]:
-    """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested. Speeds are
-    predicted if the wall thickness is given. Returns lines, and JSON content.
-    """
+    """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
     check_figure(figure)
     basis = read_basis(request, needed=("diameter_mm", "length_mm", "pressure_kPa"))
     trial = basis.planned.trials[0]

@@ -11,21 +11,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.effects import EffectError, catalogue, own_effects
+from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.provenance import describe_run
+from vinetrack.experiment.settings import FigureSettings
+from vinetrack.figures.diagnosis_figures import DiagnosisTables
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, campaign_figures, draw, figures_of
+from vinetrack.figures.style import blank, render
+from vinetrack.paper import motions
+from vinetrack.paper import rows as paper
+from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
+from vinetrack.report.build import (
+    Clip,
+    ReportContent,
+    ReportFigure,
+    ReportSection,
+    TrackedRecording,
+    build_report,
+    paper_section,
+    tally,
+)
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
-
-    from vinetrack.diagnosis.result import Diagnosis
-    from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import FigureSettings
-    from vinetrack.figures.diagnosis_figures import DiagnosisTables
-    from vinetrack.pipeline.stages import Job
-    from vinetrack.report.build import Clip, DiagnosisResult, ReportContent, ReportFigure, ReportSection
 
 
 # ------------------------------------------------------------------------------
@@ -50,8 +62,6 @@ def draw_campaign(job: Job) -> list[str]:
 
 
 def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
-    from vinetrack.figures.style import render
-
     for form, data in render(figure, settings.formats, settings.dpi).items():
         write_bytes(path(f".{form}"), data)
 
@@ -62,10 +72,6 @@ def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings
 
 def compare_with_paper(job: Job) -> list[str]:
     """Write `paper.csv`, and the tables and figures of the comparison."""
-    from vinetrack.figures.style import blank
-    from vinetrack.paper import rows as paper
-    from vinetrack.report.build import tally
-
     experiment, results = job.experiment, Results(job.results)
     kind = experiment.settings.published
     if kind is None:
@@ -102,8 +108,6 @@ def compare_with_paper(job: Job) -> list[str]:
 
 def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]:
     """Return the tables of all figures, by file name."""
-    from vinetrack.paper import motions
-
     trials = experiment.trials
     positions, speeds = motions.position_conditions(trials), motions.speed_conditions(trials)
     starts = {
@@ -134,8 +138,6 @@ MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 
 def write_report(job: Job) -> list[str]:
     """Write `provenance.json` and `report.html`."""
-    from vinetrack.report.build import build_report
-
     results = Results(job.results)
     settings = job.settings.model_dump(mode="json", exclude={"experiment", "results"})
     content = report_content(job.experiment, job.results, settings)
@@ -147,8 +149,6 @@ def write_report(job: Job) -> list[str]:
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
     """Collect the content of the report from a results folder."""
-    from vinetrack.report.build import ModelResult, ReportContent, TrackedRecording, paper_section
-
     results, tables = Results(folder), FigureTables(folder, experiment.trials)
     trials, diagnosis = read_result(results.trials), read_diagnosis(results)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
@@ -160,6 +160,9 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
     if experiment.settings.published:
         figures = _figures(tables, figures_of("paper").values(), diagnosis)
         paper = [paper_section(tables.paper, tables.paper_departures, figures)]
+    known = dict(catalogue())
+    with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
+        known |= own_effects([experiment.folder / path for path in experiment.settings.effects])
     return ReportContent(
         name=experiment.name,
         trials=trials,
@@ -179,36 +182,21 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         },
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
         clip=_clip(results, tables.diagnosed, trials),
-        model=ModelResult(
-            read_fit(results), read_result(results.comparison), read_result(results.model_check), diagnosis
-        ),
-        diagnosis=None if diagnosis is None else _diagnosis_section(results, diagnosis, experiment),
+        fit=read_fit(results),
+        comparison=read_result(results.comparison),
+        check=read_result(results.model_check),
+        diagnosis=diagnosis,
+        moved=_table_of(results, "moved.csv"),
+        laws=_table_of(results, "damping_laws.csv"),
+        effects=known,
         sections=paper,
         notes=experiment.blank_notes,
     )
 
 
-def _diagnosis_section(results: Results, diagnosis: Diagnosis, experiment: Experiment) -> DiagnosisResult:
-    """Return the content of the report's section on the diagnosis."""
-    from vinetrack.effects import EffectError, catalogue, own_effects
-    from vinetrack.report.build import DiagnosisResult
-
-    known = dict(catalogue())
-    with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
-        known |= own_effects([experiment.folder / path for path in experiment.settings.effects])
-    paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
-    moved, laws = (table if path.exists() and len(table := read_result(path)) else None for path in paths)
-    reported = [*diagnosis.effects, *diagnosis.answer_set]
-    named = dict.fromkeys([*reported, *(row.effect for ranked in diagnosis.rounds for row in ranked.ranking)])
-    effects = {name: known[name] for name in named if name in known}
-    return DiagnosisResult(
-        diagnosis,
-        diagnosis.ladder,
-        moved,
-        laws,
-        {name: effects[name].summary for name in reported if name in effects},
-        {f"{name}.{p.name}": (p.symbol, p.unit) for name, effect in effects.items() for p in effect.parameters},
-    )
+def _table_of(results: Results, name: str) -> pd.DataFrame | None:
+    """A table of the diagnosis; None if it wrote none."""
+    return read_result(path) if (path := results.diagnosed(name)).exists() else None
 
 
 def _picture(path: Callable[[str], Path]) -> str | bytes:
@@ -222,11 +210,7 @@ def _picture(path: Callable[[str], Path]) -> str | bytes:
 def _figures(
     tables: FigureTables, figures: Iterable[RegisteredFigure], diagnosis: Diagnosis | None
 ) -> list[ReportFigure]:
-    """Return the figures that were drawn for the page, each with its data: a file of the results, or a table of its own
-    with five digits, more than a figure can show.
-    """
-    from vinetrack.report.build import ReportFigure
-
+    """Return the drawn figures with their data: a file of the results, or a table of its own with five digits."""
     shown = []
     for one in figures:
         if picture := _picture(partial(tables.results.figure, one.name)):
@@ -244,8 +228,6 @@ def _figures(
 
 def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFrame) -> Clip | None:
     """Return the clip for the page: of the condition that the model predicts worst if it has one, else the first."""
-    from vinetrack.report.build import Clip
-
     with_clip = trials[[results.overlay(name).exists() for name in trials["trial"]]]
     if not len(with_clip):
         return None

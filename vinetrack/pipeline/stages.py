@@ -6,11 +6,16 @@ that does part of a run calls the same function. Imports stay light: Snakemake l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import multiprocessing
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -114,3 +119,41 @@ STAGES = {
         "report written",
     ),
 }  # fmt: skip
+
+
+# ------------------------------------------------------------------------------
+# Applying a function to many trials in several processes.
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
+    """Yield `function(item)` of every item as soon as it is ready; both go to other processes, so are picklable."""
+    if n_workers < 2 or len(items) < 2:
+        yield from map(function, items)
+        return
+    # Forked on Linux, where workers are ready at once and share what is imported, and spawned elsewhere.
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(min(n_workers, len(items)), mp_context=context, initializer=_end_with_parent) as pool:
+        futures = [pool.submit(function, item) for item in items]
+        try:
+            yield from (future.result() for future in as_completed(futures))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent process ends, even if the parent is killed. A worker waits for its next argument
+    on a pipe that the other workers hold open as well: after a killed run all of them would wait forever and keep their
+    memory.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, name="end with the parent", daemon=True).start()

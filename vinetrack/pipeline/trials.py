@@ -10,27 +10,34 @@ import hashlib
 import io
 import json
 import logging
-import multiprocessing
 import os
-import sys
-import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import is_disk_full, write_bytes, write_csv, write_json
+from vinetrack.dynamics.model import Model, make_model
+from vinetrack.effects import load_effect
+from vinetrack.experiment.folder import Experiment
+from vinetrack.experiment.settings import FigureSettings, RunSettings
+from vinetrack.figures.motion_figures import draw_trial_motion
+from vinetrack.figures.overlay import draw_strip
 from vinetrack.figures.registry import describe_trial
+from vinetrack.figures.style import blank, render
+from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_left_out
+from vinetrack.kinematics.summary import TrialError, TrialResult, condition_table, summarise_trial
+from vinetrack.narrative.diagnosis_text import damping_headline
+from vinetrack.pipeline.stages import Job, map_unordered
+from vinetrack.pipeline.workflow import code_hash
 from vinetrack.results.folder_layout import (
     COUNT_COLUMNS,
     KINEMATICS_COLUMNS,
@@ -45,18 +52,17 @@ from vinetrack.results.folder_layout import (
     read_json,
     read_result,
 )
+from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
+from vinetrack.video.axis import askew_trials, slope_deg
+from vinetrack.video.curved_axis import axis_entry, axis_from_entry
+from vinetrack.video.frames import RecordingError
+from vinetrack.video.point_quality import Ending
+from vinetrack.video.survey import Measurement, exposure_problems, measure_recording, size_problems, tracked_facts
+from vinetrack.video.track import Tracking
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
-
-    from vinetrack.dynamics.model import Model
-    from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import FigureSettings, RunSettings
-    from vinetrack.kinematics.summary import TrialResult
-    from vinetrack.pipeline.stages import Job
-    from vinetrack.video.survey import Measurement
-    from vinetrack.video.track import Tracking
 
 
 # ------------------------------------------------------------------------------
@@ -66,20 +72,9 @@ if TYPE_CHECKING:
 # does not know. A file that is replaced, or another version of the program, has another key; what no run asks for in a
 # month is dropped.
 
-PACKAGE = Path(__file__).parents[1]
 SCALARS = (
     "blur_px", "exposure_frames", "tube_width_px", "tube_width_sigma_px", "seen_exposure_frames", "fast_px_per_frame",
 )  # fmt: skip
-
-
-@lru_cache(maxsize=2)
-def code_hash(*rooms: str) -> str:
-    """Hash of the code of some rooms of the package, or of all of it."""
-    digest = hashlib.sha256()
-    for path in sorted(path for room in rooms or (".",) for path in (PACKAGE / room).rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def identity(path: Path) -> tuple[tuple[str, int, int], ...]:
@@ -120,8 +115,6 @@ class Kept:
         key = _key(code_hash(), settings.dpi, inputs)
         found: dict[str, bytes] = {form: _read(self.folder / f"{key}.{form}") for form in settings.formats}
         if missing := [form for form, data in found.items() if not data]:
-            from vinetrack.figures.style import render
-
             for form, data in render(draw(), missing, settings.dpi).items():
                 write_bytes(self.folder / f"{key}.{form}", data)
                 found[form] = data
@@ -150,8 +143,6 @@ def _read(path: Path) -> bytes:
 
 def packed(tracking: Tracking) -> bytes:
     """A tracking in pixels as a file of arrays without pickled objects."""
-    from vinetrack.video.curved_axis import axis_entry
-
     track, ending = tracking.track, tracking.ending
     text = {
         **{name: getattr(tracking, name) for name in SCALARS},
@@ -172,10 +163,6 @@ def packed(tracking: Tracking) -> bytes:
 
 def unpacked(data: bytes) -> Tracking:
     """Read what `packed` wrote."""
-    from vinetrack.video.curved_axis import axis_from_entry
-    from vinetrack.video.point_quality import Ending
-    from vinetrack.video.track import Tracking
-
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         text: dict[str, Any] = json.loads(str(arrays["text"]))
         track = Track(
@@ -194,46 +181,6 @@ def unpacked(data: bytes) -> Tracking:
 log = logging.getLogger(__name__)
 
 # ------------------------------------------------------------------------------
-# Applying a function to many trials in several processes.
-
-Item = TypeVar("Item")
-Answer = TypeVar("Answer")
-
-
-def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
-    """Yield `function(item)` of every item as soon as it is ready, in any order. `function` and items are sent to other
-    processes and must be picklable.
-    """
-    if n_workers < 2 or len(items) < 2:
-        yield from map(function, items)
-        return
-    # Forked on Linux, where workers are ready at once and share what is imported, and spawned elsewhere.
-    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
-    context = multiprocessing.get_context(method)
-    with ProcessPoolExecutor(min(n_workers, len(items)), mp_context=context, initializer=_end_with_parent) as pool:
-        futures = [pool.submit(function, item) for item in items]
-        try:
-            yield from (future.result() for future in as_completed(futures))
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """End this worker when its parent process ends, even if the parent is killed. A worker waits for its next argument
-    on a pipe that the other workers hold open as well: after a killed run all of them would wait forever and keep their
-    memory.
-    """
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, name="end with the parent", daemon=True).start()
-
-
-# ------------------------------------------------------------------------------
 # One trial: its track, kinematics, contribution to the tables, and pictures.
 
 
@@ -241,18 +188,10 @@ TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
 
 
 def analyse_trials(job: Job) -> list[str]:
-    """Analyse all trials that are used, or only some; write the files of each in `tracks/`, `kinematics/`, `analysed/`
-    and `figures/`. Trials with a faulty row of the sheet get empty files. Returns reasons of failed trials.
-    """
+    """Analyse all trials in use, or some, and write their files; empty ones of faulty rows. Returns what failed."""
     experiment, only = job.experiment, job.trials
     names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
     model_of(experiment)
-    if job.threads > 1:
-        # What every worker needs is imported once, before they are forked.
-        rooms = ["figures.motion_figures", "kinematics.summary"]
-        rooms += ["figures.overlay", "video.survey"] if any(trial.video for trial in experiment.trials) else []
-        for room in rooms:
-            import_module(f"vinetrack.{room}")
     work = partial(_analyse, experiment=experiment, results=Results(job.results), settings=job.settings)
     failed = {}
     for count, (name, reason, fault) in enumerate(map_unordered(work, names, job.threads), 1):
@@ -267,13 +206,7 @@ def analyse_trials(job: Job) -> list[str]:
 
 
 def _analyse(name: str, experiment: Experiment, results: Results, settings: RunSettings) -> tuple[str, str, str]:
-    """Analyse one trial in a worker process. Returns its name, why it failed (blank if it did not), and the traceback
-    of an unexpected exception (blank if there was none).
-    """
-    from vinetrack.kinematics.summary import TrialError, summarise_trial
-    from vinetrack.tracks.importers import TrackError, load_track
-    from vinetrack.video.frames import RecordingError
-
+    """Analyse one trial. Returns its name, why it failed and the traceback of a fault; blank if there are none."""
     reason, fault, kept = experiment.failed.get(name, ""), "", Kept(results.folder)
     trial = None if reason else experiment.trial(name)
     measurement, summary = None, None
@@ -283,8 +216,6 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
         if trial is not None and trial.video is None:
             summary = summarise_trial(trial, load_track(trial), settings, model_of(experiment))
         elif trial is not None:
-            from vinetrack.video.survey import measure_recording
-
             measurement = measure_recording(trial, experiment.settings, experiment.folder, kept.track)
             track, columns, view = _of_recording(trial, measurement, experiment)
             summary = summarise_trial(trial, track, settings, model_of(experiment))
@@ -306,14 +237,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
 def _of_recording(
     trial: Trial, measurement: Measurement, experiment: Experiment
 ) -> tuple[Track, dict[str, float], dict[str, Any]]:
-    """Return the track of a recording, its columns of `trials.csv`, and what pages show of it as JSON entries: its
-    calibration, the axis along which its `edge_px` is measured, and what contradicts the sheet.
-    """
-    from vinetrack.tracks.importers import with_pressure_trace
-    from vinetrack.video.curved_axis import axis_entry
-    from vinetrack.video.frames import RecordingError
-    from vinetrack.video.survey import exposure_problems, size_problems, tracked_facts
-
+    """Return the track of a recording, its columns of `trials.csv`, and what pages show of it as JSON entries."""
     tracking, calibration = measurement.tracking, measurement.calibration
     problems = [*size_problems(trial, tracked_facts(trial, measurement)), *exposure_problems(trial, tracking)]
     if errors := [problem.reason for problem in problems if problem.severity == "error"]:
@@ -335,9 +259,6 @@ def _of_recording(
 
 @lru_cache(maxsize=1)
 def _model(names: tuple[str, ...], paths: tuple[Path, ...]) -> Model:
-    from vinetrack.dynamics.model import make_model
-    from vinetrack.effects import load_effect
-
     return make_model(names, {effect.name: effect for effect in map(load_effect, paths)})
 
 
@@ -393,8 +314,6 @@ def _draw_trial(name: str, trial: Trial | None, results: Results, settings: Figu
     title, ratio = (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
 
     def draw() -> Figure:
-        from vinetrack.figures.style import blank
-
         return draw_trial(results, trial, name) or blank(f"{title}: no positions to draw.")
 
     shown = [path(name).read_bytes() for path in (results.track, results.kinematics, results.analysed)]
@@ -403,8 +322,6 @@ def _draw_trial(name: str, trial: Trial | None, results: Results, settings: Figu
 
 def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | None:
     """Draw position, speed and steady windows of one trial; None if there are no positions."""
-    from vinetrack.figures.motion_figures import draw_trial_motion
-
     title, ratio = (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
     windows = _frame(read_json(results.analysed(name))["windows"], STEADY_COLUMNS)
     return draw_trial_motion(
@@ -418,9 +335,6 @@ def _draw_strip(
     """Draw the strip of a recording with its tracked edge, unless nothing in it changed."""
 
     def draw() -> Figure:
-        from vinetrack.figures.overlay import draw_strip
-        from vinetrack.figures.style import blank
-
         if measurement is None:
             return blank(f"{trial.name}: {reason}")
         return draw_strip(trial.name, measurement.tracking, measurement.m_per_px)
@@ -436,9 +350,6 @@ def _draw_strip(
 
 def fit_damping(job: Job) -> list[str]:
     """Gather the trials; fit the damping law and its scaling with size, and write `damping.json` and `scaling.json`."""
-    from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends
-    from vinetrack.narrative.diagnosis_text import damping_headline
-
     table, results, settings = gather(job.experiment, job.results, job.settings), Results(job.results), job.settings
     law = fit_laws(read_result(results.points), resamples=settings.damping.resamples, seed=settings.damping.seed)
     write_json(results.scaling, fit_scaling(law) | fit_trends(read_result(results.conditions)))
@@ -451,9 +362,6 @@ def fit_damping(job: Job) -> list[str]:
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
     """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`."""
-    from vinetrack.kinematics.damping import mark_left_out
-    from vinetrack.kinematics.summary import condition_table
-
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
     analysed |= _askew_as_failed(experiment, analysed)
@@ -474,8 +382,6 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
 
 def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return, as failed trials, those whose axis is askew to that of most other trials with the same growth angle."""
-    from vinetrack.video.axis import askew_trials, slope_deg
-
     if experiment.settings.axis is not None:
         return {}
     axes = {name: content.get("axis") for name, content in analysed.items() if content["row"]["status"] != "failed"}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import hashlib
 import json
 import math
 import os
@@ -17,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,7 +27,6 @@ from vinetrack.core.tables import is_readable, write_text
 from vinetrack.core.terminal import Progress, progress
 from vinetrack.figures.registry import figures_of
 from vinetrack.pipeline.stages import STAGES, Stage
-from vinetrack.pipeline.trials import PACKAGE, Kept, code_hash
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 Say = Callable[[str], None]
 Made = TypeVar("Made")
+
+PACKAGE = Path(__file__).parents[1]
 
 
 # ------------------------------------------------------------------------------
@@ -75,9 +78,7 @@ def command_for_results(experiment: Path, results: Path) -> str:
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
-    """Return the ground truth of a shipped virtual experiment; None for any other folder. The virtual laboratory has a
-    file for each folder of `data/` that it makes, with the same name.
-    """
+    """Ground truth, named like its folder in `data/`, of a shipped virtual experiment; None for any other."""
     for ground_truth in sorted((PACKAGE / "laboratory").glob("*.yaml")):
         shipped = base / "data" / ground_truth.stem
         if folder.exists() and shipped.exists() and folder.samefile(shipped):
@@ -132,12 +133,6 @@ def has_wildcard(path: Path) -> bool:
 # when a run is killed; the profile and `vinetrack run` do without them.
 
 
-def refuse_running(results: Path) -> None:
-    """Refuse a results folder that another running process writes."""
-    if results.is_dir():
-        _locked(results).release()
-
-
 def _locked(results: Path) -> FileLock:
     """Return the lock of a results folder, held by this process."""
     from filelock import FileLock, Timeout
@@ -181,6 +176,16 @@ SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings of a job take a minute or a few)
 
 
+@lru_cache(maxsize=2)
+def code_hash(*rooms: str) -> str:
+    """Hash of the code of some rooms of the package, or of all of it."""
+    digest = hashlib.sha256()
+    for path in sorted(path for room in rooms or (".",) for path in (PACKAGE / room).rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 @dataclass(frozen=True)
 class WorkflowPlan:
     """Inputs and outputs of one run of the workflow. `trials` are all trials that get files (a trial with a faulty row
@@ -212,9 +217,7 @@ class WorkflowPlan:
 
     @property
     def jobs(self) -> dict[str, tuple[str, Stage, Sequence[str]]]:
-        """Jobs by name: the name of the stage, the stage, and the trials it is for. Trials are shared out over several
-        jobs where they are many, so that a cluster works on them at the same time.
-        """
+        """Jobs by name: name of the stage, stage, trials; many trials are shared out over several jobs."""
         jobs: dict[str, tuple[str, Stage, Sequence[str]]] = {}
         for name, stage in self.stages.items():
             step = TRIALS_PER_JOB if name == "trials" else len(self.trials)
@@ -223,9 +226,7 @@ class WorkflowPlan:
         return jobs
 
     def files(self, group: str, trials: Sequence[str] | None = None) -> list[str]:
-        """Paths of a file or folder of the results, or of a group of files, as the table of stages names them; those of
-        some trials alone, or of all.
-        """
+        """Paths of a file, folder or group of files of the table of stages; of some trials alone, or of all."""
         trials = self.trials if trials is None else trials
         if not group.startswith("<"):
             return [self.result(group)]
@@ -252,9 +253,7 @@ class WorkflowPlan:
         return [self.result("figures", f"{prefix}{name}.{form}") for name in names for form in formats]
 
     def settings_of(self, stage: Stage) -> str:
-        """Settings that a stage depends on, as JSON; all but the paths if it names none. Paths are left out, since the
-        same folder can be written in several ways.
-        """
+        """Settings that a stage depends on, as JSON; all but the paths, which have many spellings, if it names none."""
         chosen = set(stage.settings) or set(type(self.settings).model_fields) - {"experiment", "results"}
         return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
@@ -311,9 +310,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
 
 
 def or_exit(function: Callable[..., Made], *given: Any) -> Made:
-    """Call a function; print its problems in at most 20 lines and exit with status 1. For the Snakefile, where an
-    exception would be printed with Snakemake's traceback.
-    """
+    """Call a function for the Snakefile; print its problems instead of a traceback and exit with status 1."""
     try:
         return function(*given)
     except ExperimentError as error:
@@ -442,6 +439,7 @@ def run_paths(folder: Path, base: Path | None) -> RunPaths:
 def check_before_run(paths: RunPaths, say: Say) -> None:
     """Print the problems of an experiment before its run."""
     from vinetrack.experiment.folder import read_experiment
+    from vinetrack.pipeline.trials import Kept
 
     if find_ground_truth(paths.experiment, PACKAGE.parent):
         return  # The recordings of the demonstration do not exist yet: the run makes them.
@@ -457,7 +455,8 @@ def check_before_run(paths: RunPaths, say: Say) -> None:
 
 def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     """Run Snakemake on an experiment; show a progress bar on a terminal, and one line per stage elsewhere."""
-    refuse_running(paths.results)
+    if paths.results.is_dir():
+        _locked(paths.results).release()  # refused, if another running process writes there
     log = paths.results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # Snakemake parses values of --config as YAML, where ` #2` in the name of a folder would be a comment.

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.power import Power
+    from vinetrack.effects import Effect
     from vinetrack.inference.fit_summary import FitSummary
 
 
@@ -63,9 +64,7 @@ if TYPE_CHECKING:
 
 
 def inline_picture(picture: str | bytes, prefix: str, description: str) -> Markup:
-    """Return an SVG file or a PNG file as an element of the page, as wide as `--wide` where there is room: then its
-    text is as large as that of the page. Blank for an empty file.
-    """
+    """Return an SVG or PNG file as an element of the page, `--wide` if there is room; blank for an empty one."""
     if not picture:
         return Markup()
     if isinstance(picture, str):
@@ -170,78 +169,48 @@ def data_uri(name: str, text: str) -> str:
 # The section of the report on the diagnosis: candidates, upper limits, tied candidates, the next trial, drift.
 
 
-@dataclass(frozen=True)
-class DiagnosisResult:
-    """The diagnosis, with the errors, parameters and damping laws of its models; None for parts that do not exist.
-    `summaries` describes each effect in a sentence; `units` has symbol and unit by `effect.parameter`.
-    """
-
-    diagnosis: Diagnosis
-    ladder: pd.DataFrame | None = None
-    moved: pd.DataFrame | None = None
-    laws: pd.DataFrame | None = None
-    summaries: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-
-
-def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
+def diagnosis_section(content: ReportContent) -> dict[str, Any] | None:
     """Return the section on the diagnosis as text for the template; None if there is no diagnosis."""
-    if result is None:
+    diagnosis, effects = content.diagnosis, content.effects
+    if diagnosis is None:
         return None
-    diagnosis = result.diagnosis
     drifting = [str(row["sentence"]) for row in diagnosis.drift if row.get("sentence") and row.get("significant", True)]
     rounds, named = [], diagnosis.effects or diagnosis.answer_set
     for entry in diagnosis.rounds:
         untestable = [row for row in entry.ranking if row.status == NOT_TESTABLE]
         blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
-        rounds.append({"table": ranking_table(entry), "blind": blind, "of": entry})
+        rounds.append({"ranking": ranking_rows(entry), "blind": blind, "of": entry})
     return {
         "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
         "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
         "sentence": verdict_sentence(diagnosis),
         "meaning": verdict_meaning(diagnosis),
-        "summaries": [result.summaries[name] for name in named if name in result.summaries],
-        "facts": summary_facts(diagnosis, result.ladder),
+        "summaries": [effects[name].summary for name in named if name in effects],
+        "facts": summary_facts(diagnosis, diagnosis.ladder),
         "explanation": diagnosis.explanation,
-        "ladder": ladder_table(result.ladder),
+        "ladder": ladder_rows(diagnosis.ladder),
         "where": [line for line in map(str, diagnosis.where) if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
         "rounds": rounds,
         # Upper limits are valid only if no effect is missing.
-        "hidden": upper_limit_table(
-            diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), result.units
-        ),
+        "hidden": upper_limits(diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), effects),
         "power": power_entry(diagnosis.power),
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
-        "moved": moved_table(result.moved),
-        "laws": law_table(result.laws),
+        "moved": moved_table(content.moved),
+        "laws": law_rows(content.laws),
         "notes": list(diagnosis.notes),
     }
 
 
-def ladder_table(ladder: pd.DataFrame | None) -> ReportTable:
+def ladder_rows(ladder: pd.DataFrame | None) -> list[tuple[str, ...]]:
     """Return the errors of every model of `ladder.csv`, mm."""
     keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
-    head = (
-        "Model",
-        "in sample (mm)",
-        "conditions left out (mm)",
-        "highest pressure left out (mm)",
-        "replicates (mm)",
-        "excess on left out (mm)",
-    )
-    rows = [
+    return [
         (_step(str(row["added"] or ""), row.get("partial")), *(number(1e3 * float(row[key])) for key in keys))
         for row in ([] if ladder is None else ladder.to_dict("records"))
     ]
-    note = (
-        "Root mean square error of position. Left out: every condition is predicted by the model fitted to all others; "
-        "every vine's highest pressure by the model fitted to all lower ones. Excess: √(rms² − replicates²). Partial: "
-        "a step that explains part of a misfit that nothing explains in full; it is not claimed to be missing."
-    )
-    return ReportTable("The numbers of the ladder", head, rows, frozenset(range(1, len(head))), note)
 
 
 def _step(added: str, partial: object = False) -> str:
@@ -249,10 +218,9 @@ def _step(added: str, partial: object = False) -> str:
     return f"+ {listed_names(added.split('+'))}{mark}" if added else "initial model"
 
 
-def ranking_table(entry: Round) -> ReportTable:
+def ranking_rows(entry: Round) -> list[tuple[str, ...]]:
     """Return the candidates of a round that could be tested."""
-    head = ("Candidate", "kind", "Δχ²", "σ", "size", "status", "")
-    rows = [
+    return [
         (
             ("● " if row.in_answer_set else "") + spaced_name(row.effect),
             row.kind,
@@ -265,47 +233,30 @@ def ranking_table(entry: Round) -> ReportTable:
         for row in entry.ranking
         if row.status != NOT_TESTABLE
     ]
-    note = (
-        "● in the answer set. Δχ² is relative to the noise of the tracks alone; σ also accounts for disagreement "
-        "between trials: for a fitted candidate it is √Δχ² or less."
-    )
-    return ReportTable("", head, rows, frozenset({2, 3}), note)
 
 
-def upper_limit_table(ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]]) -> ReportTable:
-    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; `units` as in the result."""
+def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) -> list[tuple[str, str, str]]:
+    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; `effects` are known by name."""
     rows = []
     for row in ranking:
-        of = {entry.key.split(".")[-1]: (entry.symbol, entry.unit) for entry in row.numbers}
+        named = effects[row.effect].parameters if row.effect in effects else ()
+        of = {parameter.name: (parameter.symbol, parameter.unit) for parameter in named}
+        of |= {entry.key.split(".")[-1]: (entry.symbol, entry.unit) for entry in row.numbers}
         for name, largest in row.largest.items():
-            if not is_finite(largest):
-                continue
-            short = name.split(".")[-1]
-            symbol, unit = of.get(short) or units.get(f"{row.effect}.{short}") or (short, "SI")
-            shown, factor = display_unit(unit)
-            rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
-    note = (
-        "Larger sizes contradict these trials (95 %, one-sided; of the sign with the larger limit). Sizes that would "
-        "have been detected are larger; they are given with the verdict."
-    )
-    return ReportTable(
-        "Upper limits on undetected effects", ("Candidate", "number", "limit"), rows, frozenset({2}), note
-    )
+            if is_finite(largest):
+                short = name.split(".")[-1]
+                symbol, unit = of.get(short) or (short, "SI")
+                shown, factor = display_unit(unit)
+                rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
+    return rows
 
 
 def power_entry(power: Power | None) -> dict[str, Any] | None:
-    """Return what the trials could have detected, for the template: sentences and a table of sizes; None if unknown."""
+    """Return what the trials could have detected, for the template: sentences and rows of sizes; None if unknown."""
     if power is None:
         return None
     order = [] if power.wary else sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
-    head = ("Effect", "number", *POWER_COLUMNS[2:])
-    note = (
-        "By linear theory, with the noise and scatter of the fit, given all effects of the last model. Power there: at "
-        "the largest plausible size. Mistaken for: the other candidates with the highest score, at the size of 90 % "
-        "power."
-    )
-    table = ReportTable("", head, power_rows(order), frozenset({2, 3, 4, 5}), note)
-    return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "table": table}
+    return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "sizes": power_rows(order)}
 
 
 def tied_pairs(entry: Round) -> list[str]:
@@ -340,17 +291,16 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         found = simulated.get(pair) or {}
         spread = f"{number(found['mean'], 2)} ± {number(found.get('sd'), 1)}" if is_finite(found.get("mean")) else "–"
         separations.append((" from ".join(map(spaced_name, pair.split(" | "))), number(sigma, 2), spread))
-    columns = ("They separate", "by (σ)", "in simulation (σ)")
     return {
         "text": str(content.get("text") or ""),
         "trials": ReportTable("", head, rows if head else (), frozenset(range(len(head)))),
-        "separations": ReportTable("", columns, separations, frozenset({1, 2})),
+        "separations": separations,
         "calibration": str(content.get("calibration") or ""),
     }
 
 
 def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the missing force for the template: sentences, weights and simple laws; None for none."""
+    """Return the missing force for the template: sentences, and rows of weights and simple laws; None for none."""
     if not content:
         return None
     rows = [
@@ -361,7 +311,6 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         )
         for law in content.get("laws") or []
     ]
-    head = ("Simple law", "explains of the missing force", "size (N)")
     learned = content.get("learned") or {}
     weights = [
         (" and ".join(name.split("+")), f"{100 * float(weight):.1f} %")
@@ -369,11 +318,9 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
     ]
     return {
         "sentence": str(content.get("sentence") or content.get("text") or ""),
-        "laws": ReportTable("Simple laws that resemble it", head, rows, frozenset({1, 2})),
+        "laws": rows,
         "learned": str(learned.get("sentence") or ""),
-        "weights": ReportTable(
-            "Variables of the learned force", ("Variables", "posterior weight"), weights, frozenset({1})
-        ),
+        "weights": weights,
     }
 
 
@@ -393,23 +340,19 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable:
     return ReportTable("Parameters of every model", head, rows, frozenset(range(1, len(head))))
 
 
-def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
-    """Return the damping law from steady speeds with the pressure at the vine in each model; None without laws."""
+def law_rows(laws: pd.DataFrame | None) -> list[tuple[str, ...]]:
+    """Return the damping law from steady speeds with the pressure at the vine in each model."""
     if laws is None or not len(laws):
-        return None
+        return []
     chosen = laws[laws["method"] == PREFERRED] if (laws["method"] == PREFERRED).any() else laws
     first = set(str(chosen["model"].iloc[0]).split("+"))
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for entry in chosen.to_dict("records"):
         added = [name for name in str(entry["model"]).split("+") if name not in first]
         bounds = {key: [entry[f"{key}_low_95"], entry[f"{key}_high_95"]] for key in ("n", "B")}
         row = (_step("+".join(added)), str(entry["vine"]), number(entry["n"], 4), interval(bounds["n"]))
         rows.append((*row, number(entry["B"], 4), interval(bounds["B"]), f"{entry['n_trials']:.0f}"))
-    head = ("Model", "Vine", "n", "95 %", "B, N·(s/m)ⁿ", "95 %", "Trials")
-    note = "From steady speeds, as in the section on the damping law, with the pressure at the vine in each model."
-    return ReportTable(
-        "The damping law with the pressure of every model", head, rows, frozenset(range(2, len(head))), note
-    )
+    return rows
 
 
 # ------------------------------------------------------------------------------
@@ -607,9 +550,7 @@ MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single tria
 
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
-    """Return all trials for the template, and the number of trials whose figures were left out for size. Returns
-    entries, n_left_out.
-    """
+    """Return all trials for the template, and how many of them have their figures left out for size."""
     entries, left_out, weight = [], 0, 0
     for row in rows(content.trials):
         name, curve = row.trial, content.kinematics.get(row.trial)
@@ -643,9 +584,7 @@ def _thinned(curve: pd.DataFrame, n_trials: int) -> str:
 
 
 def speed_sparkline(curve: pd.DataFrame, steady_s: tuple[float, float]) -> Markup:
-    """Return the speed of a trial against time as a small SVG, with the steady window thick; blank if there is nothing
-    to draw.
-    """
+    """Return the speed of a trial as a small SVG, its steady window thick; blank if there is nothing to draw."""
     spark_px = (132, 30)  # Width and height of the small curve of a trial (chosen)
     known = curve[np.isfinite(curve["time_s"]) & np.isfinite(curve["lead_velocity_m_s"])]
     known = known.iloc[:: max(len(known) // spark_px[0], 1)]
@@ -672,32 +611,21 @@ def _polyline(x: NDArray[np.float64], y: NDArray[np.float64]) -> str:
 # The section of the report that compares the model in use with the measurement.
 
 
-@dataclass(frozen=True)
-class ModelResult:
-    """The fit, the comparison and the check of the damping law of a results folder."""
-
-    fit: FitSummary
-    comparison: pd.DataFrame
-    check: pd.DataFrame
-    diagnosis: Diagnosis | None = None
-
-    @property
-    def verdict(self) -> str:
-        """The position error of the model in two sentences; blank without a condition."""
-        table = self.comparison
-        if not len(table):
-            return ""
-        worst = table.sort_values("rms_position_m").iloc[-1]
-        conditions = "one condition" if len(table) == 1 else f"{len(table)} conditions"
-        sentence = f"Over {conditions} the model is off by {_rms_mm(table['rms_position_m'])} mm"
-        known = table[table["replicate_floor_m"] > 0]
-        if len(known):
-            sentence += f", and replicates scatter by {_rms_mm(known['replicate_floor_m'])} mm"
-        return (
-            f"{sentence} (root mean square). Worst is {worst['condition']}, by "
-            f"{number(1e3 * worst['rms_position_m'])} mm, with the maximum after "
-            f"{number(1e3 * worst['worst_at_m'])} mm of growth."
-        )
+def model_errors(table: pd.DataFrame) -> str:
+    """The position error of the model in two sentences, from `comparison.csv`; blank without a condition."""
+    if not len(table):
+        return ""
+    worst = table.sort_values("rms_position_m").iloc[-1]
+    conditions = "one condition" if len(table) == 1 else f"{len(table)} conditions"
+    sentence = f"Over {conditions} the model is off by {_rms_mm(table['rms_position_m'])} mm"
+    known = table[table["replicate_floor_m"] > 0]
+    if len(known):
+        sentence += f", and replicates scatter by {_rms_mm(known['replicate_floor_m'])} mm"
+    return (
+        f"{sentence} (root mean square). Worst is {worst['condition']}, by "
+        f"{number(1e3 * worst['rms_position_m'])} mm, with the maximum after "
+        f"{number(1e3 * worst['worst_at_m'])} mm of growth."
+    )
 
 
 def final_errors(diagnosis: Diagnosis) -> str:
@@ -720,9 +648,7 @@ def _rms_mm(values_m: pd.Series) -> str:
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip that plays in the page: the trial, the MP4 file, a caption, and a WebP poster. The poster is shown until
-    the clip plays, and in print.
-    """
+    """A clip that plays in the page: trial, MP4 file, caption; a WebP poster, shown until it plays and in print."""
 
     trial: str
     mp4: bytes
@@ -748,8 +674,13 @@ class ReportContent:
     recordings: Mapping[str, TrackedRecording] = field(default_factory=dict)
     clips: Mapping[str, str] = field(default_factory=dict)
     clip: Clip | None = None
-    model: ModelResult | None = None
-    diagnosis: DiagnosisResult | None = None
+    fit: FitSummary | None = None
+    comparison: pd.DataFrame | None = None
+    check: pd.DataFrame | None = None
+    diagnosis: Diagnosis | None = None
+    moved: pd.DataFrame | None = None
+    laws: pd.DataFrame | None = None
+    effects: Mapping[str, Effect] = field(default_factory=dict)
     sections: Sequence[ReportSection] = ()
     notes: Sequence[str] = ()
 
@@ -779,29 +710,28 @@ def build_report(content: ReportContent) -> str:
         for vine, law in ((content.damping.get(method) or {}).get("vines") or {}).items()
     ]
     return environment.get_template("report.html").render(
-        name=content.name,
-        style=Markup(page_tokens() + (folder / "report.css").read_text(encoding="utf-8")),
-        headline=damping_headline(content.damping),
-        tally=status_tally(content.trials),
-        notes=content.notes,
-        damping=content.damping,
-        law_methods=LAW_METHODS,
-        laws=sorted(laws, key=lambda one: (one[1]["diameter_mm"], one[1]["thickness_um"], one[0])),
-        model=content.model,
-        final_errors=final_errors,
-        diagnosis=diagnosis_section(content.diagnosis),
-        figures=figures,
-        # Chosen: a sixth of the 15 MB that a report may have
-        clip=content.clip if content.clip is not None and len(content.clip.mp4) <= 2_500_000 else None,
-        sections=content.sections,
-        trials=trials,
-        rule_names=RULE_NAMES,
-        n_left_out=n_left_out,
-        calibrations=calibration_table(content.recordings),
-        filmed=bool(content.recordings),
-        run=settings,
-        settings=sorted(_flat(settings)),
-        provenance=content.provenance,
+        **vars(content)
+        | {
+            "style": Markup(page_tokens() + (folder / "report.css").read_text(encoding="utf-8")),
+            "headline": damping_headline(content.damping),
+            "tally": status_tally(content.trials),
+            "law_methods": LAW_METHODS,
+            "laws": sorted(laws, key=lambda one: (one[1]["diameter_mm"], one[1]["thickness_um"], one[0])),
+            "model_errors": model_errors,
+            "final": content.diagnosis,
+            "final_errors": final_errors,
+            "diagnosis": diagnosis_section(content),
+            "power_columns": POWER_COLUMNS,
+            "figures": figures,
+            # Chosen: a sixth of the 15 MB that a report may have
+            "clip": content.clip if content.clip is not None and len(content.clip.mp4) <= 2_500_000 else None,
+            "trials": trials,
+            "rule_names": RULE_NAMES,
+            "n_left_out": n_left_out,
+            "calibrations": calibration_table(content.recordings),
+            "run": settings,
+            "settings": sorted(_flat(settings)),
+        }
     )
 
 

@@ -72,9 +72,7 @@ class _File:
 
 
 class _Named:
-    """A file of each trial, condition or figure, as a method of `Results` that takes its name, and a suffix if it may
-    have several.
-    """
+    """A file of each trial, condition or figure: a method of `Results` that takes its name, perhaps a suffix."""
 
     def __init__(self, folder: str, suffix: str = "", prefix: str = "") -> None:
         self.folder, self.suffix, self.prefix = folder, suffix, prefix
@@ -127,9 +125,7 @@ class Results:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Say in a sentence that a file is not there, where an experiment may have been named instead of its results, or
-    that it does not hold what a stage wrote.
-    """
+    """Say in a sentence that a file is not there, or that it does not hold what a stage wrote."""
     try:
         yield
     except FileNotFoundError:
@@ -215,9 +211,7 @@ def read_source_experiment(folder: Path, experiment: Path | None = None) -> Expe
 def measured_trials(
     experiment: Experiment, results: Results
 ) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
-    """Read the tracks and kinematics of all trials that did not fail from a results folder. Returns pairs, kinematics
-    (by name of trial).
-    """
+    """Read the trials that did not fail, with their tracks, and their kinematics by name of trial."""
     pairs, kinematics = [], {}
     failed: set[str] = set()
     if results.trials.exists():
@@ -238,9 +232,7 @@ def measured_trials(
 
 
 def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
-    """Make a track of `tracks/<trial>.csv`, with the measured pressure. The results do not contain the pressure: it is
-    read from the user's track or pressure trace.
-    """
+    """Make a track of `tracks/<trial>.csv`, with the pressure measured in the user's track or trace."""
     from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
 
     names = ("time_s", "lead_position_m", "lead_position_sigma_m", "edge_px", "lead_position_systematic_m")
