@@ -13,7 +13,7 @@ from grown import Pairs, grown, pairs_of
 import vinetrack as vt
 from vinetrack.diagnosis import diagnose
 from vinetrack.diagnosis import ladder as ladder_module
-from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out, moved
+from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import predict_prepared, predict_trials
@@ -136,11 +136,3 @@ def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:
     assert math.isnan(table["rms_left_out_m"].iloc[0])
     assert math.isnan(table["excess_left_out_m"].iloc[0])
     assert table.attrs["notes"]
-
-
-def test_b_and_n_come_home_along_the_ladder(fits: tuple[Fit, Fit]) -> None:
-    table = moved(fits, ["", DEPLETION])
-    n = table[table["parameter"] == "eversion_damping.n"]
-    away = np.abs(n["value"].to_numpy() - 0.37)
-    assert away[1] < 0.01 < away[0]
-    assert len(table) == sum(len(one.numbers) for one in fits)

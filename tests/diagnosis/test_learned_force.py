@@ -19,6 +19,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
     SDIRK_GAMMA,
     CoefficientLikelihood,
+    ForceEstimate,
     ForcePoint,
     _with_updated_motions,
     acceleration_sensitivities,
@@ -46,7 +47,7 @@ from vinetrack.diagnosis.learned_force import (
     marginal_likelihood,
     variable_weights,
 )
-from vinetrack.diagnosis.missing_force import DetectedLaw, MissingForce, force_problem, missing_force
+from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, force_problem, missing_force
 from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_text
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
@@ -364,7 +365,7 @@ LAWS = [
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_the_effect_file_of_a_law_reproduces_the_law(law: Law, tmp_path: Path) -> None:
     path = tmp_path / f"proposed_{law.name}.py"
-    seen = DetectedLaw(law, (-0.2, 0.1)[: law.n_amplitudes], 0.9, "a force")
+    seen = RankedLaw(law, ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1), 0.0)
     path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]

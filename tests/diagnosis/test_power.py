@@ -32,7 +32,6 @@ from vinetrack.diagnosis.linear_power import (
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, Power, Rate
 from vinetrack.experiment.settings import Limits
-from vinetrack.pipeline.power_stage import sheet_rows
 from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
 CAMERA = FilmingPlan(500.0, 1e-4)
@@ -216,15 +215,6 @@ def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_
     never = further_trials(few, few_power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
     assert not never.is_reached
     assert never.unlimited < 0.9
-
-
-def test_rows_of_the_sheet_give_the_same_trials(few_power: Power, further: FurtherTrials) -> None:
-    rows = sheet_rows(replace(few_power, further=(further,)))
-    assert len({row["trial"] for row in rows}) == len(further.trials)
-    texts = {name: str(cell) for name, cell in rows[0].items() if name != "trial"}
-    read = vt.planned_trial(texts).trials[0]
-    assert read.pressure_Pa == pytest.approx(further.trials[0].trial.pressure_Pa)
-    assert read.vine == further.trials[0].trial.vine
 
 
 # Further trials where nothing is found.

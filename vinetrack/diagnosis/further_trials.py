@@ -91,29 +91,16 @@ class NextExperiment:
         return str(self.advice)
 
     def to_json(self) -> dict[str, Any]:
-        """As `diagnosis.json` holds it; unknown values are null."""
-        content: dict[str, Any] = _without_nan(
-            {
-                "text": self.text,
-                "trials": [dict(trial) for trial in self.trials],
-                "separation_sigma": dict(self.separation_sigma),
-                "if_true_sigma": {pair: dict(ways) for pair, ways in self.if_true_sigma.items()},
-                "simulated_sigma": {
-                    pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()
-                },
-                "alternatives": [dict(other) for other in self.alternatives],
-                "calibration": str(self.measurement) or None,
-            }
-        )
-        return content
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        """As `diagnosis.json` holds it."""
+        return {
+            "text": self.text,
+            "trials": self.trials,
+            "separation_sigma": self.separation_sigma,
+            "if_true_sigma": self.if_true_sigma,
+            "simulated_sigma": {pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()},
+            "alternatives": self.alternatives,
+            "calibration": str(self.measurement) or None,
+        }
 
 
 @dataclass(frozen=True)

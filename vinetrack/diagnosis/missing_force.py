@@ -259,16 +259,6 @@ LEAST_MISFIT_REDUCTION = 0.5
 
 
 @dataclass(frozen=True)
-class DetectedLaw:
-    """A law with its amplitudes, N, the part of the missing force that it explains, and its description."""
-
-    law: Law
-    amplitude_N: tuple[float, ...]
-    explained: float
-    words: str
-
-
-@dataclass(frozen=True)
 class MissingForce:
     """What is missing, as a force on the tail, N. `table`, columns `FORCE_COLUMNS`: the force of every condition
     (blank: mean over all) against `lead_position_m`, `tail_velocity_m_s`, `time_s` and `pressure_Pa`.
@@ -278,7 +268,7 @@ class MissingForce:
     laws: pd.DataFrame
     depends_on: Mapping[str, float]
     sentence: Remark
-    detected: tuple[DetectedLaw, ...] = ()
+    detected: tuple[RankedLaw, ...] = ()
     learned: LearnedForce | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -320,7 +310,7 @@ def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
         laws=_law_table(laws),
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),
-        detected=tuple(_detected(law) for law in laws if law.is_detected),
+        detected=tuple(law for law in laws if law.is_detected),
         learned=_learned(problem) if learn else None,
     )
 
@@ -346,10 +336,6 @@ def _learned(problem: ForceProblem) -> LearnedForce | None:
             return learned_force(problem)
     except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
         return None
-
-
-def _detected(ranked: RankedLaw) -> DetectedLaw:
-    return DetectedLaw(ranked.law, tuple(ranked.estimate.amplitude.tolist()), ranked.explained, ranked.words)
 
 
 def _explained_by_variable(problem: ForceProblem, point: ForcePoint) -> dict[str, float]:
@@ -435,18 +421,11 @@ def _binned_means(part: pd.DataFrame) -> pd.DataFrame:
 def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
     import pandas as pd
 
-    rows = [
-        (
-            law.law.name,
-            law.words,
-            law.explained,
-            float(law.estimate.amplitude[0]) if law.law.n_amplitudes == 1 else float(np.hypot(*law.estimate.amplitude)),
-            law.estimate.sigma,
-            law.estimate.delta_chi2,
-            law.bic,
-        )
-        for law in laws
-    ]
+    rows = []
+    for law in laws:
+        amplitude, estimate = law.estimate.amplitude, law.estimate
+        size_N = float(amplitude[0]) if law.law.n_amplitudes == 1 else float(np.hypot(*amplitude))
+        rows.append((law.law.name, law.words, law.explained, size_N, estimate.sigma, estimate.delta_chi2, law.bic))
     return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
 
 

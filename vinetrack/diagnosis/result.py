@@ -236,20 +236,9 @@ class Diagnosis:
 
         columns = ["round", "effect", "kind", "status", "delta_chi2", "sigma", "size", "in_answer_set", "plausible"]
         rows = [
-            (
-                i,
-                c.effect,
-                c.kind,
-                c.status,
-                c.delta_chi2,
-                c.sigma,
-                in_words(c),
-                c.in_answer_set,
-                c.plausible,
-                str(c.reason),
-            )
+            {**vars(row), "round": i, "size": in_words(row), "reason": str(row.reason)}
             for i, step in enumerate(self.rounds, 1)
-            for c in step.ranking
+            for row in step.ranking
         ]
         return pd.DataFrame(rows, columns=[*columns, "reason"])
 
