@@ -137,7 +137,9 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     tied = list(tied)[:5]
     names = _hypothesis_names(tied)
     measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
-    if _only_measurement(tied):
+    common = set.intersection(*(set(fit.model.names) for fit in tied))
+    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
+    if differ and all(effect.kind == "measurement" for effect in differ):
         faults = [name for name in names if name != NO_FURTHER_EFFECT]
         return NextExperiment(remark("measure_first", faults=faults, measurement=measurement), measurement=measurement)
     bench, terms = _feasible_trials(tied, names, limits)
@@ -145,13 +147,6 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     if not options:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
     return _recommendation(bench, options, seed)
-
-
-def _only_measurement(tied: Sequence[Fit]) -> bool:
-    """Return whether the hypotheses differ only in faults of the measurement."""
-    common = set.intersection(*(set(fit.model.names) for fit in tied))
-    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
-    return bool(differ) and all(effect.kind == "measurement" for effect in differ)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:

@@ -144,12 +144,13 @@ def compare(
     for condition in dict.fromkeys(trial.trial.condition for trial in predicted):
         members = [trial for trial in predicted if trial.trial.condition == condition]
         together = replicates_of(members)
+        known = [errors[trial.name] for trial in members if math.isfinite(errors[trial.name])]
         rows.append(
             {
                 "model": "+".join(fit.model.names),
                 "condition": condition,
                 **position_errors(members, together),
-                "rms_final_velocity_m_s": _rms([errors[trial.name] for trial in members]),
+                "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
         trajectories[condition] = trajectory_table(members, together)
@@ -249,11 +250,6 @@ def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.Dat
         }
         parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
-
-
-def _rms(values: Sequence[float]) -> float:
-    known = [value for value in values if math.isfinite(value)]
-    return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
 
 
 LADDER_COLUMNS = (

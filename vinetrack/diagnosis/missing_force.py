@@ -203,7 +203,11 @@ def _seen_from(problem: ForceProblem, point: ForcePoint) -> Misfit:
             RankedLaw(law, one, problem.bic(chi2, one.delta_chi2, law.n_parameters, largest), largest_N=largest_N)
             for law, one in estimated
         ]
-        return sorted(_best_of_kinds(laws), key=_detected_then_bic)
+        best: dict[str, RankedLaw] = {}
+        # Detected ones first, then by BIC
+        for law in sorted(laws, key=lambda law: (not law.is_detected, law.bic)):
+            best.setdefault(law.law.name, law)
+        return list(best.values())
 
     estimated = _estimates(problem, point, laws_on_grid(point.motions))
     near = [law for best in ranked(estimated) for law in laws_near(best.law, point.motions)]
@@ -224,11 +228,6 @@ def _estimates(problem: ForceProblem, point: ForcePoint, laws: Sequence[Law]) ->
     ]
 
 
-def _detected_then_bic(law: RankedLaw) -> tuple[bool, float]:
-    """Order of laws: those that are detected first, then by BIC."""
-    return not law.is_detected, law.bic
-
-
 def _largest_N(motions: Sequence[FittedMotion]) -> float:
     """The largest force that is reported: MAX_DRIVE_RATIO times drive, weight and inertia at their largest."""
     sizes = []
@@ -237,15 +236,6 @@ def _largest_N(motions: Sequence[FittedMotion]) -> float:
         body_N = motion.mass_kg * (GRAVITY_M_S2 + np.abs(motion.acceleration))
         sizes.append(float(np.max(drive_N + body_N)))
     return MAX_DRIVE_RATIO * max(sizes)
-
-
-def _best_of_kinds(laws: Sequence[RankedLaw]) -> list[RankedLaw]:
-    best: dict[str, RankedLaw] = {}
-    for law in laws:
-        before = best.get(law.law.name)
-        if before is None or _detected_then_bic(law) < _detected_then_bic(before):
-            best[law.law.name] = law
-    return list(best.values())
 
 
 FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -84,13 +84,13 @@ class EffectPower(JsonRecord):
 
 
 @dataclass(frozen=True)
-class NumberWidth:
+class NumberWidth(JsonRecord):
     """Half width of the 95 % interval of a fitted parameter: relative for B, absolute for n."""
 
     name: str
     vine: str
-    value: float
-    half_width: float
+    value: OrNaN
+    half_width: OrNaN
 
     @property
     def is_relative(self) -> bool:
@@ -270,8 +270,6 @@ class Power:
 
     def of_effects(self, names: Sequence[str]) -> Power:
         """The same for a selection of effects."""
-        from dataclasses import replace
-
         if not names:
             return self
         return replace(
@@ -312,10 +310,7 @@ class Power:
             not_testable={
                 str(name): Remark.from_json(why) for name, why in (content.get("not_testable_codes") or {}).items()
             },
-            numbers=tuple(
-                NumberWidth(str(e["name"]), str(e["vine"]), or_nan(e["value"]), or_nan(e["half_width"]))
-                for e in content.get("numbers") or ()
-            ),
+            numbers=tuple(map(NumberWidth.from_json, content.get("numbers") or ())),
             inputs=tuple(PowerInput(**entry) for entry in content.get("inputs") or ()),
             model=tuple(content.get("model") or ()),
             wary=Remark.from_json(content.get("wary_code")),
