@@ -132,7 +132,6 @@ def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
 
 
 def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diagnosis) -> None:
-    """A step that a few points with heavy tails may have made had been the verdict in place of `supply_pulsation`."""
     missing = LostFrames(("a", "b"))
     result = with_lost_frames(depleted, missing)
     assert (result.verdict, result.effects) == (depleted.verdict, depleted.effects)

@@ -76,7 +76,6 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs:
 
 
 def test_in_sample_error_and_floor_are_those_of_the_comparison(fits: tuple[Fit, Fit], pairs: Pairs) -> None:
-    """And the excess is what the floor leaves of the error."""
     table = compare(fits[0], pairs).table
     errors = in_sample(fits[0])
     assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
@@ -114,7 +113,6 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pai
 def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(
     fits: tuple[Fit, Fit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on real tubes that stick, where the numbers of the other trials leave one at a corner of its motion."""
     stuck = fits[0].trials[4].name
 
     def predicted(fit: Fit, data: Sequence[FitTrial], **told: bool) -> list[TrialFit]:

@@ -110,7 +110,6 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
 
 
 def seen(design: Floats, positions: Floats) -> CoefficientLikelihood:
-    """Likelihood of the coefficients from positions with unit noise."""
     return CoefficientLikelihood(design.T @ design, design.T @ positions, float(positions @ positions), 0.0, 0.0)
 
 
@@ -195,7 +194,6 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium() 
 
 
 def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path: Path) -> None:
-    """The score of a trial's pressure deviation against a finite difference of the cost."""
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
     tracks = slowed.tracks
@@ -226,7 +224,6 @@ def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pres
 
 
 def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
-    """The force that the base model lacks, compared with laws; as a smooth function it is tested above."""
     pairs = hidden_force(sheet((4,)), seed, name, size_N, folder)
     return missing_force(vt.fit(vt.base_model(), pairs, profile=False), learn=False)
 
@@ -307,7 +304,6 @@ DOMAINS = [
 
 
 def learned(domain: Domain, seed: int) -> LearnedForce:
-    """A force with arbitrary coefficients over a domain."""
     coefficients = np.random.default_rng(seed).standard_normal(domain.size)
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4}
     table = pd.DataFrame([where | {"force_N": -0.1, "sigma_N": 0.01, "trials": 2, "condition": ""}])

@@ -45,7 +45,6 @@ def planned(
     candidates: tuple[str, ...] = CANDIDATES,
     **cells: str,
 ) -> CampaignDesign:
-    """Trials of one vine at some pressures, kPa, with so many replicates each."""
     trials: list[Trial] = []
     for pressure in pressures:
         texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "pressure_kPa": pressure}
@@ -56,7 +55,6 @@ def planned(
 
 
 def with_trials(design: CampaignDesign, added: Sequence[Trial]) -> CampaignDesign:
-    """A design with these trials as well."""
     trials = (*design.trials, *added)
     return replace(design, trials=trials, cameras=(CAMERA,) * len(trials))
 

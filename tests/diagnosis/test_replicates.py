@@ -21,7 +21,6 @@ STEP_S = 1e-3
 def trial_fit(
     name: str, time_s: Floats, position_m: Floats, model_m: Floats, speed_m_s: Floats, release_s: float, origin_m: float
 ) -> TrialFit:
-    """A measurement and what a model predicts of it."""
     off_m = position_m - model_m
     nothing = ("release_sigma_s", "origin_sigma_m", "pressure_deviation", "pressure_deviation_sigma",
                "damping_deviation", "damping_deviation_sigma")  # fmt: skip
@@ -136,7 +135,6 @@ def errors_of(*trials: TrialFit) -> dict[str, float]:
 
 
 def test_the_error_of_position_is_that_of_the_growth_and_trials_count_alike() -> None:
-    """However long the rest was filmed, and however many frames a trial has."""
     # 100 moving frames off by 3 mm, and the frame of the release itself: √(100/101) · 3 mm.
     for rest in (10, 500):
         assert errors_of(by_hand("a", 3e-3, rest=rest))["rms_position_m"] == pytest.approx(3e-3 * np.sqrt(100 / 101))

@@ -112,12 +112,10 @@ def test_a_quick_supply_saves_a_chamber() -> None:
 
 
 def made(pressure_kPa: float, **more: object) -> Trial:
-    """As in a sheet, without a chamber."""
     return replace(trial(pressure_kPa=pressure_kPa, chamber_l=""), **more)  # type: ignore[arg-type]
 
 
 def looked_at(trials: list[Trial], **limits: Any) -> list[Condition]:
-    """Conditions for an experiment of these trials."""
     return feasible_conditions(with_names(trials), Limits(**limits))
 
 
