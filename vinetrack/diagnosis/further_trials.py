@@ -489,7 +489,7 @@ def further_trials(
     # 48: most further trials considered where `limits.trials` is not stated (chosen)
     most = limits.trials if "trials" in limits.model_fields_set else 48
     before = now.probability_at(value)
-    plan = FurtherTrials(now.effect, now.parameter, now.symbol, now.unit, value, target, before, power=now)
+    plan = FurtherTrials(now, value, target, before)
     feasible = feasible_conditions(design.trials, limits)
     if before >= target or not feasible:
         return replace(plan, unlimited=before)
@@ -503,7 +503,6 @@ def further_trials(
     for _ in range(3):
         chosen, needed = search.fewest(wanted, most // REPLICATES)
         plan = _evaluated(design, search, replace(plan, n_conditions=len(search.conditions), needed=needed), chosen)
-        assert plan.power is not None
         shortfall = abs(plan.power.size_at(target) - now.zero) / deviation
         if plan.is_reached or not math.isfinite(shortfall) or len(chosen) >= most // REPLICATES:
             break
@@ -600,13 +599,11 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
     trials: list[AddedTrial] = []
     power, probability = plan.power, plan.before
     while len(trials) < len(conditions) and probability < plan.target:
-        power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), plan.effect) or power
-        assert power is not None
+        power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), power.effect) or power
         probability = power.probability_at(plan.value)
         for condition in conditions[len(trials) : len(trials) + REPLICATES]:
             trial = replace(condition.trial, name=f"added_{len(trials) + 1}")
             trials.append(AddedTrial(trial, condition.changed, condition.effort == NEW_VINE, probability))
-    assert power is not None
     endless = search.first_information((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
     ratio = math.sqrt(endless / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
     unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))

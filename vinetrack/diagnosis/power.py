@@ -176,15 +176,12 @@ class AddedTrial:
 
 @dataclass(frozen=True)
 class FurtherTrials:
-    """Further trials that bring the power for an effect of one size to a target. `before` is the power with the trials
-    so far; `unlimited` that with unlimited replicates of all trials within the limits; `n_conditions` counts the
-    conditions considered.
+    """Further trials that bring the power for an effect of one size to a target. `power` is that with these trials,
+    `before` the probability with the trials so far, `unlimited` that with unlimited replicates of all trials within the
+    limits; `n_conditions` counts the conditions considered.
     """
 
-    effect: str
-    parameter: str
-    symbol: str
-    unit: str
+    power: EffectPower
     value: float
     target: float
     before: float
@@ -192,7 +189,6 @@ class FurtherTrials:
     n_conditions: int = 0
     trials: tuple[AddedTrial, ...] = ()
     needed: Mapping[str, int] = field(default_factory=dict)
-    power: EffectPower | None = None
 
     @property
     def after(self) -> float:
@@ -207,9 +203,9 @@ class FurtherTrials:
     def to_json(self) -> dict[str, Any]:
         """As the key `further_trials` of what `vinetrack power --json` writes."""
         return {
-            "effect": self.effect,
-            "parameter": self.parameter,
-            "unit": self.unit,
+            "effect": self.power.effect,
+            "parameter": self.power.parameter,
+            "unit": self.power.unit,
             "value": self.value,
             "wanted": self.target,
             "probability_before": self.before,
@@ -217,7 +213,7 @@ class FurtherTrials:
             "probability_endless": self.unlimited,
             "conditions_looked_at": self.n_conditions,
             "needed": dict(self.needed),
-            "taken_for": dict(self.power.taken_for) if self.power else {},
+            "taken_for": dict(self.power.taken_for),
             "trials": [
                 {
                     **sheet_cells(added.trial),

@@ -242,8 +242,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     from vinetrack.core.terminal import table
     from vinetrack.diagnosis.power import sheet_cells
 
-    size = size_text(plan.power, plan.value) if plan.power is not None else number(plan.value, 2)
-    what = f"{spaced_name(plan.effect)} at {plan.symbol} = {size}"
+    power = plan.power
+    what = f"{spaced_name(power.effect)} at {power.symbol} = {size_text(power, plan.value)}"
     if plan.before >= plan.target:
         return [f"{what} is detected with {percent(plan.before)} power by these trials: none need be added."]
     if not plan.n_conditions:
@@ -258,8 +258,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         added, kPa, grams = alike[0], cells.get("pressure_kPa", math.nan), cells.get("payload_g", 0.0)
         new = ["a new vine"] if added.new_vine else []
         new += [f"{rig.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
-        power = percent(alike[-1].probability)
-        rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", power))
+        then = percent(alike[-1].probability)
+        rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", then))
     if rows and plan.after > plan.before:
         head = ("trials", "vine", "pressure", "payload", "new", "power then")
         lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
@@ -280,8 +280,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     ]
     if plan.is_reached and alternatives:
         lines.append(f"Without these changes: {', '.join(alternatives)} trials.")
-    if plan.power is not None and plan.power.taken_for:
-        names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3]]
+    if power.taken_for:
+        names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:3]]
         lines.append(f"With them it would be mistaken for {joined(names)} of campaigns (at the size of 90 % power).")
     return lines
 
