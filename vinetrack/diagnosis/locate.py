@@ -191,8 +191,8 @@ def _where(table: pd.DataFrame, fails: bool) -> Iterator[Remark]:
     numbers = {name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")}
     yield remark("fails_most", condition=_named(worst, table), **numbers)
     # 2.0: significance, in standard deviations, from which it is said to fail in a condition
-    failing = table["z"] > min(2.0, float(table["z"].max()) - 1e-9)
-    yield remark("fails_in", count=int(failing.sum()), total=len(table))
+    count, total = int((table["z"] > min(2.0, float(table["z"].max()) - 1e-9)).sum()), len(table)
+    yield remark("fails_everywhere") if count == total else remark("fails_in", count=count, total=total)
     for column in ("pressure_Pa", "payload_kg"):
         usable = table[np.isfinite(table["ratio"])]
         steps = [group.sort_values(column)["ratio"].to_numpy(float) for _, group in usable.groupby("vine")]

@@ -957,16 +957,6 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"The error on {'left-out conditions' if left_out == 'conditions' else 'the left-out highest pressure'} is"
         f" without {_count(count, 'trial')}, unlike that in sample: {reason}"
     ),
-    "B_given": lambda error: f"B is given to {100 * error:.2g} % (one standard deviation)",
-    "printed_B_scatter": lambda printed, here, dof: (
-        f"the four printed B scatter by {100 * printed:.0f} % about it: {100 * here:.0f} % at this size (Student's t,"
-        f" {dof} degrees of freedom)"
-    ),
-    "one_t_over_D": lambda sigma, here: (
-        f"B is printed for one t/D only: exponents of t and D ±{sigma:g} against each other, {100 * here:.0f} % at this"
-        " t/D"
-    ),
-    "spread": lambda origin, size: f"{origin}: {100 * size:.2g} %",
     "medians_and_bands": lambda model, samples: f"{' + '.join(model)}; medians and 90 % bands of {samples} draws",
     "fastest_by": lambda quantity, y_over_L, share, burst_MPa, kPa: (
         f"fastest by {quantity}{_at_place(y_over_L)}; hoop stress up to {share:.0%} of {burst_MPa:g} MPa, supply up to"
@@ -1026,10 +1016,6 @@ REMARKS: dict[str, Callable[..., str]] = {
     ),
     "misfit_falls": lambda column: (
         f"The {'lower the pressure' if column == 'pressure_Pa' else 'smaller the payload'}, the larger the misfit."
-    ),
-    "fails_in": lambda count, total: (
-        f"It fails in {'every condition' if count == total else f'{count} of {total} conditions'} by more than the"
-        " scatter of replicates."
     ),
     "drifts": drift_text,
     "like_no_law": like_no_law_text,
