@@ -541,7 +541,7 @@ def film_trials(
     select usable points as for a fit; None where there are too few. Shapes: theta (n_free,); deviations (n_places, 2).
     """
     chosen, of_chosen = [conditions[k] for k in places], [cameras[k] for k in places]
-    data, rho = truth.fit.predictor.data, truth.fit.state.rho
+    data, rho = truth.fit.predictor.data, truth.fit.solution.state.rho
     times = [
         camera.frame_s * np.arange(camera.rest_frames + math.ceil(camera.longest_s / camera.frame_s), dtype=float)
         for camera in of_chosen
@@ -652,7 +652,7 @@ def _terms_of(
     hypothesis: Hypothesis, columns: Floats, differences: Floats, has_deviations: NDArray[np.bool_]
 ) -> RefitTerms:
     # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
-    scale = (1 - hypothesis.fit.state.rho) / np.sqrt(hypothesis.variance)
+    scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
     both = scale * np.concatenate([columns[:, :, :-1], differences], axis=2)
     products = np.swapaxes(both, 1, 2) @ both
     levels = hypothesis.scatter_levels

@@ -177,7 +177,7 @@ def simulated_rises(
         deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
         try:
             filmed = film_trials(
-                truth, design, bench.conditions, bench.cameras, theta, deviations * truth.fit.state.spread, rng
+                truth, design, bench.conditions, bench.cameras, theta, deviations * truth.fit.solution.state.spread, rng
             )
         except SimulationError:
             continue
