@@ -55,7 +55,7 @@ BUDGETS = {
     "interface": (629, 2, 2),
     "kinematics": (1940, 6, 12),
     "laboratory": (1846, 6, 13),
-    "narrative": (1492, 3, 13),
+    "narrative": (1839, 3, 12),
     "pages": (3425, 8, 24),
     "paper": (842, 3, 15),
     "pipeline": (3180, 10, 13),

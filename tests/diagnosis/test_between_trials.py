@@ -37,7 +37,6 @@ def made(trials: Sequence[Trial], factors: Sequence[float], seed: int) -> Pairs:
 
 
 def uses(trials: Sequence[Trial]) -> list[int]:
-    """How often the tube of each trial was used before."""
     return [sum(other.vine == trial.vine for other in trials[:i]) for i, trial in enumerate(trials)]
 
 
@@ -46,7 +45,6 @@ PHYSICS = ("reservoir_depletion", "tail_friction", "air_drag", "length_scale")
 
 
 def diagnosed(pairs: Pairs, candidates: Sequence[str] = PHYSICS) -> tuple[Diagnosis, dict[str, Numbers]]:
-    """What is said, and the numbers of each effect."""
     said = vt.diagnose(pairs, candidates=candidates, ladder=False, advice=False)
     return said, {row.effect: {n.vine: n for n in row.numbers} for row in said.rounds[0].ranking}
 
@@ -85,7 +83,6 @@ def test_what_changes_in_the_course_of_a_campaign_is_named_with_its_size(
 
 @pytest.mark.slow
 def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials: list[Trial]) -> None:
-    """Three days, pressures rising; the tube gets 5 % more on the second and 4 % less on the third."""
     known = [replace(trial, day=str(1 + 3 * i // len(trials))) for i, trial in enumerate(trials)]
     result, sizes = misread(known, [{"1": 1.0, "2": 1.05, "3": 0.96}[trial.day] for trial in known], seed=10)
     assert result.verdict in (ARTEFACT, AMBIGUOUS)

@@ -13,7 +13,7 @@ from grown import Pairs, grown, pairs_of
 import vinetrack as vt
 from vinetrack.diagnosis import diagnose
 from vinetrack.diagnosis import ladder as ladder_module
-from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out, moved
+from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import predict_prepared, predict_trials
@@ -76,7 +76,6 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs:
 
 
 def test_in_sample_error_and_floor_are_those_of_the_comparison(fits: tuple[Fit, Fit], pairs: Pairs) -> None:
-    """And the excess is what the floor leaves of the error."""
     table = compare(fits[0], pairs).table
     errors = in_sample(fits[0])
     assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
@@ -114,7 +113,6 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pai
 def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(
     fits: tuple[Fit, Fit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on real tubes that stick, where the numbers of the other trials leave one at a corner of its motion."""
     stuck = fits[0].trials[4].name
 
     def predicted(fit: Fit, data: Sequence[FitTrial], **told: bool) -> list[TrialFit]:
@@ -136,11 +134,3 @@ def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:
     assert math.isnan(table["rms_left_out_m"].iloc[0])
     assert math.isnan(table["excess_left_out_m"].iloc[0])
     assert table.attrs["notes"]
-
-
-def test_b_and_n_come_home_along_the_ladder(fits: tuple[Fit, Fit]) -> None:
-    table = moved(fits, ["", DEPLETION])
-    n = table[table["parameter"] == "eversion_damping.n"]
-    away = np.abs(n["value"].to_numpy() - 0.37)
-    assert away[1] < 0.01 < away[0]
-    assert len(table) == sum(len(one.numbers) for one in fits)

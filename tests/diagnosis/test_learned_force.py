@@ -19,6 +19,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
     SDIRK_GAMMA,
     CoefficientLikelihood,
+    ForceEstimate,
     ForcePoint,
     _with_updated_motions,
     acceleration_sensitivities,
@@ -46,7 +47,7 @@ from vinetrack.diagnosis.learned_force import (
     marginal_likelihood,
     variable_weights,
 )
-from vinetrack.diagnosis.missing_force import DetectedLaw, MissingForce, force_problem, missing_force
+from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, force_problem, missing_force
 from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_text
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
@@ -109,7 +110,6 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
 
 
 def seen(design: Floats, positions: Floats) -> CoefficientLikelihood:
-    """Likelihood of the coefficients from positions with unit noise."""
     return CoefficientLikelihood(design.T @ design, design.T @ positions, float(positions @ positions), 0.0, 0.0)
 
 
@@ -194,7 +194,6 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium() 
 
 
 def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path: Path) -> None:
-    """The score of a trial's pressure deviation against a finite difference of the cost."""
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
     tracks = slowed.tracks
@@ -225,7 +224,6 @@ def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pres
 
 
 def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
-    """The force that the base model lacks, compared with laws; as a smooth function it is tested above."""
     pairs = hidden_force(sheet((4,)), seed, name, size_N, folder)
     return missing_force(vt.fit(vt.base_model(), pairs, profile=False), learn=False)
 
@@ -306,7 +304,6 @@ DOMAINS = [
 
 
 def learned(domain: Domain, seed: int) -> LearnedForce:
-    """A force with arbitrary coefficients over a domain."""
     coefficients = np.random.default_rng(seed).standard_normal(domain.size)
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4}
     table = pd.DataFrame([where | {"force_N": -0.1, "sigma_N": 0.01, "trials": 2, "condition": ""}])
@@ -364,7 +361,7 @@ LAWS = [
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_the_effect_file_of_a_law_reproduces_the_law(law: Law, tmp_path: Path) -> None:
     path = tmp_path / f"proposed_{law.name}.py"
-    seen = DetectedLaw(law, (-0.2, 0.1)[: law.n_amplitudes], 0.9, "a force")
+    seen = RankedLaw(law, ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1), 0.0)
     path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]

@@ -46,7 +46,6 @@ def fits_of(pairs: Pairs, *effects: str) -> list[Fit]:
 
 
 def as_trials(found: NextExperiment, like: Trial) -> list[Trial]:
-    """The recommended trials, to be grown."""
     columns = {
         "pressure_Pa": ("pressure_kPa", 1e3), "pressure_sigma_Pa": ("pressure_kPa", 10),
         "payload_kg": ("payload_g", 1e-3), "diameter_m": ("diameter_mm", 1e-3), "thickness_m": ("thickness_um", 1e-6),
@@ -74,7 +73,6 @@ def shown(fits: Sequence[Fit], pairs: Pairs) -> float:
 
 @pytest.fixture(scope="module")
 def dragged() -> tuple[Pairs, list[Fit]]:
-    """24 trials of one tube with a strong drag, fitted with it and with an inlet loss: they cannot be distinguished."""
     tube = campaign(Vine(24.0, 200.0, 280.0), (14, 20, 28, 38), 6)
     trials = with_names([replace(trial, chamber_m3=3.7e-3, inlet_m=8e-3) for trial in tube])
     pairs = grown(list(trials), 4001)

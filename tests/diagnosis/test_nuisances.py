@@ -44,20 +44,16 @@ def careful(payload_g: float, seed: int) -> Pairs:
 
 
 def questioned(pairs: Pairs, model: Model, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND) -> MisfitTests:
-    """What tests say of the model, fitted to these trials, beside all other effects."""
     candidates = candidates_of(model, None, None)
     found = fit(model, pairs, host=host_for(model, candidates), profile=False)
     return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], level)
 
 
 def misweighed() -> Pairs:
-    """Payloads of 60 g of which the sheet says one per cent less."""
     return [(replace(trial, payload_kg=trial.payload_kg / 1.01), track) for trial, track in careful(60.0, 8)]
 
 
 def seen_crookedly() -> Pairs:
-    """Tracks that say of themselves that they err by 20 µm, and do, slowly and all alike."""
-
     made = []
     for trial, track in careful(0.0, 9):
         y = track.lead_position_m

@@ -39,7 +39,6 @@ def campaign() -> list[tuple[Trial, Track]]:
 
 
 def stated(pairs: list[tuple[Trial, Track]], **kPa: float) -> list[tuple[Trial, Track]]:
-    """The campaign with other pressures in these rows, and other conditions therefore."""
     told = {name: {"pressure_Pa": 1e3 * value, "condition": f"12mm_{value}"} for name, value in kPa.items()}
     return [(replace(trial, **told.get(trial.name, {})), track) for trial, track in pairs]
 

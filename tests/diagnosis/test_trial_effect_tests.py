@@ -47,7 +47,6 @@ def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials: 
 
 
 def wandering(*, at_rest: bool) -> Pairs:
-    """Positions that wander slowly, in motion alone or all along."""
     draw, spoilt = np.random.default_rng(3), []
     for trial, track in grown(seed=31):
         wander_m = WANDER_M * ar1(track.time_s.size, 0.9, draw)

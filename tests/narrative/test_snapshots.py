@@ -52,7 +52,7 @@ def power() -> str:
 
 def plan() -> str:
     entry = POWER["fold_inertia"]
-    none = FurtherTrials("fold_inertia", "eta", "η", "1", 0.5, 0.9, 0.2, power=entry)
+    none = FurtherTrials(entry, 0.5, 0.9, 0.2)
     enough = replace(none, before=0.95)
     never = replace(none, unlimited=0.4, n_conditions=12)
     trials = [{"replicates": 2, "pressure_kPa": 30.0, "payload_g": 20.0, "diameter_mm": 24.0, "thickness_um": 200.0,

@@ -16,6 +16,7 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.sheet import planned_trial
+from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.prediction import (
@@ -53,13 +54,11 @@ VINE = dict(zip(SIZES, (24, 200, 280, 28), strict=True))
 
 
 def trial(**values: object) -> Trial:
-    """The fast vine, its yield pressure exact; or another."""
     said = {**FAST, "yield_pressure_sigma_kPa": "0", **{name: str(value) for name, value in values.items()}}
     return planned_trial(said).trials[0]
 
 
 def unsaid(**values: object) -> Trial:
-    """The fast vine, of which nobody says the yield pressure; or another."""
     said = {**dict(zip(SIZES, (25, 100, 400, 62), strict=True)), **values}
     return planned_trial({name: str(value) for name, value in said.items()}).trials[0]
 
@@ -144,37 +143,22 @@ def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> Non
 B, N = "eversion_damping.B", "eversion_damping.n"
 
 
-def fitted(**changes: Any) -> dict[str, Any]:
-    """A fit.json by hand: B 6 ± 0.06, n 0.4 ± 0.01, correlation −0.8; P_y 3.2 ± 0.1 kPa by itself."""
-    half = 1.959964
-
-    def number(key: str, vine: str, value: float, sigma: float) -> dict[str, Any]:
-        ends = {"low_95": value - half * sigma, "high_95": value + half * sigma}
-        if key == B:
-            ends = {"low_95": value * math.exp(-half * 0.01), "high_95": value * math.exp(half * 0.01)}
-        told = {"symbol": key.split(".")[1], "unit": "", "interval": "linear", "bound": None}
-        return {"parameter": key, "vine": vine, "value": value, "sigma": sigma, **ends, **told}
-
-    vine = "24mm-200um-280mm"
-    return {
-        "model": ["pressure_drive", "gravity", "eversion_damping", "yield_pressure"],
-        "refused": None,
-        "numbers": [
-            number(B, vine, 6.0, 0.06), number(N, "", 0.4, 0.01), number("yield_pressure.P_y", vine, 3200.0, 100.0),
-        ],
-        "covariance": [[0.0036, -0.00048, 0.0], [-0.00048, 1e-4, 0.0], [0.0, 0.0, 1e4]],
-        "spreads": {"pressure": {"value": 0.02, "estimated": True}, "B": {"value": 0.05, "estimated": True}},
-        "trials": {"a": {}, "b": {}},
-        **changes,
-    }  # fmt: skip
-
-
-def numbers_of(content: dict[str, Any]) -> FitNumbers:
-    return fit_numbers(FitSummary.from_json(content))
+def fitted(n_trials: int = 2, B_is_estimated: bool = True) -> FitNumbers:
+    """By hand: B 6 ± 0.06, n 0.4 ± 0.01, correlation −0.8; P_y 3.2 ± 0.1 kPa by itself."""
+    half, vine = 1.959964, "24mm-200um-280mm"
+    numbers = (
+        Number(B, vine, "B", "", 6.0, 0.06, 6.0 * math.exp(-half * 0.01), 6.0 * math.exp(half * 0.01)),
+        Number(N, "", "n", "", 0.4, 0.01, 0.4 - half * 0.01, 0.4 + half * 0.01),
+        Number("yield_pressure.P_y", vine, "P_y", "", 3200.0, 100.0, 3200.0 - half * 100, 3200.0 + half * 100),
+    )
+    covariance = np.array([[0.0036, -0.00048, 0.0], [-0.00048, 1e-4, 0.0], [0.0, 0.0, 1e4]])
+    spreads = {"pressure": BetweenTrialSpread(0.02, True), "B": BetweenTrialSpread(0.05, B_is_estimated)}
+    rest: Any = {"covariance": covariance, "spreads": spreads, "trials": dict.fromkeys(range(n_trials))}
+    return fit_numbers(FitSummary(vt.base_model().names, numbers=numbers, **rest), "a")
 
 
 def test_what_a_person_says_goes_before_the_fit_and_the_fit_before_the_guess() -> None:
-    numbers = numbers_of(fitted())
+    numbers = fitted()
     assert predictive_inputs(unsaid(**VINE), StatedValues(B=5.0), numbers).medians[B] == 5.0
     assert predictive_inputs(unsaid(**VINE), None, numbers).medians[B] == pytest.approx(6.0)
     assert predictive_inputs(unsaid()).medians[B] == pytest.approx(3.32, abs=0.005)
@@ -186,7 +170,7 @@ def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a
 
 
 def test_draws_from_a_fit_have_its_covariance() -> None:
-    inputs = predictive_inputs(unsaid(**VINE), StatedValues(spreads=(0.0, 0.0)), numbers_of(fitted()))
+    inputs = predictive_inputs(unsaid(**VINE), StatedValues(spreads=(0.0, 0.0)), fitted())
     draws = inputs.draw(40_000, seed=3)
     found = np.cov([np.log(draws[B]), draws[N], draws[YIELD] / 1e5])
     # ln B has 0.06/6 = 1 %, and n the correlation −0.00048/(0.06 × 0.01) = −0.8 with it.
@@ -196,23 +180,21 @@ def test_draws_from_a_fit_have_its_covariance() -> None:
 
 def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials() -> None:
     """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
-    content = fitted(trials={str(k): {} for k in range(13)})
-    content["spreads"]["B"]["estimated"] = False
-    inputs = predictive_inputs(unsaid(**VINE), None, numbers_of(content))
+    inputs = predictive_inputs(unsaid(**VINE), None, fitted(13, B_is_estimated=False))
     draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
     assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
     assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
 
 
 def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess() -> None:
-    inputs = predictive_inputs(unsaid(diameter_mm=24, thickness_um=100, length_mm=280), None, numbers_of(fitted()))
+    inputs = predictive_inputs(unsaid(diameter_mm=24, thickness_um=100, length_mm=280), None, fitted())
     assert inputs.medians[B] == pytest.approx(3.0)  # half the wall, half of B
     assert [(note.code, note.facts["vine"]) for note in inputs.notes] == [("B_carried_over", "24mm-200um-280mm")]
     assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
 
 
 def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed() -> None:
-    numbers = numbers_of(fitted())
+    numbers = fitted()
     assert predictive_inputs(unsaid(**VINE, yield_pressure_kPa=3), None, numbers).medians[YIELD] == 3200.0
     assert predictive_inputs(unsaid(**VINE, yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
 

@@ -10,9 +10,7 @@ import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from importlib import import_module
-from typing import Annotated, Any
-
-from pydantic import BeforeValidator, PlainSerializer
+from typing import Any
 
 CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
 
@@ -163,9 +161,6 @@ class Remark:
     def from_json(cls, content: Mapping[str, Any] | None) -> Remark:
         """Read what `to_json` wrote."""
         return cls(content["code"], {k: v for k, v in content.items() if k != "code"}) if content else cls()
-
-
-StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)]
 
 
 def remark(code: str, **facts: Any) -> Remark:

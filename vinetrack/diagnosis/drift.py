@@ -319,22 +319,14 @@ def _group(
 HALVES = (0.25, 0.75)  # Midpoints of the halves, as fractions of the growth (defined)
 
 
-@dataclass(frozen=True)
-class _Halves:
-    """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2)."""
-
-    trials: tuple[Trial, ...]
-    deviation: Floats
-
-
 def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
     """Test B for a change along the growth, for every vine and for all."""
     if aligned.predictor.damping_column < 0:
         return
     halves = _halves(fit, aligned, estimates.trial_effects)
-    vines = np.array([trial.vine for trial in halves.trials])
+    vines = np.array([trial.vine for trial in estimates.trials])
     # 3.0: deviation of ln B of a half (chosen)
-    usable = (np.abs(halves.deviation) <= 3.0).all(axis=1)
+    usable = (np.abs(halves) <= 3.0).all(axis=1)
     names = list(dict.fromkeys(vines[usable]))
     for vine in [*names, *([""] if len(names) > 1 else [])]:
         chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
@@ -343,9 +335,9 @@ def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates)
             yield test
 
 
-def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> _Halves:
-    """Deviations of ln B in both halves, linearised about each trial's own B. About the common B, the between-trial
-    scatter would enter in second order.
+def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> Floats:
+    """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2), linearised about each
+    trial's own B. About the common B, the between-trial scatter would enter in second order.
     """
     motions = motions_of(fit, trial_effects)
     data = aligned.predictor.data
@@ -363,7 +355,7 @@ def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> _Halves:
         if aligned.predictor.has_damping_deviation[i] and np.all(np.ptp(sensitivities, axis=0) > 0):
             design = np.column_stack([sensitivities, others])
             deviation[i] = np.linalg.lstsq(design, columns[i][:, -1], rcond=1e-9)[0][:2]
-    return _Halves(tuple(trial_data.trial for trial_data in data), deviation + trial_effects[:, [DAMPING_DEVIATION]])
+    return np.asarray(deviation + trial_effects[:, [DAMPING_DEVIATION]])
 
 
 def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
@@ -379,15 +371,15 @@ def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
 
 
 def _difference_test(
-    fit: Fit, estimates: PerTrialEstimates, halves: _Halves, vine: str, chosen: np.ndarray
+    fit: Fit, estimates: PerTrialEstimates, halves: Floats, vine: str, chosen: np.ndarray
 ) -> ConstancyTest | None:
     """Student's t test of the mean difference of the halves; None without enough degrees of freedom. The groups of a
     vine are its halves, among which the variance of their difference is divided equally.
     """
     from scipy.stats import t as student
 
-    rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
-    scatter, dof = _scatter(rise, [halves.trials[i].condition for i in chosen])
+    rise = halves[chosen, 1] - halves[chosen, 0]
+    scatter, dof = _scatter(rise, [estimates.trials[i].condition for i in chosen])
     if dof < FEWEST_DEGREES:
         return None
     # 2e-3: lower limit of the standard deviation of the rise of ln B in single trials (chosen)
@@ -399,7 +391,7 @@ def _difference_test(
     if vine:
         base = float(fit.model.parameters_for(vine)[fit.model.parameter_names.index(DAMPING)])
         for half, level in enumerate(HALVES):
-            ratio = math.exp(float(halves.deviation[chosen, half].mean()))
+            ratio = math.exp(float(halves[chosen, half].mean()))
             with_error = ratio, ratio * sigma / math.sqrt(2)
             value = base * with_error[0], base * with_error[1]
             groups.append(_group(estimates, vine, "growth", level, value, with_error, int(chosen.size)))

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats
@@ -257,8 +256,10 @@ def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> lis
     for law in (replace(law, peak=1.0) for law in laws):
         forces = [np.abs(law.unit_force(motion)) for motion in motions]
         peak = max(float(force.max()) for force in forces)
+        # 0.05: part of the growth over which a vine accelerates; the size of a law at rest is not observed (chosen)
         peak_after_start = max(
-            float(force[_after_start(motion)].max()) for force, motion in zip(forces, motions, strict=True)
+            float(force[motion.lead_position_m >= 0.05 * motion.lead_position_m.max()].max())
+            for force, motion in zip(forces, motions, strict=True)
         )
         if law.n_amplitudes > 1:
             peak = 1.0
@@ -270,12 +271,6 @@ def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> lis
             continue
         scaled.append(replace(law, peak=peak or 1.0))
     return scaled
-
-
-def _after_start(motion: FittedMotion) -> NDArray[np.bool_]:
-    """Where a vine has grown beyond its start: the size of a law at rest alone is not observed."""
-    # 0.05: part of the growth over which a vine accelerates (chosen)
-    return motion.lead_position_m >= 0.05 * motion.lead_position_m.max()
 
 
 def _visited_range(motions: Sequence[FittedMotion]) -> _Range:

@@ -91,29 +91,16 @@ class NextExperiment:
         return str(self.advice)
 
     def to_json(self) -> dict[str, Any]:
-        """As `diagnosis.json` holds it; unknown values are null."""
-        content: dict[str, Any] = _without_nan(
-            {
-                "text": self.text,
-                "trials": [dict(trial) for trial in self.trials],
-                "separation_sigma": dict(self.separation_sigma),
-                "if_true_sigma": {pair: dict(ways) for pair, ways in self.if_true_sigma.items()},
-                "simulated_sigma": {
-                    pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()
-                },
-                "alternatives": [dict(other) for other in self.alternatives],
-                "calibration": str(self.measurement) or None,
-            }
-        )
-        return content
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        """As `diagnosis.json` holds it."""
+        return {
+            "text": self.text,
+            "trials": self.trials,
+            "separation_sigma": self.separation_sigma,
+            "if_true_sigma": self.if_true_sigma,
+            "simulated_sigma": {pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()},
+            "alternatives": self.alternatives,
+            "calibration": str(self.measurement) or None,
+        }
 
 
 @dataclass(frozen=True)
@@ -150,7 +137,9 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     tied = list(tied)[:5]
     names = _hypothesis_names(tied)
     measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
-    if _only_measurement(tied):
+    common = set.intersection(*(set(fit.model.names) for fit in tied))
+    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
+    if differ and all(effect.kind == "measurement" for effect in differ):
         faults = [name for name in names if name != NO_FURTHER_EFFECT]
         return NextExperiment(remark("measure_first", faults=faults, measurement=measurement), measurement=measurement)
     bench, terms = _feasible_trials(tied, names, limits)
@@ -158,13 +147,6 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     if not options:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
     return _recommendation(bench, options, seed)
-
-
-def _only_measurement(tied: Sequence[Fit]) -> bool:
-    """Return whether the hypotheses differ only in faults of the measurement."""
-    common = set.intersection(*(set(fit.model.names) for fit in tied))
-    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
-    return bool(differ) and all(effect.kind == "measurement" for effect in differ)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -507,7 +489,7 @@ def further_trials(
     # 48: most further trials considered where `limits.trials` is not stated (chosen)
     most = limits.trials if "trials" in limits.model_fields_set else 48
     before = now.probability_at(value)
-    plan = FurtherTrials(now.effect, now.parameter, now.symbol, now.unit, value, target, before, power=now)
+    plan = FurtherTrials(now, value, target, before)
     feasible = feasible_conditions(design.trials, limits)
     if before >= target or not feasible:
         return replace(plan, unlimited=before)
@@ -521,7 +503,6 @@ def further_trials(
     for _ in range(3):
         chosen, needed = search.fewest(wanted, most // REPLICATES)
         plan = _evaluated(design, search, replace(plan, n_conditions=len(search.conditions), needed=needed), chosen)
-        assert plan.power is not None
         shortfall = abs(plan.power.size_at(target) - now.zero) / deviation
         if plan.is_reached or not math.isfinite(shortfall) or len(chosen) >= most // REPLICATES:
             break
@@ -618,13 +599,11 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
     trials: list[AddedTrial] = []
     power, probability = plan.power, plan.before
     while len(trials) < len(conditions) and probability < plan.target:
-        power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), plan.effect) or power
-        assert power is not None
+        power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), power.effect) or power
         probability = power.probability_at(plan.value)
         for condition in conditions[len(trials) : len(trials) + REPLICATES]:
             trial = replace(condition.trial, name=f"added_{len(trials) + 1}")
             trials.append(AddedTrial(trial, condition.changed, condition.effort == NEW_VINE, probability))
-    assert power is not None
     endless = search.first_information((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
     ratio = math.sqrt(endless / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
     unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))

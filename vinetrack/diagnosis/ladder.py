@@ -99,23 +99,13 @@ COMPARISON_COLUMNS = (
     "worst_at_m",
     "replicate_floor_sigma_m",
 )
-TRAJECTORY_COLUMNS = (
-    "trial",
-    "time_s",
-    "lead_position_m",
-    "model_position_m",
-    "replicates_mean_m",
-    "replicates_sigma_m",
-)
-
 FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at which the final speed is taken (chosen)
 
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
     """Result of `compare`: `table` has one row for each condition, columns `COMPARISON_COLUMNS`. `trajectories` holds
-    the trials of each condition with the model's prediction, columns `TRAJECTORY_COLUMNS`, with time since release and
-    position from the origin. `trials` are the predictions.
+    the trials of each condition with the model's prediction, see `trajectory_table`. `trials` are the predictions.
     """
 
     table: pd.DataFrame
@@ -154,12 +144,13 @@ def compare(
     for condition in dict.fromkeys(trial.trial.condition for trial in predicted):
         members = [trial for trial in predicted if trial.trial.condition == condition]
         together = replicates_of(members)
+        known = [errors[trial.name] for trial in members if math.isfinite(errors[trial.name])]
         rows.append(
             {
                 "model": "+".join(fit.model.names),
                 "condition": condition,
                 **position_errors(members, together),
-                "rms_final_velocity_m_s": _rms([errors[trial.name] for trial in members]),
+                "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
         trajectories[condition] = trajectory_table(members, together)
@@ -237,36 +228,28 @@ def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats
 
 
 def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.DataFrame:
-    """Trials of one condition with the model, since release and from the origin, columns `TRAJECTORY_COLUMNS`.
+    """Trials of one condition with the model, since release and from the origin.
     `replicates_mean_m` is the mean of the replicates at that time, `replicates_sigma_m` their standard deviation.
     """
     import pandas as pd
 
     mean_m = together.model_m + together.mean_residual_m
     sigma_m = np.sqrt(together.variance_m2)
+    step_s = float(np.diff(together.time_s)[0]) if together.time_s.size > 1 else 1.0
     parts = []
     for trial in trials:
         time_s = trial.time_s - trial.release_s
-        k = np.clip(np.rint((time_s - together.time_s[0]) / _step(together.time_s)).astype(int), 0, mean_m.size - 1)
-        columns = (
-            trial.name,
-            time_s,
-            trial.lead_position_m - trial.origin_m,
-            trial.predicted_position_m - trial.origin_m,
-            mean_m[k],
-            sigma_m[k],
-        )
-        parts.append(pd.DataFrame(dict(zip(TRAJECTORY_COLUMNS, columns, strict=True))))
+        k = np.clip(np.rint((time_s - together.time_s[0]) / step_s).astype(int), 0, mean_m.size - 1)
+        columns = {
+            "trial": trial.name,
+            "time_s": time_s,
+            "lead_position_m": trial.lead_position_m - trial.origin_m,
+            "model_position_m": trial.predicted_position_m - trial.origin_m,
+            "replicates_mean_m": mean_m[k],
+            "replicates_sigma_m": sigma_m[k],
+        }
+        parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
-
-
-def _step(time_s: Floats) -> float:
-    return float(time_s[1] - time_s[0]) if time_s.size > 1 else 1.0
-
-
-def _rms(values: Sequence[float]) -> float:
-    known = [value for value in values if math.isfinite(value)]
-    return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
 
 
 LADDER_COLUMNS = (
@@ -400,7 +383,7 @@ def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
     except FitError as error:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
     undetermined = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}
-    undetermined = {vine for vine in undetermined if _has_own_parameters(fit, vine)}
+    undetermined &= {number.vine for number in fit.numbers if number.key in fit.model.parameter_names}
     predictable = [trial_data for trial_data in data if trial_data.trial.vine not in undetermined]
     not_predicted = {
         trial_data.trial.name: remark("undetermined_vine", vine=trial_data.trial.vine)
@@ -420,10 +403,6 @@ def _predicted(fit: Fit, data: Sequence[FitTrial]) -> Errors:
         if len(data) == 1:
             return Errors((), {data[0].trial.name: str(error)})
         return _combined([_predicted(fit, [trial_data]) for trial_data in data])
-
-
-def _has_own_parameters(fit: Fit, vine: str) -> bool:
-    return any(number.vine == vine and number.key in fit.model.parameter_names for number in fit.numbers)
 
 
 def _combined(parts: Sequence[Errors]) -> Errors:
@@ -446,18 +425,7 @@ def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
     import pandas as pd
 
     rows = [
-        (
-            "+".join(fit.model.names),
-            name,
-            number.key,
-            number.vine,
-            number.symbol,
-            number.unit,
-            number.value,
-            number.sigma,
-            number.low,
-            number.high,
-        )
+        {"model": "+".join(fit.model.names), "added": name, **number.to_json()}
         for fit, name in zip(fits, added, strict=True)
         for number in fit.numbers
     ]

@@ -180,13 +180,6 @@ def residual_displacements(fit: Fit, products: Products) -> Floats:
     return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))
 
 
-def half_power_below(least: float, sizes: Floats) -> Floats:
-    """Detectable sizes where a detection below the least size counts with probability one half."""
-    deviation = np.abs(sizes)
-    at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, deviation, right=math.inf)
-    return np.asarray(np.sign(sizes) * np.where(deviation >= least, deviation, np.minimum(at_half_power, least)))
-
-
 def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: NoiselessStart) -> Fit:
     """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held."""
     state, jobs = start.state, start.jobs.with_effect([shape.size.zero + size, *shape.other_values])
@@ -396,7 +389,10 @@ def _effect_power(
     needed = np.quantile(_required_means(tests, index, inflation[:, index]), PROBABILITIES)
     steps = np.array([_size_with_mean(means, response.sizes, mean) for mean in needed])
     if not response.shape.whole and np.isfinite(steps).all():
-        steps = half_power_below(float(least[response.index]), steps)
+        # A detection below the size that systematic errors imitate counts with probability one half.
+        size, smallest = np.abs(steps), float(least[response.index])
+        at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, size, right=math.inf)
+        steps = np.sign(steps) * np.where(size >= smallest, size, np.minimum(at_half_power, smallest))
     taken_for, named_alone = _confusion(tests, response, float(steps[PROBABILITIES.index(0.9)]), null_scores)
     effect, shape = response.effect, response.shape
     if not effect.parameters:

@@ -38,22 +38,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-CONDITION_COLUMNS = (
-    "vine",
-    "condition",
-    "pressure_Pa",
-    "payload_kg",
-    "n_trials",
-    "rms_m",
-    "floor_m",
-    "ratio",
-    "excess_m",
-    "z",
-    "worst_at_s",
-    "worst_at_m",
-    "worst_residual_m",
-    "worst_sigma_m",
-)
 _MEANS = ("mean_residual_m", "sigma_m", "z", "n_trials")
 TIME_COLUMNS = ("vine", "condition", "from_s", "to_s", "time_s", *_MEANS)
 POSITION_COLUMNS = ("vine", "condition", "from_m", "to_m", "lead_position_m", *_MEANS)
@@ -62,9 +46,9 @@ SPEED_COLUMNS = ("vine", "condition", "from_m_s", "to_m_s", "lead_velocity_m_s",
 
 @dataclass(frozen=True)
 class Failure:
-    """Where a model fails; tables in SI, a residual is measurement minus model. `by_condition`, columns
-    `CONDITION_COLUMNS`, has the largest root mean square first, which all pages call the worst condition; `z` is the
-    significance of the mean residual compared with the scatter of replicates.
+    """Where a model fails; tables in SI, a residual is measurement minus model. `by_condition` has the largest root
+    mean square first, which all pages call the worst condition; `z` is the significance of the mean residual compared
+    with the scatter of replicates.
     """
 
     model: str
@@ -98,7 +82,7 @@ def locate(fit: Fit) -> Failure:
     for name in conditions:
         members = [trial for trial in predicted if trial.trial.condition == name]
         rows.append(_condition_row(members, common_stretches(of[name], "time_s", edges[name]), scatter))
-    table = pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
+    table = pd.DataFrame(rows)
     vines = list(dict.fromkeys(course.trial.vine for course in courses))
     by_vine = {vine: [course for course in courses if course.trial.vine == vine] for vine in vines}
     return Failure(
@@ -207,8 +191,8 @@ def _where(table: pd.DataFrame, fails: bool) -> Iterator[Remark]:
     numbers = {name: float(worst[name]) for name in ("rms_m", "floor_m", "worst_residual_m", "worst_sigma_m", "z")}
     yield remark("fails_most", condition=_named(worst, table), **numbers)
     # 2.0: significance, in standard deviations, from which it is said to fail in a condition
-    failing = table["z"] > min(2.0, float(table["z"].max()) - 1e-9)
-    yield remark("fails_in", count=int(failing.sum()), total=len(table))
+    count, total = int((table["z"] > min(2.0, float(table["z"].max()) - 1e-9)).sum()), len(table)
+    yield remark("fails_everywhere") if count == total else remark("fails_in", count=count, total=total)
     for column in ("pressure_Pa", "payload_kg"):
         usable = table[np.isfinite(table["ratio"])]
         steps = [group.sort_values(column)["ratio"].to_numpy(float) for _, group in usable.groupby("vine")]

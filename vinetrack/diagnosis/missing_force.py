@@ -203,7 +203,11 @@ def _seen_from(problem: ForceProblem, point: ForcePoint) -> Misfit:
             RankedLaw(law, one, problem.bic(chi2, one.delta_chi2, law.n_parameters, largest), largest_N=largest_N)
             for law, one in estimated
         ]
-        return sorted(_best_of_kinds(laws), key=_detected_then_bic)
+        best: dict[str, RankedLaw] = {}
+        # Detected ones first, then by BIC
+        for law in sorted(laws, key=lambda law: (not law.is_detected, law.bic)):
+            best.setdefault(law.law.name, law)
+        return list(best.values())
 
     estimated = _estimates(problem, point, laws_on_grid(point.motions))
     near = [law for best in ranked(estimated) for law in laws_near(best.law, point.motions)]
@@ -224,11 +228,6 @@ def _estimates(problem: ForceProblem, point: ForcePoint, laws: Sequence[Law]) ->
     ]
 
 
-def _detected_then_bic(law: RankedLaw) -> tuple[bool, float]:
-    """Order of laws: those that are detected first, then by BIC."""
-    return not law.is_detected, law.bic
-
-
 def _largest_N(motions: Sequence[FittedMotion]) -> float:
     """The largest force that is reported: MAX_DRIVE_RATIO times drive, weight and inertia at their largest."""
     sizes = []
@@ -237,15 +236,6 @@ def _largest_N(motions: Sequence[FittedMotion]) -> float:
         body_N = motion.mass_kg * (GRAVITY_M_S2 + np.abs(motion.acceleration))
         sizes.append(float(np.max(drive_N + body_N)))
     return MAX_DRIVE_RATIO * max(sizes)
-
-
-def _best_of_kinds(laws: Sequence[RankedLaw]) -> list[RankedLaw]:
-    best: dict[str, RankedLaw] = {}
-    for law in laws:
-        before = best.get(law.law.name)
-        if before is None or _detected_then_bic(law) < _detected_then_bic(before):
-            best[law.law.name] = law
-    return list(best.values())
 
 
 FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
@@ -259,16 +249,6 @@ LEAST_MISFIT_REDUCTION = 0.5
 
 
 @dataclass(frozen=True)
-class DetectedLaw:
-    """A law with its amplitudes, N, the part of the missing force that it explains, and its description."""
-
-    law: Law
-    amplitude_N: tuple[float, ...]
-    explained: float
-    words: str
-
-
-@dataclass(frozen=True)
 class MissingForce:
     """What is missing, as a force on the tail, N. `table`, columns `FORCE_COLUMNS`: the force of every condition
     (blank: mean over all) against `lead_position_m`, `tail_velocity_m_s`, `time_s` and `pressure_Pa`.
@@ -278,7 +258,7 @@ class MissingForce:
     laws: pd.DataFrame
     depends_on: Mapping[str, float]
     sentence: Remark
-    detected: tuple[DetectedLaw, ...] = ()
+    detected: tuple[RankedLaw, ...] = ()
     learned: LearnedForce | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -320,7 +300,7 @@ def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
         laws=_law_table(laws),
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),
-        detected=tuple(_detected(law) for law in laws if law.is_detected),
+        detected=tuple(law for law in laws if law.is_detected),
         learned=_learned(problem) if learn else None,
     )
 
@@ -346,10 +326,6 @@ def _learned(problem: ForceProblem) -> LearnedForce | None:
             return learned_force(problem)
     except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
         return None
-
-
-def _detected(ranked: RankedLaw) -> DetectedLaw:
-    return DetectedLaw(ranked.law, tuple(ranked.estimate.amplitude.tolist()), ranked.explained, ranked.words)
 
 
 def _explained_by_variable(problem: ForceProblem, point: ForcePoint) -> dict[str, float]:
@@ -435,18 +411,11 @@ def _binned_means(part: pd.DataFrame) -> pd.DataFrame:
 def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
     import pandas as pd
 
-    rows = [
-        (
-            law.law.name,
-            law.words,
-            law.explained,
-            float(law.estimate.amplitude[0]) if law.law.n_amplitudes == 1 else float(np.hypot(*law.estimate.amplitude)),
-            law.estimate.sigma,
-            law.estimate.delta_chi2,
-            law.bic,
-        )
-        for law in laws
-    ]
+    rows = []
+    for law in laws:
+        amplitude, estimate = law.estimate.amplitude, law.estimate
+        size_N = float(amplitude[0]) if law.law.n_amplitudes == 1 else float(np.hypot(*amplitude))
+        rows.append((law.law.name, law.words, law.explained, size_N, estimate.sigma, estimate.delta_chi2, law.bic))
     return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
 
 

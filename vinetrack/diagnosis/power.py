@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -84,13 +84,13 @@ class EffectPower(JsonRecord):
 
 
 @dataclass(frozen=True)
-class NumberWidth:
+class NumberWidth(JsonRecord):
     """Half width of the 95 % interval of a fitted parameter: relative for B, absolute for n."""
 
     name: str
     vine: str
-    value: float
-    half_width: float
+    value: OrNaN
+    half_width: OrNaN
 
     @property
     def is_relative(self) -> bool:
@@ -176,15 +176,12 @@ class AddedTrial:
 
 @dataclass(frozen=True)
 class FurtherTrials:
-    """Further trials that bring the power for an effect of one size to a target. `before` is the power with the trials
-    so far; `unlimited` that with unlimited replicates of all trials within the limits; `n_conditions` counts the
-    conditions considered.
+    """Further trials that bring the power for an effect of one size to a target. `power` is that with these trials,
+    `before` the probability with the trials so far, `unlimited` that with unlimited replicates of all trials within the
+    limits; `n_conditions` counts the conditions considered.
     """
 
-    effect: str
-    parameter: str
-    symbol: str
-    unit: str
+    power: EffectPower
     value: float
     target: float
     before: float
@@ -192,7 +189,6 @@ class FurtherTrials:
     n_conditions: int = 0
     trials: tuple[AddedTrial, ...] = ()
     needed: Mapping[str, int] = field(default_factory=dict)
-    power: EffectPower | None = None
 
     @property
     def after(self) -> float:
@@ -207,9 +203,9 @@ class FurtherTrials:
     def to_json(self) -> dict[str, Any]:
         """As the key `further_trials` of what `vinetrack power --json` writes."""
         return {
-            "effect": self.effect,
-            "parameter": self.parameter,
-            "unit": self.unit,
+            "effect": self.power.effect,
+            "parameter": self.power.parameter,
+            "unit": self.power.unit,
             "value": self.value,
             "wanted": self.target,
             "probability_before": self.before,
@@ -217,7 +213,7 @@ class FurtherTrials:
             "probability_endless": self.unlimited,
             "conditions_looked_at": self.n_conditions,
             "needed": dict(self.needed),
-            "taken_for": dict(self.power.taken_for) if self.power else {},
+            "taken_for": dict(self.power.taken_for),
             "trials": [
                 {
                     **sheet_cells(added.trial),
@@ -270,8 +266,6 @@ class Power:
 
     def of_effects(self, names: Sequence[str]) -> Power:
         """The same for a selection of effects."""
-        from dataclasses import replace
-
         if not names:
             return self
         return replace(
@@ -312,10 +306,7 @@ class Power:
             not_testable={
                 str(name): Remark.from_json(why) for name, why in (content.get("not_testable_codes") or {}).items()
             },
-            numbers=tuple(
-                NumberWidth(str(e["name"]), str(e["vine"]), or_nan(e["value"]), or_nan(e["half_width"]))
-                for e in content.get("numbers") or ()
-            ),
+            numbers=tuple(map(NumberWidth.from_json, content.get("numbers") or ())),
             inputs=tuple(PowerInput(**entry) for entry in content.get("inputs") or ()),
             model=tuple(content.get("model") or ()),
             wary=Remark.from_json(content.get("wary_code")),

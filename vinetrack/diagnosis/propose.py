@@ -39,7 +39,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     answer_set,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, learn_missing_force, missing_force
+from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, RankedLaw, learn_missing_force, missing_force
 from vinetrack.diagnosis.score_test import shapes_of
 from vinetrack.dynamics.model import Model, check_needs, make_model
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
@@ -289,15 +289,10 @@ class ProposedLaw:
     likelihood of others is far higher.
     """
 
-    law: DetectedLaw
+    law: RankedLaw
     effect: Effect
     ratio: LikelihoodRatio
     rms_left_out_m: float
-
-    @property
-    def words(self) -> str:
-        """Description of the law with its size."""
-        return self.law.words
 
 
 @dataclass(frozen=True)
@@ -331,7 +326,7 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     return replace(proposal, table=proposed_table(model, proposal.before, fits, report))
 
 
-def _fitted_laws(model: Model, before: Fit, detected: Sequence[DetectedLaw], report: Callable[[str], None]) -> Proposal:
+def _fitted_laws(model: Model, before: Fit, detected: Sequence[RankedLaw], report: Callable[[str], None]) -> Proposal:
     """Fit the laws in the equation of motion, and find those that the data do not exclude."""
     if not detected:
         reason = remark("no_law_detected")
@@ -349,16 +344,15 @@ def _fitted_laws(model: Model, before: Fit, detected: Sequence[DetectedLaw], rep
             fitted.append((law, effect, likelihood_ratio(before, (effect,), after)))
         report("errors on left-out conditions")
         highest = max((ratio.fit.log_likelihood for _, _, ratio in fitted), default=-math.inf)
+
+        def near_best(ratio: LikelihoodRatio) -> bool:
+            return 2 * (highest - ratio.fit.log_likelihood) < OUT_OF_REACH
+
         laws = [
-            ProposedLaw(law, effect, ratio, left_out(ratio.fit).rms_m if _may_tie(ratio, highest) else math.nan)
+            ProposedLaw(law, effect, ratio, left_out(ratio.fit).rms_m if near_best(ratio) else math.nan)
             for law, effect, ratio in fitted
         ]
     return _proposal(before, laws)
-
-
-def _may_tie(ratio: LikelihoodRatio, highest: float) -> bool:
-    """Whether a law is near enough to the best for its errors on left-out conditions to be computed."""
-    return 2 * (highest - ratio.fit.log_likelihood) < OUT_OF_REACH
 
 
 def _proposal(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
@@ -381,7 +375,7 @@ def _proposal(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
     return Proposal(before, error_m, laws, tied)
 
 
-def _loaded(law: DetectedLaw, folder: Path) -> Effect:
+def _loaded(law: RankedLaw, folder: Path) -> Effect:
     """A law as an effect, written to a file in this folder and loaded from it."""
     path = folder / f"proposed_{law.law.name}.py"
     path.write_text(effect_text(law), encoding="utf-8")
@@ -389,7 +383,7 @@ def _loaded(law: DetectedLaw, folder: Path) -> Effect:
     return load_effect(path)
 
 
-def effect_text(detected: DetectedLaw, origin: str = "") -> str:
+def effect_text(detected: RankedLaw, origin: str = "") -> str:
     """Source of an effect file that holds a law: docstring, parameters with units and bounds, function,
     worked example.
     """
@@ -436,9 +430,9 @@ def effect_text(detected: DetectedLaw, origin: str = "") -> str:
     return "\n".join(part for part in parts if part is not None) + "\n"
 
 
-def _values(detected: DetectedLaw) -> tuple[float, tuple[float, ...]]:
+def _values(detected: RankedLaw) -> tuple[float, tuple[float, ...]]:
     """Size and shape parameters of a law as its effect holds them, SI, rounded to what is printed."""
-    law, amplitude = detected.law, detected.amplitude_N
+    law, amplitude = detected.law, detected.estimate.amplitude
 
     def rounded(*values: float) -> tuple[float, ...]:
         return tuple(float(f"{value:.6g}") for value in values)
@@ -452,12 +446,12 @@ def _values(detected: DetectedLaw) -> tuple[float, tuple[float, ...]]:
     return rounded(amplitude[0] / law.peak)[0], rounded(law.scale) if FORMS[law.kind].shapes else ()
 
 
-def _force_N(detected: DetectedLaw) -> float:
+def _force_N(detected: RankedLaw) -> float:
     """The force of a law in the state of the worked example, from the law itself: it checks the formula of the file."""
     suffix = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s", "pressure": "_Pa", "time": "_s"}
     state = {f"{name}{suffix[name]}": np.array([value]) for name, value in _WORKED_STATE.items()}
     motion = SimpleNamespace(**state, trial=SimpleNamespace(area_m2=detected.law.reference_area_m2))
-    return float((detected.law.unit_force(motion) @ np.array(detected.amplitude_N))[0])  # type: ignore[arg-type]
+    return float((detected.law.unit_force(motion) @ detected.estimate.amplitude)[0])  # type: ignore[arg-type]
 
 
 def _unit(powers: Sequence[int]) -> str:

@@ -21,7 +21,6 @@ from vinetrack.core.records import Floats, Track, Trial, plain_track, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.result import ADEQUATE, ARTEFACT, DROPPED_FRAMES, UNEXPLAINED, Diagnosis, Round
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import Parameter
 from vinetrack.inference.fit import FEWEST_AT_REST, aligned_to_trials, rest_is_seen, scaled_least_squares
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
 from vinetrack.inference.fit_result import DAMPING, Fit, TrialFit
@@ -318,11 +317,13 @@ def align_trials(fit: Fit) -> AlignedTrials:
 def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialEstimates:
     """Fit the value of `key` to each trial by least squares of position, with its release free."""
     predictor, trial_effects = aligned.predictor, aligned.trial_effects
-    parameter = _parameter(fit, key)
+    parameter = {f"{effect.name}.{one.name}": one for effect in fit.model for one in effect.parameters}[key]
     column = fit.model.parameter_names.index(key)
     base = predictor.layout.base[:, column].copy()
     logarithmic = key == DAMPING
-    scale = np.ones_like(base) if logarithmic else np.full_like(base, _scale(parameter, base))
+    low, high = parameter.plausible or (0.0, 0.0)
+    of_parameter = max(float(np.max(np.abs(base - parameter.zero))), 0.1 * (high - low), 1e-12)
+    scale = np.full_like(base, 1.0 if logarithmic else of_parameter)
     scaled = np.zeros_like(base)
     projected = [np.zeros(0)] * base.size
     # 5: gauss–Newton steps (chosen)
@@ -336,6 +337,8 @@ def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialE
     )
     known &= np.abs(scaled) < 0.99 * MAX_DEVIATION_SCALES
     deviation = np.where(known, scaled * scale, np.nan)
+    if logarithmic:
+        trial_effects[:, DAMPING_DEVIATION] = scaled
     return PerTrialEstimates(
         key=key,
         symbol=parameter.symbol,
@@ -347,27 +350,8 @@ def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialE
         base=base,
         deviation=deviation,
         variance=_variance(aligned, projected, scale),
-        trial_effects=_with_deviation(trial_effects, scaled) if logarithmic else trial_effects,
+        trial_effects=trial_effects,
     )
-
-
-def _with_deviation(trial_effects: Floats, deviation: Floats) -> Floats:
-    changed = trial_effects.copy()
-    changed[:, DAMPING_DEVIATION] = deviation
-    return changed
-
-
-def _parameter(fit: Fit, key: str) -> Parameter:
-    for effect in fit.model:
-        for parameter in effect.parameters:
-            if f"{effect.name}.{parameter.name}" == key:
-                return parameter
-    raise KeyError(key)
-
-
-def _scale(parameter: Parameter, base: Floats) -> float:
-    low, high = parameter.plausible or (0.0, 0.0)
-    return max(float(np.max(np.abs(base - parameter.zero))), 0.1 * (high - low), 1e-12)
 
 
 def _gauss_newton_step(

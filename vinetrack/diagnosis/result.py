@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
 from vinetrack.core.notebook import plot
-from vinetrack.core.problems import Remark, StoredRemark, in_words, remark
+from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.tables import JsonRecord
 from vinetrack.diagnosis.power import Power
 from vinetrack.inference.fit_result import Fit, Number, OrNaN
@@ -95,7 +95,9 @@ class Candidate(JsonRecord):
     numbers: tuple[Number, ...] = ()
     plausible: bool = True
     in_answer_set: bool = False
-    reason: StoredRemark = field(default_factory=Remark)
+    reason: Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)] = field(
+        default_factory=Remark
+    )
     largest: Mapping[str, OrNaN] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
     posterior_weight: OrNaN = math.nan
@@ -236,20 +238,9 @@ class Diagnosis:
 
         columns = ["round", "effect", "kind", "status", "delta_chi2", "sigma", "size", "in_answer_set", "plausible"]
         rows = [
-            (
-                i,
-                c.effect,
-                c.kind,
-                c.status,
-                c.delta_chi2,
-                c.sigma,
-                in_words(c),
-                c.in_answer_set,
-                c.plausible,
-                str(c.reason),
-            )
+            {**vars(row), "round": i, "size": in_words(row), "reason": str(row.reason)}
             for i, step in enumerate(self.rounds, 1)
-            for c in step.ranking
+            for row in step.ranking
         ]
         return pd.DataFrame(rows, columns=[*columns, "reason"])
 

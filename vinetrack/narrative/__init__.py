@@ -27,6 +27,8 @@ SENTENCES = {
     "no_next_experiment": "No next experiment could be computed: {error}",
     "not_located": "Where the model fails could not be computed: {error}",
     "no_missing_force": "The missing force could not be computed: {error}",
+    "fails_in": "It fails in {count} of {total} conditions by more than the scatter of replicates.",
+    "fails_everywhere": "It fails in every condition by more than the scatter of replicates.",
     "undetermined_vine": "no other condition of the vine {vine} determines its parameters",
     "not_fitted_to_trials": "{key} could not be fitted to single trials: the simulation fails there.",
     "not_fitted_along_growth": "B along the growth could not be estimated: the simulation fails there.",
@@ -44,6 +46,12 @@ SENTENCES = {
     "B_guessed": "guess: 6.44 (t/200 µm)(D/24 mm)^0.75",
     "B_scaled": "scaled from {vine} of {source} as t·D^0.75: a guess",
     "P_y_guessed": "guess: the one that is printed, for another vine",
+    "B_given": "B is given to {percent:.2g} % (one standard deviation)",
+    "printed_B_scatter": "the four printed B scatter by {printed:.0f} % about it: {here:.0f} % at this size (Student's "
+    "t, {dof} degrees of freedom)",
+    "one_t_over_D": "B is printed for one t/D only: exponents of t and D ±{sigma:g} against each other, {here:.0f} % "
+    "at this t/D",
+    "spread": "{origin}: {percent:.2g} %",
     "B_printed": "the error of the printed B is not printed: assumed to be {percent:.0f} %",
     "n_given": "n is given to {error:.2g} (one standard deviation)",
     "n_printed": "±{error:.2g}, from the printed R² of the fits",

@@ -31,12 +31,10 @@ from vinetrack.narrative.verdict_text import (
     MOST_NAMED,
     ODD_MEANING,
     difference_headline,
-    dropped_in_words,
     estimates_text,
     listed_names,
     odd_deciding_in_words,
     odd_in_words,
-    perhaps_dropped_in_words,
     spaced_name,
     summary_facts,
     trials_differ,
@@ -244,8 +242,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     from vinetrack.core.terminal import table
     from vinetrack.diagnosis.power import sheet_cells
 
-    size = size_text(plan.power, plan.value) if plan.power is not None else number(plan.value, 2)
-    what = f"{spaced_name(plan.effect)} at {plan.symbol} = {size}"
+    power = plan.power
+    what = f"{spaced_name(power.effect)} at {power.symbol} = {size_text(power, plan.value)}"
     if plan.before >= plan.target:
         return [f"{what} is detected with {percent(plan.before)} power by these trials: none need be added."]
     if not plan.n_conditions:
@@ -260,8 +258,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         added, kPa, grams = alike[0], cells.get("pressure_kPa", math.nan), cells.get("payload_g", 0.0)
         new = ["a new vine"] if added.new_vine else []
         new += [f"{rig.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
-        power = percent(alike[-1].probability)
-        rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", power))
+        then = percent(alike[-1].probability)
+        rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", then))
     if rows and plan.after > plan.before:
         head = ("trials", "vine", "pressure", "payload", "new", "power then")
         lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
@@ -282,8 +280,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     ]
     if plan.is_reached and alternatives:
         lines.append(f"Without these changes: {', '.join(alternatives)} trials.")
-    if plan.power is not None and plan.power.taken_for:
-        names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3]]
+    if power.taken_for:
+        names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:3]]
         lines.append(f"With them it would be mistaken for {joined(names)} of campaigns (at the size of 90 % power).")
     return lines
 
@@ -366,12 +364,6 @@ def advice_text(
     elif advice:
         text += f" A measurement would decide as well: {advice}"
     return text.rstrip()
-
-
-def measure_first_text(faults: Sequence[str], measurement: Remark) -> str:
-    """Return the advice where only faults of the measurement are tied."""
-    are = "are errors" if len(faults) > 1 else "is an error"
-    return f"Measure before making more trials: {joined(faults)} {are} of measurement. {measurement}"
 
 
 # ------------------------------------------------------------------------------
@@ -756,12 +748,6 @@ def like_no_law_text(law: str, explained: float, variable: str, alone: float) ->
     return text + depends if alone else text
 
 
-def like_a_law_text(law: str, explained: float, others: Sequence[str]) -> str:
-    """Return the law that the missing force looks like, and others that fit nearly as well."""
-    text = f"What is missing looks like {law}; that explains {explained:.0%} of what any force could."
-    return f"{text} These data fit nearly as well with: {'; '.join(others)}." if others else text
-
-
 def _variables_text(name: str) -> str:
     """Return a choice of variables in words."""
     words = {"growth": "the growth", "speed": "the speed of the tail", "time": "the time since release",
@@ -874,15 +860,6 @@ def _file_text(title: str, paragraphs: Sequence[str], formula: str) -> str:
     return "\n\n".join([title, *wrapped, f"    {formula}", last]) + "\n"
 
 
-def law_file_text(law: str, formula: str, origin: str) -> str:
-    """Return the docstring of an effect file that holds a law."""
-    caution = (
-        "It describes these data but explains nothing: its physical cause is for you to find. Forces are positive along"
-        " the growth, so that a friction is negative."
-    )
-    return _file_text(f"Proposed law: {law}.", [origin, caution], formula)
-
-
 def learned_file_text(learned: LearnedForce, origin: str) -> str:
     """Return the docstring of an effect file that holds a learned force."""
     domain = learned.domain
@@ -924,10 +901,8 @@ def trial_text(trial: Trial) -> str:
     return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {direction}{rig}"
 
 
-def sweeps_text(trial: Trial, swept_m3: float, in_full: bool) -> str:
-    """Return the volume of the grown vine of a trial, which is described in full or by its size alone."""
-    size = f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa"
-    return f"{trial_text(trial) if in_full else size}: it sweeps {volume_text(swept_m3)}"
+def _size_text(trial: Trial) -> str:
+    return f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa"
 
 
 def value_in_unit(value: float, unit: str) -> str:
@@ -969,6 +944,11 @@ REMEDIES = {
     "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
     "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
 }  # fmt: skip
+
+def _recordings(trials: Sequence[str]) -> str:
+    some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
+    return f"{_count(len(trials), 'recording')} ({some})"
+
 
 # Remarks that take more than a template, by their codes
 REMARKS: dict[str, Callable[..., str]] = {
@@ -1020,22 +1000,14 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"The error on {'left-out conditions' if left_out == 'conditions' else 'the left-out highest pressure'} is"
         f" without {_count(count, 'trial')}, unlike that in sample: {reason}"
     ),
-    "B_given": lambda error: f"B is given to {100 * error:.2g} % (one standard deviation)",
-    "printed_B_scatter": lambda printed, here, dof: (
-        f"the four printed B scatter by {100 * printed:.0f} % about it: {100 * here:.0f} % at this size (Student's t,"
-        f" {dof} degrees of freedom)"
-    ),
-    "one_t_over_D": lambda sigma, here: (
-        f"B is printed for one t/D only: exponents of t and D ±{sigma:g} against each other, {100 * here:.0f} % at this"
-        " t/D"
-    ),
-    "spread": lambda origin, size: f"{origin}: {100 * size:.2g} %",
     "medians_and_bands": lambda model, samples: f"{' + '.join(model)}; medians and 90 % bands of {samples} draws",
     "fastest_by": lambda quantity, y_over_L, share, burst_MPa, kPa: (
         f"fastest by {quantity}{_at_place(y_over_L)}; hoop stress up to {share:.0%} of {burst_MPa:g} MPa, supply up to"
         f" {kPa:g} kPa"
     ),
-    "sweeps": sweeps_text,
+    "sweeps": lambda trial, swept_m3, in_full: (
+        f"{trial_text(trial) if in_full else _size_text(trial)}: it sweeps {volume_text(swept_m3)}"
+    ),
     "supplied_chambers": lambda ms, volumes: (
         f"with a supply that refills the chamber in {ms:g} ms, at the medians: "
         + ", ".join(f"{volume_text(m3) if m3 > 0 else 'none'} ({law.split(',')[0]})" for law, m3 in volumes.items())
@@ -1056,10 +1028,21 @@ REMARKS: dict[str, Callable[..., str]] = {
     ),
     "odd_trials": odd_in_words,
     "odd_trials_decide": odd_deciding_in_words,
-    "frames_missing": dropped_in_words,
-    "frames_perhaps_missing": perhaps_dropped_in_words,
+    "frames_missing": lambda trials: (
+        f"Frames are missing from {_recordings(trials)}: the edge moves much farther from one frame to the next than in"
+        " the frames around them, so the camera or the disk dropped frames. The times were corrected; record again"
+        " where it matters."
+    ),
+    "frames_perhaps_missing": lambda trials: (
+        f"Frames may be missing from {_recordings(trials)}: the edge moves farther from one frame to the next than in"
+        " the frames around them, and the later times were shifted accordingly. Points farther away are too few or too"
+        " noisy to confirm it: look at the recording."
+    ),
     "deciding_measurements": measurement_text,
-    "measure_first": measure_first_text,
+    "measure_first": lambda faults, measurement: (
+        f"Measure before making more trials: {joined(faults)} {'are errors' if len(faults) > 1 else 'is an error'} of"
+        f" measurement. {measurement}"
+    ),
     "no_feasible_trial": lambda measurement: f"No trial within the limits can be made and simulated. {measurement}",
     "trials_to_make": advice_text,
     "no_trials_separate": partial(advice_text, worth_it=False),
@@ -1077,14 +1060,21 @@ REMARKS: dict[str, Callable[..., str]] = {
     "misfit_falls": lambda column: (
         f"The {'lower the pressure' if column == 'pressure_Pa' else 'smaller the payload'}, the larger the misfit."
     ),
-    "fails_in": lambda count, total: (
-        f"It fails in {'every condition' if count == total else f'{count} of {total} conditions'} by more than the"
-        " scatter of replicates."
-    ),
     "drifts": drift_text,
     "like_no_law": like_no_law_text,
-    "like_a_law": like_a_law_text,
+    "like_a_law": lambda law, explained, others: (
+        f"What is missing looks like {law}; that explains {explained:.0%} of what any force could."
+        + (f" These data fit nearly as well with: {'; '.join(others)}." if others else "")
+    ),
     "learned_force": learned_force_text,
     "learned_file": learned_file_text,
-    "law_file": law_file_text,
+    "law_file": lambda law, formula, origin: _file_text(
+        f"Proposed law: {law}.",
+        [
+            origin,
+            "It describes these data but explains nothing: its physical cause is for you to find. Forces are positive"
+            " along the growth, so that a friction is negative.",
+        ],
+        formula,
+    ),
 }

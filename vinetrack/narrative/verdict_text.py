@@ -687,26 +687,3 @@ def odd_deciding_in_words(
     text = f"{odd_in_words(odd, count)} Without {names} the verdict is `{others.verdict}`: {others.explanation}"
     rests = f" the verdict would rest on {'it' if len(odd) == 1 else 'them'} alone." if withdrawn else ""
     return f"{text} With {names}:{rests} {with_them}"
-
-
-def dropped_in_words(trials: Sequence[str]) -> str:
-    """Return the explanation of a diagnosis where frames are missing from these recordings."""
-    return (
-        f"Frames are missing from {_recordings(trials)}: the edge moves much farther from one frame to the next than "
-        "in the frames around them, so the camera or the disk dropped frames. The times were corrected; record again "
-        "where it matters."
-    )
-
-
-def perhaps_dropped_in_words(trials: Sequence[str]) -> str:
-    """Return the note of a diagnosis where frames may be missing from these recordings."""
-    return (
-        f"Frames may be missing from {_recordings(trials)}: the edge moves farther from one frame to the next than in "
-        "the frames around them, and the later times were shifted accordingly. Points farther away are too few or too "
-        "noisy to confirm it: look at the recording."
-    )
-
-
-def _recordings(trials: Sequence[str]) -> str:
-    some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
-    return f"{len(trials)} recording{'s' if len(trials) > 1 else ''} ({some})"

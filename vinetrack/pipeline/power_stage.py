@@ -245,7 +245,10 @@ def _refusal(message: str, value: str, remedy: str) -> ExperimentError:
 def sheet_rows(power: Power) -> list[dict[str, object]]:
     """Return the rows of the sheet for the further trials."""
     return [
-        {"trial": f"{plan.effect}_{k}" if len(power.further) > 1 else added.trial.name, **sheet_cells(added.trial)}
+        {
+            "trial": f"{plan.power.effect}_{k}" if len(power.further) > 1 else added.trial.name,
+            **sheet_cells(added.trial),
+        }
         for plan in power.further
         for k, added in enumerate(plan.trials, 1)
     ]

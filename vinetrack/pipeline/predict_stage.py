@@ -568,7 +568,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
     yield from table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
     if inputs is not None:
-        (steady,) = final_speeds(inputs.model, [trial], at_fraction, host=host_for(inputs.model)).tolist()
+        (steady,) = final_speeds(inputs.model, [inputs.trial], at_fraction, host=host_for(inputs.model)).tolist()
         place = 1.0 if trial.payload_kg > 0 else at_fraction
         yield str(remark("speeds_at_medians", y_over_L=place, m_s=steady))
     yield str(remark("slow_and_fast"))

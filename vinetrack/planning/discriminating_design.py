@@ -309,9 +309,7 @@ class Hypothesis:
     theta: Floats
     scatter_levels: tuple[ScatterLevel, ...]
     sd_of_new: Floats
-    rho: float
     variance: float
-    spread: tuple[float, float]
 
     @property
     def room(self) -> tuple[Floats, Floats]:
@@ -363,9 +361,7 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
         theta=np.concatenate([state.theta, [number.to_scaled(number.start) for number in added]]),
         scatter_levels=_scatter_levels(fit, precision_of_new),
         sd_of_new=np.array(sd_of_new),
-        rho=state.rho,
         variance=float(np.exp(np.mean(np.log(state.variance)))),
-        spread=state.spread,
     )
 
 
@@ -545,7 +541,7 @@ def film_trials(
     select usable points as for a fit; None where there are too few. Shapes: theta (n_free,); deviations (n_places, 2).
     """
     chosen, of_chosen = [conditions[k] for k in places], [cameras[k] for k in places]
-    data = truth.fit.predictor.data
+    data, rho = truth.fit.predictor.data, truth.fit.solution.state.rho
     times = [
         camera.frame_s * np.arange(camera.rest_frames + math.ceil(camera.longest_s / camera.frame_s), dtype=float)
         for camera in of_chosen
@@ -563,7 +559,7 @@ def film_trials(
         if moved.status == "ended":
             last_s = trial_effects[i, RELEASE] + moved.end_time_s
             stop = min(stop, int(np.searchsorted(times[i], last_s)) + of_chosen[i].frames_behind_end)
-        noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - truth.rho**2)), truth.rho, rng)
+        noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - rho**2)), rho, rng)
         position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
         pressure_Pa = None if items[i].trace is None else np.full(stop, chosen[i].trial.pressure_Pa)
         try:
@@ -656,7 +652,7 @@ def _terms_of(
     hypothesis: Hypothesis, columns: Floats, differences: Floats, has_deviations: NDArray[np.bool_]
 ) -> RefitTerms:
     # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
-    scale = (1 - hypothesis.rho) / np.sqrt(hypothesis.variance)
+    scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
     both = scale * np.concatenate([columns[:, :, :-1], differences], axis=2)
     products = np.swapaxes(both, 1, 2) @ both
     levels = hypothesis.scatter_levels

@@ -501,7 +501,9 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
         sources.set(DAMPING, stated.B, "given")
         if stated.B_error > 0:
             sample = scaled(DAMPING, stated.B_error)
-            sources.add_uncertainty("error of B", f"B given|{trial.vine}", sample, "B_given", error=stated.B_error)
+            sources.add_uncertainty(
+                "error of B", f"B given|{trial.vine}", sample, "B_given", percent=100 * stated.B_error
+            )
         return
     if fit is not None and place is not None and (is_same or fit.vines[place] == ""):
         sources.set_fitted(DAMPING, place)
@@ -525,11 +527,14 @@ def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) 
         sources.notes.append(remark("B_carried_over", source=fit.source, vine=vine))
         split -= split_leverage(*like)
     sample = scaled(DAMPING, scatter, SCATTER_DOF)
-    facts = {"printed": damping_scatter(), "here": scatter, "dof": SCATTER_DOF}
+    facts = {"printed": 100 * damping_scatter(), "here": 100 * scatter, "dof": SCATTER_DOF}
     sources.add_uncertainty("guess of B", f"B scatter|{trial.vine}", sample, "printed_B_scatter", **facts)
     if abs(split) > 1e-9:
         split_sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
-        facts, sample = {"sigma": split_sigma, "here": abs(split) * split_sigma}, scaled(DAMPING, split * split_sigma)
+        facts, sample = (
+            {"sigma": split_sigma, "here": 100 * abs(split) * split_sigma},
+            scaled(DAMPING, split * split_sigma),
+        )
         sources.add_uncertainty("t against D", "B split", sample, "one_t_over_D", **facts)
 
 
@@ -656,7 +661,7 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
     ):
         if spread > 0:
             title, key = f"{symbol} from trial to trial", f"{symbol} trial|{trial.vine}"
-            sources.add_uncertainty(title, key, sampler, "spread", origin=origin, size=spread)
+            sources.add_uncertainty(title, key, sampler, "spread", origin=origin, percent=100 * spread)
     return pressure, damping
 
 

@@ -176,7 +176,9 @@ def simulated_rises(
         in_turn = alternating[(np.arange(len(design)) + draws[k]) % 4]
         deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
         try:
-            filmed = film_trials(truth, design, bench.conditions, bench.cameras, theta, deviations * truth.spread, rng)
+            filmed = film_trials(
+                truth, design, bench.conditions, bench.cameras, theta, deviations * truth.fit.solution.state.spread, rng
+            )
         except SimulationError:
             continue
         new = [(place, trial_data) for place, trial_data in zip(design, filmed, strict=True) if trial_data is not None]
