@@ -196,13 +196,11 @@ class AuditedMotion:
     lead_velocity_m_s: Floats
     pressure_Pa: Floats | None = None
 
-    def thinned(self, most: int = 200) -> AuditedMotion:
-        """The same motion at fewer points."""
-        every = slice(None, None, max(1, math.ceil(self.time_s.size / most)))
-        pressure = None if self.pressure_Pa is None else self.pressure_Pa[every]
-        return AuditedMotion(
-            self.trial, self.time_s[every], self.lead_position_m[every], self.lead_velocity_m_s[every], pressure
-        )
+    def thinned(self) -> AuditedMotion:
+        """The same motion at 200 points or fewer."""
+        every = slice(None, None, max(1, math.ceil(self.time_s.size / 200)))
+        time_s, y, v = (part[every] for part in (self.time_s, self.lead_position_m, self.lead_velocity_m_s))
+        return AuditedMotion(self.trial, time_s, y, v, None if self.pressure_Pa is None else self.pressure_Pa[every])
 
     def terms(self, model: Model) -> Terms:
         """Everything that a model computes along it."""
