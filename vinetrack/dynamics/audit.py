@@ -348,14 +348,12 @@ def _reservoir_rule(model: Model, motion: AuditedMotion, row: dict[str, Any] | N
     if row is None or row["note"] or not pressure > 0:
         return
     depleted = model + catalogue()["reservoir_depletion"]
-    pressures = (
-        motion.terms(depleted.with_values({"reservoir_depletion.gamma": gamma})).pressure_Pa for gamma in (1.0, 1.4)
-    )
-    shares = [1 - float(np.min(along_Pa)) / pressure for along_Pa in pressures]
-    if shares[1] > 0.05:
+    models = (depleted.with_values({"reservoir_depletion.gamma": gamma}) for gamma in (1.0, 1.4))
+    slow, fast = (1 - float(np.min(motion.terms(each).pressure_Pa)) / pressure for each in models)
+    if fast > 0.05:
         yield (
             "reservoir",
-            f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
-            f"(fast) of its gauge pressure while the vine grows, above 5%, unless a supply refills "
-            "it; add reservoir_depletion or supply_refill to the model, or measure the pressure",
+            f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {slow:.0%} (slow) to {fast:.0%} (fast) of "
+            "its gauge pressure while the vine grows, above 5%, unless a supply refills it; add reservoir_depletion or "
+            "supply_refill to the model, or measure the pressure",
         )

@@ -18,7 +18,7 @@ import pandas as pd
 import yaml
 from numpy.typing import NDArray
 
-from vinetrack.core.tables import replacing, write_csv, write_text
+from vinetrack.core.tables import replacing, write_bytes, write_csv, write_text
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.sheet import SHEET
@@ -34,10 +34,8 @@ def render_recording(
 ) -> Truth:
     """Film `motion` in `scene` and write the recording to `out_path`, completely or not at all."""
     renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
-    out_path.parent.mkdir(parents=True, exist_ok=True)
-    draft = out_path.with_name("part-" + out_path.name)
-    _write_video(renderer, draft)
-    draft.replace(out_path)
+    with replacing(out_path) as draft:
+        _write_video(renderer, draft)
     return renderer.truth(np.arange(n_frames))
 
 
@@ -147,9 +145,7 @@ def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
     import cv2
 
     picture = render_target(filming.target, replace(preset(filming.scene), camera=filming.camera), seed=seed)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+    write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 def recording_experiment(experiment: Experiment, trials: Sequence[str], filming: Filming, folder: Path) -> Experiment:
