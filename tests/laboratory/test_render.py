@@ -79,7 +79,9 @@ def projected(plane_m: np.ndarray, camera: Camera) -> np.ndarray:
     turn, _ = cv2.Rodrigues(about_y @ about_x)
     away_m = np.array([0, 0, camera.focal_px * camera.m_per_px])
     spatial_m = np.column_stack([plane_m, np.zeros(len(plane_m))])
-    seen, _ = cv2.projectPoints(spatial_m, turn, away_m, camera.matrix, np.array([camera.k1, camera.k2, 0, 0, 0]))
+    f, (cx, cy) = camera.focal_px, camera.centre_px
+    matrix = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])
+    seen, _ = cv2.projectPoints(spatial_m, turn, away_m, matrix, np.array([camera.k1, camera.k2, 0, 0, 0]))
     return seen[:, 0]
 
 

@@ -191,9 +191,7 @@ def assert_shows(numbers: Browser, table: pd.DataFrame, rel: float) -> None:
     assert bars_mm(numbers, "floor") == pytest.approx(compared_mm(table, "replicate_floor_m"), rel=rel)
     overall = float(np.sqrt(np.mean(np.square(list(expected.values())))))
     assert f"off by {overall:.3g} mm" in numbers.text("headline")
-    shown = numbers.page.shown
-    assert shown is not None
-    for trial, drawn in zip(shown.trials, numbers.model("residual_curves").data["ys"], strict=True):
+    for trial, drawn in zip(numbers.page.shown.trials, numbers.model("residual_curves").data["ys"], strict=True):
         assert np.nanmax(np.abs(drawn)) <= 1e3 * np.abs(trial.residual_m).max() + 1e-9
 
 

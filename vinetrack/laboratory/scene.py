@@ -38,12 +38,6 @@ class Camera:
         return (self.width_px - 1) / 2, (self.height_px - 1) / 2
 
     @property
-    def matrix(self) -> Floats:
-        """Camera matrix, shape (3, 3), px."""
-        cx, cy = self.centre_px
-        return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]], dtype=float)
-
-    @property
     def rotation(self) -> Floats:
         """Rotation of the plane against the picture, shape (3, 3)."""
         ax, ay = math.radians(self.tilt_x_deg), math.radians(self.tilt_y_deg)
