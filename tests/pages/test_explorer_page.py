@@ -34,12 +34,16 @@ from vinetrack.video.axis import Axis
 GAMMA = "size_reservoir_depletion.gamma"
 
 
-@pytest.fixture(scope="module")
-def background(campaign: Campaign) -> BackgroundFit:
+def fitted(campaign: Campaign) -> BackgroundFit:
     grown = BackgroundFit(campaign).begin()
     grown.wait(240)
     assert grown.failure == ""
     return grown
+
+
+@pytest.fixture(scope="module")
+def background(campaign: Campaign) -> BackgroundFit:
+    return fitted(campaign)
 
 
 @pytest.fixture
@@ -168,9 +172,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def numbers(results: Path) -> Iterator[Browser]:
-    background = BackgroundFit(open_campaign(results)).begin()
-    background.wait(240)
-    opened = Browser(background)
+    opened = Browser(fitted(open_campaign(results)))
     yield opened
     opened.page.close()
 
@@ -249,9 +251,7 @@ def test_add_finds_what_the_page_finds_and_until_the_next_run_the_page_says_whic
     campaign = open_campaign(results)
     assert campaign.in_use == tuple(json.loads((results / "fit.json").read_text())["model"])
     assert tuple(campaign.experiment.settings.model) == (*campaign.in_use, EFFECT)
-    background = BackgroundFit(campaign).begin()
-    background.wait(240)
-    again = Browser(background)
+    again = Browser(fitted(campaign))
     again.turn()
     assert not again.model(f"tick_{EFFECT}").active
     assert_shows(again, pd.read_csv(results / "comparison.csv"), 1e-6)
@@ -277,9 +277,7 @@ def unexplained(campaign: Campaign, tmp_path: Path) -> Campaign:
 def opened(unexplained: Campaign) -> Iterator[tuple[Browser, list[BackgroundFit]]]:
     """A page of it, and the pages opened in its place."""
     reopened: list[BackgroundFit] = []
-    background = BackgroundFit(unexplained).begin()
-    background.wait(240)
-    browser = Browser(background, reopened.append)
+    browser = Browser(fitted(unexplained), reopened.append)
     yield browser, reopened
     browser.page.close()
 
