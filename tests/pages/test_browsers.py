@@ -46,8 +46,8 @@ def visitor(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
         assert all(request.startswith(("http://127.0.0.1:", "ws://127.0.0.1:")) for request in asked)
 
 
-def errors(visitor: Visitor) -> np.ndarray:
-    return np.array(visitor.value("error_bars", "data.now"), dtype=float)
+def errors(visitor: Visitor, column: str = "now") -> np.ndarray:
+    return np.array(visitor.value("error_bars", f"data.{column}"), dtype=float)
 
 
 def test_dragging_a_slider_moves_the_curves_continuously(visitor: Visitor) -> None:
@@ -70,7 +70,10 @@ def test_an_effect_ticked_and_refitted_brings_the_error_down(visitor: Visitor) -
     visitor.click("tick_reservoir_depletion", "input")
     visitor.until("$status.text.includes('refitting')", "progress", 20)
     visitor.until("$refit.label === 'Refit' && $numbers.text.includes('1 parameter more')", "the fit", 240)
-    assert np.all(errors(visitor) < before)
+    # Of the mean square error that replicates do not explain, a tenth is left at most.
+    floor = np.mean(errors(visitor, "floor") ** 2)
+    assert np.mean(errors(visitor) ** 2) - floor < 0.1 * (np.mean(before**2) - floor)
+    assert "vinetrack add reservoir_depletion" in visitor.text("commands")
 
 
 def test_the_recording_is_scrubbed_with_the_edges_over_it(visitor: Visitor) -> None:
