@@ -6,18 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from by_hand import (
-    ATM,
-    LEVEL,
-    LOADED,
-    RT_AIR,
-    G,
-    N,
-    Vine,
-    assert_same_motion,
-    followed,
-    simulated,
-)
+from by_hand import ATM, LEVEL, LOADED, RT_AIR, G, N, Vine, assert_same_motion, followed, simulated
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
 from vinetrack.core.records import Bend
@@ -34,40 +23,24 @@ def test_capstan_friction_as_printed_is_a_constant() -> None:
         force = 0.5 * (vine.P - vine.P_y) * vine.A + m * G - 0.5 * vine.B * v**0.37
         return (force - 0.1 * math.exp(0.7 * 0.06 / 0.05)) / m
 
-    assert_same_motion(
-        vine,
-        {"capstan_friction.C": 0.1, "capstan_friction.mu_c": 0.7},
-        acceleration,
-        share=0.45,
-        bends=(Bend(0.05, 0.06, 0.05),),
-        mass_loss="as_printed",
-    )
-
-
-V0 = 3.7e-3
-A_IN = math.pi * 6e-3**2 / 4
+    sizes = {"capstan_friction.C": 0.1, "capstan_friction.mu_c": 0.7}
+    bends = (Bend(0.05, 0.06, 0.05),)
+    assert_same_motion(vine, sizes, acceleration, share=0.45, bends=bends, mass_loss="as_printed")
 
 
 def test_gauge_then_chamber_then_leak_then_inlet_then_stretch() -> None:
     vine = LOADED
-    sizes = {
-        "pressure_gain.eps": 0.02,
-        "pressure_gauge.delta": 700.0,
-        "leak.rate": 2.0,
-        "inlet_loss.K": 1.5,
-        "wall_stretch.kappa": 4e-6,
-        "supply_refill.tau": 0.05,
-        "supply_refill.gamma": 1.4,
-    }
-    P_0 = 1.02 * vine.P + 700.0
-    P_y = 1.02 * vine.P_y
+    sizes = {"pressure_gain.eps": 0.02, "pressure_gauge.delta": 700.0, "leak.rate": 2.0, "inlet_loss.K": 1.5}
+    sizes |= {"wall_stretch.kappa": 4e-6, "supply_refill.tau": 0.05, "supply_refill.gamma": 1.4}
+    V0, A_in = 3.7e-3, math.pi * 6e-3**2 / 4
+    P_0, P_y = 1.02 * vine.P + 700.0, 1.02 * vine.P_y
 
     def at_the_tip(t: float, v: float, P: float) -> tuple[float, float]:
         leaked = P * math.exp(-2.0 * t)
         area = vine.A
         for _ in range(60):
             rho = (leaked + ATM) / RT_AIR
-            tip = leaked - 1.5 * 0.5 * rho * (v / 2) ** 2 * (area / A_IN) ** 2
+            tip = leaked - 1.5 * 0.5 * rho * (v / 2) ** 2 * (area / A_in) ** 2
             area = vine.A * (1 + 4e-6 * tip) ** 2
         return tip, area
 
@@ -146,20 +119,18 @@ def test_stick_and_slip_under_a_pressure_that_rises_and_falls() -> None:
     assert np.all(got.lead_velocity_m_s[resting] == 0)
 
 
-def test_below_p_s_it_never_starts() -> None:
-    got = simulated(LEVEL, {"static_yield.P_s": 30e3}, np.linspace(0, 1, 11))
+TIMES = np.linspace(0, 0.15, 50)
+
+
+def test_below_p_s_it_never_starts_and_released_above_it_leaves_no_trace() -> None:
+    got = simulated(LEVEL, {"static_yield.P_s": 30e3}, TIMES)
     assert got.status == "stalled"
     assert np.all(got.lead_position_m == 0)
+    free = simulated(LEVEL, {}, TIMES).lead_position_m
+    for P_s in (3e3, 20e3):
+        np.testing.assert_array_equal(simulated(LEVEL, {"static_yield.P_s": P_s}, TIMES).lead_position_m, free)
 
 
-@pytest.mark.parametrize("P_s", [0.0, 3e3, 20e3])
-def test_released_above_p_s_it_leaves_no_trace(P_s: float) -> None:
-    times = np.linspace(0, 0.15, 40)
-    got = simulated(LEVEL, {"static_yield.P_s": P_s}, times).lead_position_m
-    np.testing.assert_array_equal(got, simulated(LEVEL, {}, times).lead_position_m)
-
-
-TIMES = np.linspace(0, 0.15, 50)
 FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
 
 
@@ -196,10 +167,9 @@ def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read(
     vine: Vine, delay: float, phase_s: float
 ) -> None:
     fine = np.linspace(-0.01, 0.3, 400_001)
-    y = simulated(vine, {}, fine).lead_position_m
-    stamped = fine - delay * y  # the row at y is read delay · y after the stamp of its picture
     ended = simulated(vine, {}, fine)
-    assert ended.status == "ended"
+    y = ended.lead_position_m
+    stamped = fine - delay * y  # the row at y is read delay · y after the stamp of its picture
     times = np.arange(-0.005, ended.end_time_s + 0.003, 5e-4) + phase_s  # release lies on a frame or between two
     got = simulated(vine, {"rolling_shutter.delay": delay}, times).observed_position_m
     np.testing.assert_allclose(got, np.interp(times, stamped, y), rtol=0, atol=5e-6)
@@ -222,9 +192,9 @@ def test_a_rolling_shutter_reads_what_the_lens_bends(delay: float) -> None:
 @pytest.mark.parametrize("vine", [LOADED, FAST], ids=["2 m/s", "60 m/s"])
 def test_a_moving_average_reports_the_mean_about_every_instant(vine: Vine, over_s: float, phase_s: float) -> None:
     fine = np.linspace(-0.02, 0.3, 640_001)
-    y = simulated(vine, {}, fine).lead_position_m
-    area = cumulative_trapezoid(y, fine, initial=0.0)
     ended = simulated(vine, {}, fine)
+    y = ended.lead_position_m
+    area = cumulative_trapezoid(y, fine, initial=0.0)
     times = np.arange(-0.005, ended.end_time_s + 0.005, 5e-4) + phase_s
     got = simulated(vine, {"moving_average.T2": over_s**2}, times).observed_position_m
     after, before = (np.interp(times + side * over_s / 2, fine, area) for side in (1, -1))

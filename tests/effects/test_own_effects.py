@@ -49,12 +49,6 @@ def written(folder: Path, text: str = BRUSH, name: str = "brush.py") -> Path:
     return path
 
 
-def refusal(folder: Path, text: str, name: str = "brush.py") -> None:
-    with pytest.raises(EffectError) as caught:
-        own_effects([written(folder, text, name)])
-    assert str(caught.value).startswith(str(folder / name))
-
-
 def test_it_is_simulated_like_any_other(tmp_path: Path) -> None:
     brush = own_effects([written(tmp_path)])
     model = make_model([*base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
@@ -98,18 +92,16 @@ def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeyp
     path = written(tmp_path, BRUSH.replace("import numpy as np\n", "import brush_grips\nimport numpy as np\n", 1))
 
     def digest(grip: str, number: str) -> str:
-        grips.write_text(grip, encoding="utf-8")
-        table.write_text(number, encoding="utf-8")
-        for name in ("brush_grips", "brush_table"):
-            monkeypatch.delitem(sys.modules, name, raising=False)
+        for file, text in ((grips, grip), (table, number)):
+            file.write_text(text, encoding="utf-8")
+            monkeypatch.delitem(sys.modules, file.stem, raising=False)
         kernel.cache_clear()
         importlib.import_module("brush_grips")
         return kernel((load_effect(path),)).__name__
 
     by_table = "from brush_table import SHARE\nGRIP = SHARE"
-    digests = [digest(f"GRIP = {grip}", "") for grip in (1.0, 2.0)]
-    digests += [digest(by_table, f"SHARE = {share}") for share in (3, 4)]
-    assert len(set(digests)) == 4
+    digests = [digest("GRIP = 1.0", ""), *(digest(by_table, f"SHARE = {share}") for share in (3, 4))]
+    assert len(set(digests)) == 3
     assert digest(by_table, "SHARE = 4") == digests[-1]
 
 
@@ -139,17 +131,17 @@ def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeyp
 )
 def test_a_file_that_is_no_effect_is_refused_in_one_line_that_names_it(tmp_path: Path, old: str, new: str) -> None:
     assert old in BRUSH
-    refusal(tmp_path, BRUSH.replace(old, new))
+    path = written(tmp_path, BRUSH.replace(old, new))
+    with pytest.raises(EffectError) as caught:
+        own_effects([path])
+    assert str(caught.value).startswith(str(path))
 
 
 def test_capitals_missing_files_and_two_of_one_name_are_refused(tmp_path: Path) -> None:
-    refusal(tmp_path, BRUSH, "Brush.py")
-    with pytest.raises(EffectError):
-        own_effects([tmp_path / "brush.py"])
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    with pytest.raises(EffectError):
-        own_effects([written(tmp_path / "a"), written(tmp_path / "b")])
+    paths = [effect.path for effect in copies(tmp_path, BRUSH)]
+    for refused in ([written(tmp_path, name="Brush.py")], [tmp_path / "brush.py"], paths):
+        with pytest.raises(EffectError):
+            own_effects(refused)
 
 
 @pytest.mark.parametrize("name", catalogue())
@@ -188,34 +180,26 @@ def effect_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path(shutil.copy(air_drag.path, tmp_path / "wake.py"))
 
 
-def test_it_is_named_with_its_hash_before_it_runs(effect_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_named_with_its_hash_before_it_runs_and_remembered_until_it_changes(
+    effect_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    load_effect(effect_file)
+    told = capsys.readouterr().err
+    load_effect(effect_file)
+    assert capsys.readouterr().err == ""
+    assert str(effect_file) in told
+    assert hashlib.sha256(effect_file.read_bytes()).hexdigest() in told
     effect_file.write_text("raise SystemError")
     with pytest.raises(EffectError):
         load_effect(effect_file)
-    digest = hashlib.sha256(effect_file.read_bytes()).hexdigest()
-    told = capsys.readouterr().err
-    assert str(effect_file) in told
-    assert digest in told
-
-
-def test_it_is_remembered_until_it_changes(effect_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    load_effect(effect_file)
-    capsys.readouterr()
-    load_effect(effect_file)
-    assert capsys.readouterr().err == ""
-    effect_file.write_text(effect_file.read_text() + "\n# changed\n")
-    load_effect(effect_file)
-    assert capsys.readouterr().err
+    assert str(effect_file) in capsys.readouterr().err
 
 
 def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
+    assert load_effect(effect_file).name == "wake"  # a home that cannot be written stops nothing
     monkeypatch.setenv("VINETRACK_OWN_EFFECTS", "known")
     effect_file.write_text("from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n")
     with pytest.raises(EffectError):
         load_effect(effect_file)
     assert not effect_file.with_suffix(".ran").exists()
-
-
-def test_a_home_that_cannot_be_written_stops_nothing(effect_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
-    assert load_effect(effect_file).name == "wake"

@@ -59,17 +59,13 @@ def test_without_scatter_and_noise_a_track_is_the_model_seen_from_an_unknown_ori
         np.testing.assert_allclose(grown.track.lead_position_m - grown.origin_m, truth.lead_position_m, atol=1e-12)
         assert grown.true == grown.stated
         assert -0.05 <= grown.origin_m <= 0.05
-        assert grown.track.time_s[14] <= grown.release_s <= grown.track.time_s[40]
-        frames = np.diff(grown.track.time_s)
-        np.testing.assert_allclose(frames, 1 / 1069, rtol=1e-9)
+        np.testing.assert_allclose(np.diff(grown.track.time_s), 1 / 1069, rtol=1e-9)
 
 
 def test_scatter_of_damping_and_pressure_is_as_stated() -> None:
     """Standard deviations of 600 draws are good to 3 % (one sigma); the two do not go together."""
     trials = list(with_names(campaign(isometric_vine(4), (28,), 600)))
-    hidden = nature(seed=7, longest_frames=50, release_frames=(15, 40))
-    values = damping_values(trials)
-    grown = grow(trials, replace(hidden, values=values))
+    grown = grow(trials, nature(seed=7, longest_frames=50, release_frames=(15, 40)))
     column = grown[0].model.parameter_names.index("eversion_damping.B")
     B = np.array([one.model.parameters_of(one.true)[column] for one in grown]) / 6.44 - 1
     P = np.array([one.true.pressure_Pa for one in grown]) / 28e3 - 1
@@ -103,17 +99,14 @@ def test_a_recorded_pressure_is_what_drove_it_and_noise() -> None:
     effects = (*GroundTruth().effects, "reservoir_depletion")
     values = {**damping_values(trials), "reservoir_depletion.gamma": 1.0}
     quiet = GroundTruth(effects=effects, values=values, trace_sigma_kPa=0.0, seed=1)
-    for grown in grow(trials, quiet):
-        gauge, y = grown.track.pressure_Pa, grown.true_lead_position_m
-        assert gauge is not None
-        volume = 1e-3 + math.pi * 0.012**2 * y
+    calm = grow(trials, quiet)
+    for grown in calm:
+        volume = 1e-3 + math.pi * 0.012**2 * grown.true_lead_position_m
         truth = (grown.true.pressure_Pa + 101_325) * 1e-3 / volume - 101_325
-        np.testing.assert_allclose(gauge, truth, rtol=1e-9)
-        assert gauge[0] - gauge[-1] > 1e3
+        np.testing.assert_allclose(grown.track.pressure_Pa, truth, rtol=1e-9)
+        assert truth[0] - truth[-1] > 1e3
     loud = grow(trials[:1], replace(quiet, trace_sigma_kPa=0.1))[0]
-    assert loud.track.pressure_Pa is not None
-    calm = grow(trials[:1], quiet)[0].track.pressure_Pa
-    assert np.std(loud.track.pressure_Pa - calm) == pytest.approx(100, rel=0.3)
+    assert np.std(loud.track.pressure_Pa - calm[0].track.pressure_Pa) == pytest.approx(100, rel=0.3)
 
 
 def test_a_hidden_measurement_effect_shows_in_the_track_and_not_in_the_truth() -> None:
@@ -129,9 +122,9 @@ def test_what_is_written_reads_back_without_a_word(tmp_path: Path) -> None:
     write_experiment(grown, tmp_path / "e", "chamber_l: 3.7\n")
     assert check_experiment(tmp_path / "e") == []
     experiment = read_experiment(tmp_path / "e", strict=True)
-    assert [trial.name for trial in experiment.trials] == [one.stated.name for one in grown]
     for trial, one in zip(experiment.trials, grown, strict=True):
-        assert (trial.vine, trial.condition) == (one.stated.vine, one.stated.condition)
+        told = one.stated.name, one.stated.vine, one.stated.condition
+        assert (trial.name, trial.vine, trial.condition) == told
         assert trial.pressure_Pa == pytest.approx(one.stated.pressure_Pa, rel=1e-12)
         track = load_track(trial)
         np.testing.assert_allclose(track.lead_position_m, one.track.lead_position_m, atol=1e-8)
@@ -145,7 +138,7 @@ PAPER = ROOT / "data" / "paper"
 def test_the_papers_nature_has_the_printed_numbers() -> None:
     """B of a printed diameter is in proportion to the wall; of the 25 mm vine it is 6.44 × ½ × (25/24)^0.75 = 3.320."""
     trials = read_experiment(PAPER).trials
-    assert len(trials) == 4 * 10 * 4 + 3 * 8 * 4 + 4 * 4 + 2 * 4 * 4 + (3 + 4 * 3) * 4 + 1
+    assert len(trials) == 365
     hidden = read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
     B = hidden.values["eversion_damping.B"]
     assert hidden.values["eversion_damping.n"] == 0.37

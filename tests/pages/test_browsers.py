@@ -17,17 +17,13 @@ from vinetrack.core.tables import read_table, read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.video.curved_axis import CurvedAxis, axis_from_entry
 
-# The page in a real browser: load, select, drag, tick, refit, watch the error fall, step through frames, save.
-
-
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium"),
 ]
 SIZE = "size_reservoir_depletion.gamma"
 FILMED = "d24_24kPa_1"
-ROW = "48 * 960, 49 * 960"
-"""The middle of the bar in the picture."""
+ROW = "48 * 960, 49 * 960"  # the middle of the bar in the picture
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +46,8 @@ def visitor(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
         assert all(request.startswith(("http://127.0.0.1:", "ws://127.0.0.1:")) for request in asked)
 
 
-def errors(visitor: Visitor) -> np.ndarray:
-    return np.array(visitor.value("error_bars", "data.now"), dtype=float)
-
-
-def floors(visitor: Visitor) -> np.ndarray:
-    return np.array(visitor.value("error_bars", "data.floor"), dtype=float)
+def errors(visitor: Visitor, column: str = "now") -> np.ndarray:
+    return np.array(visitor.value("error_bars", f"data.{column}"), dtype=float)
 
 
 def test_dragging_a_slider_moves_the_curves_continuously(visitor: Visitor) -> None:
@@ -79,8 +71,8 @@ def test_an_effect_ticked_and_refitted_brings_the_error_down(visitor: Visitor) -
     visitor.until("$status.text.includes('refitting')", "progress", 20)
     visitor.until("$refit.label === 'Refit' && $numbers.text.includes('1 parameter more')", "the fit", 240)
     # Of the mean square error that replicates do not explain, a tenth is left at most.
-    beyond = np.mean(before**2) - np.mean(floors(visitor) ** 2)
-    assert np.mean(errors(visitor) ** 2) - np.mean(floors(visitor) ** 2) < 0.1 * beyond
+    floor = np.mean(errors(visitor, "floor") ** 2)
+    assert np.mean(errors(visitor) ** 2) - floor < 0.1 * (np.mean(before**2) - floor)
     assert "vinetrack add reservoir_depletion" in visitor.text("commands")
 
 
@@ -112,17 +104,12 @@ def test_page_and_figures_follow_a_dark_screen(visitor: Visitor) -> None:
         assert (sum(map(int, back[4:-1].split(","))) < 150) == (screen == "dark")
 
 
-# The page in a real browser: fill in, click a ruler, drag the axis, track, save; by keyboard, narrow, dark.
-
-
 SHARED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
 HANDLE = "document.querySelector('[data-handle^=%s]')"
 NAME = "a.getAttribute('aria-label') || a.labels?.[0]?.textContent || a.textContent.slice(0, 40) || a.tagName"
 
 
 class Person:
-    """User actions on the page."""
-
     def __init__(self, chrome: Chrome, address: str) -> None:
         self.chrome = chrome
         chrome.open(address)
@@ -134,31 +121,36 @@ class Person:
         self.chrome.run(f"{field}.focus(), {field}.select()")
         self.chrome.send("Input.insertText", text=text)
 
-    def key(self, name: str, code: int) -> None:
+    def key(self, name: str, code: int, **held: int) -> None:
+        given = {"key": name, "code": name, "windowsVirtualKeyCode": code, **held}
         for kind in ("rawKeyDown", "keyUp"):
-            self.chrome.send("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code)
+            self.chrome.send("Input.dispatchKeyEvent", type=kind, **given)
 
     def press(self, element: str) -> None:
         self.chrome.run(f"document.querySelector({element!r}).click()")
 
+    def said(self, element: str, words: str, seconds: float = 60) -> None:
+        self.chrome.wait(f"document.querySelector('{element}')?.textContent.includes({words!r})", words, seconds)
+
+    def box(self, element: str) -> list[float]:
+        return list(
+            self.chrome.run(
+                f"(() => {{ const r = {element}.getBoundingClientRect(); return [r.x, r.y, r.width, r.height]; }})()"
+            )
+        )
+
     def at(self, x_px: float, y_px: float) -> tuple[float, float]:
         """Place in the window of a pixel of the picture, 480 × 160 px."""
         self.chrome.run("document.querySelector('#over').scrollIntoView({block: 'center'})")
-        left, top, width, height = self.chrome.run(
-            "(() => { const r = document.querySelector('#over').getBoundingClientRect();"
-            " return [r.x, r.y, r.width, r.height]; })()"
-        )
+        left, top, width, height = self.box("document.querySelector('#over')")
         return left + (x_px + 0.5) / 480 * width, top + (y_px + 0.5) / 160 * height
 
     def drag(self, handle: str, x_px: float, y_px: float) -> None:
         """Drag a handle over the picture, under a lens, to a pixel of it."""
         self.at(0, 0)
-        x, y = self.chrome.run(
-            f"(() => {{ const r = {HANDLE % handle}.getBoundingClientRect();"
-            " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
-        )
-        self.chrome.mouse("move", x, y)
-        self.chrome.mouse("press", x, y)
+        left, top, width, height = self.box(HANDLE % handle)
+        for kind in ("move", "press"):
+            self.chrome.mouse(kind, left + width / 2, top + height / 2)
         target = self.at(x_px, y_px)
         self.chrome.mouse("move", *target, held=True)
         assert self.chrome.run("document.querySelector('.lens') !== null")
@@ -166,7 +158,7 @@ class Person:
 
     def save(self, said: str = "Written") -> None:
         self.press("#save")
-        self.chrome.wait(f"document.querySelector('#status').textContent.includes({said!r})", "the save")
+        self.said("#status", said)
 
 
 @contextmanager
@@ -200,19 +192,16 @@ def test_a_folder_of_clips_becomes_an_experiment(person_who_typed_the_command: P
     person.chrome.wait("document.activeElement.id === 'length'", "the field of the length")
     for digit in "168.75":
         person.chrome.send("Input.insertText", text=digit)
-    person.chrome.wait("document.querySelector('#headline').textContent.includes('complete')", "the complete sheet")
+    person.said("#headline", "complete")
     person.press("#check")
-    person.chrome.wait("document.querySelector('#headline').textContent.includes('ready to run')", "the check", 60)
+    person.said("#headline", "ready to run")
     person.press("#track")
-    person.chrome.wait("document.querySelector('.strip img') !== null", "the strip", 120)
-    assert person.chrome.run("document.querySelector('#tracked').textContent.includes('growth')")
+    person.said("#tracked", "growth", 120)
     person.save()
     settings = read_experiment_settings(clips / "experiment.yaml")
-    assert settings.calibration is not None
-    assert settings.calibration.kind == "two_points"
-    assert settings.calibration.from_px == pytest.approx((15, 150), abs=0.6)
-    assert settings.calibration.length_mm == 168.75
-    assert settings.capture_fps == 1000
+    scale = settings.calibration
+    assert (settings.capture_fps, scale.kind, scale.length_mm) == (1000, "two_points", 168.75)
+    assert scale.from_px == pytest.approx((15, 150), abs=0.6)
     assert read_table(clips / "trials.csv").columns == ("trial", "video", "diameter_mm", "pressure_kPa")
 
 
@@ -225,9 +214,7 @@ def test_the_axis_is_dragged_and_moved_by_the_keyboard(person: Person, clips: Pa
     assert axis["to_px"] == pytest.approx([440, 91], abs=1.0)
 
 
-def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_the_one_tracked_along(
-    person: Person, clips: Path
-) -> None:
+def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_that_tracked_along(person: Person, clips: Path) -> None:
     person.press("#add-bend")
     assert person.chrome.run(f"document.activeElement === {HANDLE % 'Bend'}")
     person.drag("Bend", 250, 120)
@@ -251,11 +238,9 @@ def test_a_frame_is_corrected_and_the_file_contains_the_correction(person: Perso
     """Frame 20 is dropped by its button, frame 21 moved in the picture by the keyboard, and 22 taken back."""
     person.press("#track")
     person.chrome.wait("document.querySelector('.strip svg') !== null", "the strip", 120)
-    show = (
-        "(() => { const f = document.querySelector('#frame'); f.value = %d; f.dispatchEvent(new Event('input')); })()"
-    )
     for frame, button in ((20, "#drop"), (22, "#confirm"), (22, "#undo")):
-        person.chrome.run(show % frame)
+        person.chrome.run(f"document.querySelector('#frame').value = {frame}")
+        person.chrome.run("document.querySelector('#frame').dispatchEvent(new Event('input'))")
         person.press(button)
     person.press("[aria-label='Previous frame']")
     edge = HANDLE % "Leading"
@@ -264,15 +249,11 @@ def test_a_frame_is_corrected_and_the_file_contains_the_correction(person: Perso
     person.key("ArrowRight", 39)
     assert person.chrome.run("document.querySelector('.strip .by-hand').getAttribute('d').split('M').length") == 2
     person.save("corrections.csv")
-    rows = read_table(clips / "corrections.csv").rows
-    assert [(row["trial"], row["frame"], row["action"]) for row in rows] == [
-        ("d15_24kPa_1", "20", "drop"),
-        ("d15_24kPa_1", "21", "move"),
-    ]
+    rows = [(row["trial"], row["frame"], row["action"]) for row in read_table(clips / "corrections.csv").rows]
+    assert rows == [("d15_24kPa_1", "20", "drop"), ("d15_24kPa_1", "21", "move")]
     person.chrome.run(f"{HANDLE % 'End'}.focus()")
     person.key("ArrowDown", 40)
-    warning = "document.querySelector('#moved-points')?.textContent"
-    person.chrome.wait(f"{warning}?.includes('to the former axis')", "the warning of moved points")
+    person.said("#moved-points", "to the former axis")
 
 
 def test_every_control_is_reached_by_tab_and_has_a_name(person: Person) -> None:
@@ -313,8 +294,5 @@ def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(pers
     person.chrome.wait("document.querySelectorAll('#pasted li').length === 1", "the row of no clip")
     assert [float(cell) for cell in person.chrome.run(cells)] == pytest.approx([24.1317, 30.3369])
     assert person.chrome.run(names) == before[1]
-    for kind in ("rawKeyDown", "keyUp"):
-        person.chrome.send(
-            "Input.dispatchKeyEvent", type=kind, key="z", code="KeyZ", windowsVirtualKeyCode=90, modifiers=2
-        )
+    person.key("z", 90, modifiers=2)
     assert person.chrome.run(cells) == before[0]

@@ -11,6 +11,7 @@ import time
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -26,22 +27,12 @@ from tornado.websocket import websocket_connect
 from vinetrack.effects import Parameter
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.laboratory.tracks import grow, read_ground_truth
-from vinetrack.pages.campaign import (
-    Campaign,
-    Fitted,
-    Job,
-    choice_in_use,
-    commands,
-    predict_choice,
-    slider_range,
-)
+from vinetrack.pages.campaign import Campaign, Fitted, Job, choice_in_use, commands, predict_choice, slider_range
 from vinetrack.pages.page import address as where
 from vinetrack.pages.page import open_campaign, start_server
 from vinetrack.pages.plots import RecordingView, decode, recording_view
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.video.axis import Axis
-
-# What a choice predicts, and the lines, labels and commands that follow from it.
 
 
 @pytest.mark.slow
@@ -60,13 +51,14 @@ def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> N
     assert prediction.errors_m == pytest.approx(table["rms_position_m"].to_dict(), rel=1e-6)
 
 
-def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_path: Path) -> None:
+def test_a_fit_that_was_refused_still_shows_the_trials_and_a_folder_without_any_is_refused(
+    campaign: Campaign, tmp_path: Path
+) -> None:
     folder = tmp_path / "results"
     shutil.copytree(campaign.folder, folder)
     (folder / "fit.json").write_text(json.dumps({"model": [], "refused": "no reason"}))
     bare = open_campaign(folder)
-    assert bare.refused == "no reason"
-    assert bare.floors_m == {}
+    assert (bare.refused, bare.floors_m) == ("no reason", {})
     assert choice_in_use(bare).numbers["eversion_damping.n"] == 0.37
     true = {one.stated.name: one for one in grow(bare.experiment.trials, read_ground_truth(DEMO))}
     assert len(bare.trials) == 6
@@ -74,11 +66,6 @@ def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_p
         # The last frame at rest, where 0.1 mm of noise hides the first two milliseconds of the motion.
         assert seen.release_s == pytest.approx(true[seen.name].release_s, abs=2.5e-3)
         assert seen.origin_m == pytest.approx(true[seen.name].origin_m, abs=1e-4)
-
-
-def test_a_folder_without_usable_trials_is_refused(campaign: Campaign, tmp_path: Path) -> None:
-    folder = tmp_path / "results"
-    shutil.copytree(campaign.folder, folder)
     for path in (folder / "tracks").iterdir():
         path.write_text(path.read_text().splitlines()[0] + "\n")
     with pytest.raises(ResultsError):
@@ -88,9 +75,7 @@ def test_a_folder_without_usable_trials_is_refused(campaign: Campaign, tmp_path:
 def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value() -> None:
     drag = Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0))
     assert slider_range("air_drag.C_D", drag, 1.0) == (0.0, 3.0)
-    low, high = slider_range("air_drag.C_D", drag, 17.0)
-    assert low == 0.0
-    assert 17.0 < high < 200.0
+    assert slider_range("air_drag.C_D", drag, 17.0) == (0.0, 21.25)
     assert slider_range("air_drag.C_D", drag, 200.0)[1] == 200.0
     gauge = Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3))
     assert slider_range("pressure_gauge.delta", gauge, -3e3) == (-3e3, 2e3)
@@ -103,20 +88,14 @@ def test_the_page_shows_the_command_that_reproduces_it(campaign: Campaign) -> No
     folder = campaign.folder.as_posix()
     assert commands(campaign, start, fitted=True) == [f"vinetrack compare {folder}"]
     more = start.with_effect("reservoir_depletion").with_effect("leak")
-    assert commands(campaign, more, fitted=True, save=True) == [
-        f"vinetrack add reservoir_depletion {folder} --save",
-        f"vinetrack add leak {folder} --save",
-    ]
+    added = [f"vinetrack add {name} {folder} --save" for name in ("reservoir_depletion", "leak")]
+    assert commands(campaign, more, fitted=True, save=True) == added
     assert commands(campaign, more, fitted=False) == []
     assert commands(replace(campaign, in_use=(*campaign.in_use, "leak")), start, fitted=True) == []
 
 
-# Background fits and recordings.
-
-
 def test_a_cancelled_job_calls_no_callback() -> None:
-    steps: list[Step] = []
-    ends: list[tuple[object, str]] = []
+    told: list[object] = []
     started = threading.Event()
 
     def endless(watch: Watch) -> Fitted:
@@ -125,17 +104,12 @@ def test_a_cancelled_job_calls_no_callback() -> None:
             watch(Step(1, {}, 1.0))
             time.sleep(0.01)
 
-    job = Job(endless, steps.append, lambda *end: ends.append(end))
+    job = Job(endless, lambda _: None, lambda *end: told.append(end))
     started.wait(10)
     job.cancel()
     job.wait(10)
-    count = len(steps)
-    time.sleep(0.05)
-    assert len(steps) == count
-    assert not ends
-
-
-# A recording in the explorer: positions of edges in its picture, and the message for a trial without one.
+    assert not job._thread.is_alive()
+    assert not told
 
 
 def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
@@ -179,30 +153,26 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
     assert "no longer exists" in str(recording_view(results, trial))
     trial = replace(trial, video=write_bars(tmp_path / "a.mp4", np.full(2, 20)))
     assert "does not exist" in str(recording_view(results, trial))
-    results.track(trial.name).parent.mkdir()
-    results.analysed(trial.name).parent.mkdir()
-    results.track(trial.name).write_text(
-        "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag\n0,0,5,0,0,\n"
-    )
-    results.analysed(trial.name).write_text("{}")
-    assert "run snakemake again" in str(recording_view(results, trial))
-    axis = {"from_px": [0, 10], "to_px": [300, 10], "width_px": None}
-    results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
-    found = recording_view(results, trial)
+    for path in (results.track(trial.name), results.analysed(trial.name)):
+        path.parent.mkdir()
+    head = "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag"
+    results.track(trial.name).write_text(f"{head}\n0,0,5,0,0,\n")
+
+    def along(**axis: Any) -> RecordingView | str:
+        results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
+        return recording_view(results, trial)
+
+    assert "run snakemake again" in str(along())
+    found = along(from_px=[0, 10], to_px=[300, 10], width_px=None)
     assert isinstance(found, RecordingView)
     assert found.half_width_px == pytest.approx(15.0)
     assert (found.axis.from_px, found.axis.to_px) == ((0.0, 10.0), (300.0, 10.0))
-    bent = {"from_px": [0, 10], "via_px": [[100, 40]], "to_px": [300, 10], "width_px": 20}
-    results.analysed(trial.name).write_text(json.dumps({"axis": bent}))
-    found = recording_view(results, trial)
+    found = along(from_px=[0, 10], via_px=[[100, 40]], to_px=[300, 10], width_px=20)
     assert isinstance(found, RecordingView)
     (x0, x1), (y0, y1) = found.across(0.5 * found.axis.length_px, 0)
     middle, direction = found.axis.points(0.5 * found.axis.length_px), np.array([y0 - y1, x1 - x0]) / 30
     assert np.allclose([(x0 + x1) / 2, (y0 + y1) / 2], middle)
     assert np.allclose(direction, found.axis.direction_at(0.5 * found.axis.length_px), atol=1e-9)
-
-
-# The command: refusals, and a local server that Ctrl-C ends.
 
 
 def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign, tmp_path: Path) -> None:
@@ -215,13 +185,10 @@ def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign,
     assert open_campaign(tmp_path / "results", campaign.experiment.folder).conditions == campaign.conditions
 
 
-async def _origin_of_elsewhere(address: str) -> str:
+async def _origin_of_elsewhere(address: str) -> None:
     request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Origin": "http://example.org"})
-    try:
-        (await websocket_connect(request)).close()
-    except HTTPClientError as error:
-        return str(error.code)
-    return "let in"
+    with pytest.raises(HTTPClientError, match="403"):
+        await websocket_connect(request)
 
 
 @pytest.mark.slow
@@ -231,11 +198,10 @@ def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign: Camp
         with urllib.request.urlopen(address, timeout=60) as answer:
             page = answer.read().decode("utf-8")
         assert "vinetrack explorer" in page
-        assert "cdn.bokeh.org" not in page
         port = urlsplit(address).port
         with pytest.raises(OSError, match="refused"), socket.create_connection((_own_address(), port), timeout=5):
             pass
-        assert IOLoop(make_current=False).run_sync(lambda: _origin_of_elsewhere(address)) == "403"
+        IOLoop(make_current=False).run_sync(lambda: _origin_of_elsewhere(address))
         assert served.interrupt() == 0
     assert served.lines[-1] == "Explorer ended."
     assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
@@ -248,7 +214,6 @@ async def _answers(address: str, host: str) -> int:
 
 @pytest.fixture
 def bare_server():
-    """A server without an open page."""
     server = start_server(None, 0)
     yield server
     server.stop()
@@ -257,16 +222,12 @@ def bare_server():
 @pytest.mark.parametrize(
     "route", ["", "ws", "autoload.js?bokeh-autoload-element=a", "static/js/bokeh.min.js", "metadata"]
 )
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", "localhost.evil.example:{port}"])
-def test_no_route_answers_under_another_name(bare_server, route: str, host: str) -> None:
-    name = host.format(port=bare_server.port)
-    assert bare_server.io_loop.run_sync(lambda: _answers(where(bare_server) + route, name)) == 403
-
-
-@pytest.mark.parametrize("route", ["/", "/autoload.js?bokeh-autoload-element=a", "/ws", "/static/js/bokeh.min.js"])
-def test_nothing_answers_without_the_secret_of_the_address(bare_server, route: str) -> None:
-    own = f"127.0.0.1:{bare_server.port}"
-    assert bare_server.io_loop.run_sync(lambda: _answers(f"http://{own}{route}", own)) == 404
+def test_no_route_answers_under_another_name_or_without_the_secret(bare_server, route: str) -> None:
+    port, answer = bare_server.port, bare_server.io_loop.run_sync
+    for name in ("evil.example", f"evil.example:{port}", "127.0.0.1", f"localhost.evil.example:{port}"):
+        assert answer(lambda name=name: _answers(where(bare_server) + route, name)) == 403
+    own = f"127.0.0.1:{port}"
+    assert answer(lambda: _answers(f"http://{own}/{route}", own)) == 404
 
 
 def _own_address() -> str:

@@ -118,26 +118,14 @@ class _Hooks:
 
 
 def _initial_state(trial: Trial, rig: TrialInputs, time: Floats, position: Floats, velocity: Floats) -> State:
-    ones = np.ones_like(time)
-    angle = sum(
-        (np.clip(position - bend.start_m, 0.0, bend.arc_m) / bend.radius_m for bend in trial.bends), np.zeros_like(time)
-    )
+    ones, nothing = np.ones_like(time), np.zeros_like(time)
+    angles = (np.clip(position - bend.start_m, 0.0, bend.arc_m) / bend.radius_m for bend in trial.bends)
     fields: dict[str, Any] = {
-        "time": time,
-        "lead_position": position,
-        "lead_velocity": velocity,
-        "tail_position": rig.travel_ratio * position,
-        "tail_velocity": rig.travel_ratio * velocity,
-        "set_pressure": rig.set_pressure * ones,
-        "pressure": rig.set_pressure * ones,
-        "yield_pressure": rig.yield_pressure * ones,
-        "area": rig.area * ones,
-        "linear_density": rig.linear_density * ones,
-        "moving_mass": ones,
-        "damping_gain": ones,
-        "bend_angle": angle,
-        "tail_tension": np.zeros_like(time),
-        "observed": position,
+        **{name: getattr(rig, name) * ones for name in ("set_pressure", "yield_pressure", "area", "linear_density")},
+        **{"time": time, "lead_position": position, "lead_velocity": velocity, "observed": position},
+        **{"tail_position": rig.travel_ratio * position, "tail_velocity": rig.travel_ratio * velocity},
+        **{"pressure": rig.set_pressure * ones, "moving_mass": ones, "damping_gain": ones},
+        **{"bend_angle": sum(angles, nothing), "tail_tension": nothing},
     }
     return State(**fields)
 
@@ -208,13 +196,11 @@ class AuditedMotion:
     lead_velocity_m_s: Floats
     pressure_Pa: Floats | None = None
 
-    def thinned(self, most: int = 200) -> AuditedMotion:
-        """The same motion at fewer points."""
-        every = slice(None, None, max(1, math.ceil(self.time_s.size / most)))
-        pressure = None if self.pressure_Pa is None else self.pressure_Pa[every]
-        return AuditedMotion(
-            self.trial, self.time_s[every], self.lead_position_m[every], self.lead_velocity_m_s[every], pressure
-        )
+    def thinned(self) -> AuditedMotion:
+        """The same motion at 200 points or fewer."""
+        every = slice(None, None, max(1, math.ceil(self.time_s.size / 200)))
+        time_s, y, v = (part[every] for part in (self.time_s, self.lead_position_m, self.lead_velocity_m_s))
+        return AuditedMotion(self.trial, time_s, y, v, None if self.pressure_Pa is None else self.pressure_Pa[every])
 
     def terms(self, model: Model) -> Terms:
         """Everything that a model computes along it."""
@@ -288,7 +274,7 @@ def audit(model: Model, motions: Sequence[AuditedMotion]) -> Audit:
         # A pressure measured during growth includes what happens in the chamber.
         neglected = [effect for effect in left if not (effect.in_trace and motion.pressure_Pa is not None)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
-        tension = _tension_row(motion, terms)
+        tension = _tension_row(motion, terms.tension_N)
         rows += [*left_out, tension]
         violated = _violated_rules(model, motion, {row["term"]: row for row in left_out}, tension)
         violations += [RuleViolation(motion.trial.name, rule, words) for rule, words in violated]
@@ -319,8 +305,7 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
     return motion.row(effect.name, i, size=size, force_N=float(force[i]), share_of_drive=float(share[i]))
 
 
-def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:
-    tension = terms.tension_N
+def _tension_row(motion: AuditedMotion, tension: Floats) -> dict[str, Any]:
     i = int(np.argmin(tension))
     drive = float(motion.drive_N()[i])
     share = float(tension[i]) / drive if drive > 0 else math.nan
@@ -335,12 +320,9 @@ def _violated_rules(
     """Each rule that the trial violates, and how, in words."""
     trial = motion.trial
     drag = neglected.get("air_drag")
-    if drag and abs(drag["share_of_drive"]) > 0.05:
-        yield (
-            "drag",
-            f"air drag is {abs(drag['share_of_drive']):.1%} of the drive at y/L = {drag['y_over_L']:.2f} "
-            f"({drag['size']}), above 5%; add air_drag to the model",
-        )
+    if drag and (share := abs(drag["share_of_drive"])) > 0.05:
+        where = f"at y/L = {drag['y_over_L']:.2f} ({drag['size']})"
+        yield "drag", f"air drag is {share:.1%} of the drive {where}, above 5%; add air_drag to the model"
     if "tail_friction" in neglected and trial.length_m >= 0.30:
         yield (
             "length",
@@ -349,11 +331,8 @@ def _violated_rules(
         )
     bent_deg = math.degrees(sum(bend.arc_m / bend.radius_m for bend in trial.bends))
     if "capstan_friction" in neglected and bent_deg >= 30:
-        yield (
-            "bends",
-            f"the path bends by {bent_deg:.0f}° in all, which is safe to neglect below "
-            "30°; add capstan_friction to the model",
-        )
+        safe = "which is safe to neglect below 30°"
+        yield "bends", f"the path bends by {bent_deg:.0f}° in all, {safe}; add capstan_friction to the model"
     yield from _reservoir_rule(model, motion, neglected.get("reservoir_depletion"))
     if math.isfinite(tension["slack_from_s"]) and trial.tail_slack != "free":
         yield (
@@ -369,14 +348,12 @@ def _reservoir_rule(model: Model, motion: AuditedMotion, row: dict[str, Any] | N
     if row is None or row["note"] or not pressure > 0:
         return
     depleted = model + catalogue()["reservoir_depletion"]
-    pressures = (
-        motion.terms(depleted.with_values({"reservoir_depletion.gamma": gamma})).pressure_Pa for gamma in (1.0, 1.4)
-    )
-    shares = [1 - float(np.min(along_Pa)) / pressure for along_Pa in pressures]
-    if shares[1] > 0.05:
+    models = (depleted.with_values({"reservoir_depletion.gamma": gamma}) for gamma in (1.0, 1.4))
+    slow, fast = (1 - float(np.min(motion.terms(each).pressure_Pa)) / pressure for each in models)
+    if fast > 0.05:
         yield (
             "reservoir",
-            f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
-            f"(fast) of its gauge pressure while the vine grows, above 5%, unless a supply refills "
-            "it; add reservoir_depletion or supply_refill to the model, or measure the pressure",
+            f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {slow:.0%} (slow) to {fast:.0%} (fast) of "
+            "its gauge pressure while the vine grows, above 5%, unless a supply refills it; add reservoir_depletion or "
+            "supply_refill to the model, or measure the pressure",
         )

@@ -16,6 +16,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core import units
 from vinetrack.core.records import Floats
+from vinetrack.core.tables import write_text
 from vinetrack.core.threads import available_cores, thread_pool
 from vinetrack.dynamics.equations import BatchArrays
 from vinetrack.dynamics.model import Model, effects_on, hosted, shared_host
@@ -171,21 +173,13 @@ def integrate_many(batch, first, last, rtol, out, ends, work, means):
 
 
 def _cache_folder() -> Path:
-    for base in (
-        os.environ.get("VINETRACK_CACHE"),
-        os.environ.get("XDG_CACHE_HOME"),
-        "~/.cache",
-        tempfile.gettempdir(),
-    ):
-        if not base:
-            continue
+    bases = os.environ.get("VINETRACK_CACHE"), os.environ.get("XDG_CACHE_HOME"), "~/.cache", tempfile.gettempdir()
+    for base in filter(None, bases):
         folder = Path(base).expanduser() / "vinetrack" / "kernels"
-        try:
+        with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
-        except OSError:
-            continue
     raise OSError("No writable folder was found for the compiled model; set VINETRACK_CACHE to one.")
 
 
@@ -210,10 +204,7 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
         return _LOADED[digest]
     path = _cache_folder() / f"kernel_{digest}.py"
     if not path.is_file():
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(source)
-        Path(temporary).replace(path)
+        write_text(path, source)
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None

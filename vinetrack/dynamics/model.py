@@ -97,20 +97,14 @@ class Model:
 
     # A fit determines several thousand times which effects act; the part that depends on the model alone is cached.
     @cached_property
-    def sized_effects(self) -> tuple[list[int], list[int]]:
-        """Indices of the effects that have parameters, and where the parameters of each begin."""
+    def sized_and_replaced(self) -> tuple[list[int], list[int], list[tuple[int, int]]]:
+        """Indices of the effects that have parameters, where the parameters of each begin; and pairs of indices: an
+        effect, and one that it replaces.
+        """
         sized = [i for i, effect in enumerate(self.effects) if effect.parameters]
-        return sized, [self.places[i].start for i in sized]
-
-    @cached_property
-    def replaced_effects(self) -> list[tuple[int, int]]:
-        """Pairs of indices: an effect, and one that it replaces."""
-        return [
-            (i, j)
-            for i, effect in enumerate(self.effects)
-            for j, other in enumerate(self.effects)
-            if other.name in effect.replaces
-        ]
+        replaces = [(i, name) for i, effect in enumerate(self.effects) for name in effect.replaces]
+        pairs = [(i, self.names.index(name)) for i, name in replaces if name in self.names]
+        return sized, [self.places[i].start for i in sized], pairs
 
     @cached_property
     def hooks(self) -> Mapping[str, list[tuple[int, Callable[..., Any], slice]]]:
@@ -191,11 +185,11 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
     (n_trials, n_parameters) → (n_trials, n_effects).
     """
     on = np.ones((len(parameters), len(model.effects)), dtype=bool)
-    sized, begins = model.sized_effects
+    sized, begins, replaced = model.sized_and_replaced
     if sized:
         on[:, sized] = np.logical_or.reduceat(parameters != model.zeros, begins, axis=1)
     acting = on.copy()
-    for i, j in model.replaced_effects:
+    for i, j in replaced:
         on[:, j] &= ~acting[:, i]
     return on
 

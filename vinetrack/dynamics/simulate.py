@@ -212,11 +212,13 @@ def effect_motion(effect: Effect) -> pd.DataFrame:
     """Motion of the reference vine with an effect at its default size and without it. An effect of the base model is
     removed from it, any other is added.
     """
-    with_it, without = _models(effect)
+    models = _models(effect)
     trial, trace, _ = _reference(effect)
-    times = np.linspace(0.0, _end_s(with_it, without, trial, trace), 400)
-    a, b = simulate(without, trial, times, trace=trace), simulate(with_it, trial, times, trace=trace)
-    without_m, with_m = a.observed_position_m, b.observed_position_m
+    # Shortly before the earlier end of growth; to that of the pressure if it is measured.
+    grown = [] if trace is not None else [simulate(model, trial, np.linspace(0.0, 2.0, 50)) for model in models]
+    end_s = 0.99 * min((motion.end_time_s for motion in grown if motion.status == "ended"), default=0.5 / 0.99)
+    times = np.linspace(0.0, end_s if trace is None else float(trace[0][-1]), 400)
+    with_m, without_m = (simulate(model, trial, times, trace=trace).observed_position_m for model in models)
     return pd.DataFrame(
         {
             "time_s": times,
@@ -243,12 +245,3 @@ def _models(effect: Effect) -> tuple[Model, Model]:
     if effect.kind == "base":
         return none, none.with_values({name: p.zero for name, p in sizes.items()})
     return none.with_values({name: p.default for name, p in sizes.items()}), none
-
-
-def _end_s(with_it: Model, without: Model, trial: Trial, trace: Trace | None) -> float:
-    """Shortly before the earlier end of growth; that of the pressure if it is measured."""
-    if trace is not None:
-        return float(trace[0][-1])
-    motions = [simulate(model, trial, np.linspace(0.0, 2.0, 50)) for model in (with_it, without)]
-    ends = [motion.end_time_s for motion in motions if motion.status == "ended"]
-    return 0.99 * min(ends) if ends else 0.5

@@ -25,7 +25,7 @@ from types import MappingProxyType, ModuleType
 from typing import Any
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.tables import file_size
+from vinetrack.core.tables import file_size, write_json
 from vinetrack.core.terminal import table
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.effects._base import HOOKS, KINDS, Effect, Parameter, State, TrialInputs, Worked
@@ -60,8 +60,6 @@ def first_run(path: Path) -> str:
 
 def remember(path: Path) -> None:
     """Remember an own effect as known, because it was announced or written by this program."""
-    from vinetrack.core.tables import write_json
-
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     with contextlib.suppress(OSError):
         write_json(memory_file(), _known() | {digest: str(path.resolve())})
@@ -295,19 +293,11 @@ def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None
     """Return lines with name, kind and parameters of each effect, and its formula below; base effects first."""
     own = set((user_effects or {}).values())
     effects = sorted(effects, key=lambda effect: KINDS.index(effect.kind))
-    entries = [
-        (
-            effect.name,
-            f"{effect.kind}, own" if effect in own else effect.kind,
-            ", ".join(f"{p.symbol} ({p.unit})" for p in effect.parameters) or "–",
-        )
-        for effect in effects
-    ]
-    head, *lines = table(entries, ("name", "kind", "parameters"))
-    return [
-        head,
-        *(part for line, effect in zip(lines, effects, strict=True) for part in (line, f"    {effect.formula}")),
-    ]
+    kinds = [f"{effect.kind}, own" if effect in own else effect.kind for effect in effects]
+    parameters = [", ".join(f"{p.symbol} ({p.unit})" for p in effect.parameters) or "–" for effect in effects]
+    entries = zip((effect.name for effect in effects), kinds, parameters, strict=True)
+    head, *lines = table(list(entries), ("name", "kind", "parameters"))
+    return [head, *(part for line, e in zip(lines, effects, strict=True) for part in (line, f"    {e.formula}"))]
 
 
 def explanation(effect: Effect) -> list[str]:

@@ -44,11 +44,6 @@ def breakpoints(rig, k, y_0):
 
 
 WORKED = (
-    Worked(
-        "tail_force",
-        -0.4,
-        "20 N/m × (0.12 − 0.10) m",
-        state={"lead_position": 0.12},
-    ),
+    Worked("tail_force", -0.4, "20 N/m × (0.12 − 0.10) m", state={"lead_position": 0.12}),
     Worked("tail_force", 0.0, "not reached", state={"lead_position": 0.09}),
 )

@@ -49,11 +49,4 @@ WORKED = (
         state={"pressure": 28e3, "lead_velocity": 3.0, "tail_velocity": 6.0},
         rig={"payload_mass": 35.6e-3, "ambient_pressure": 101_325.0},
     ),
-    Worked(
-        "tail_force",
-        0.0,
-        "no payload",
-        state={"pressure": 28e3, "lead_velocity": 3.0, "tail_velocity": 6.0},
-        rig={"payload_mass": 0.0, "ambient_pressure": 101_325.0},
-    ),
 )

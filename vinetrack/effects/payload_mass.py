@@ -64,14 +64,6 @@ WORKED = (
         parameters={"delta": -0.1},
     ),
     Worked(
-        "added_mass",
-        0.0,
-        "no payload",
-        state={"lead_position": 0.1},
-        rig={"payload_mass": 0.0},
-        parameters={"delta": 0.006},
-    ),
-    Worked(
         "tail_force",
         0.05886,
         "6 g × 9.81, straight down",

@@ -61,11 +61,4 @@ WORKED = (
         state={"lead_position": 0.2},
         rig={"length": 0.28, "tail_on_reel": 0.0},
     ),
-    Worked(
-        "tail_force",
-        -0.1,
-        "off a reel, 0.5 N/m × 0.20 m",
-        state={"lead_position": 0.2},
-        rig={"length": 0.28, "tail_on_reel": 1.0},
-    ),
 )

@@ -15,7 +15,7 @@ import argparse
 import fnmatch
 import os
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from itertools import count, repeat
 from pathlib import Path
 
 import yaml
@@ -69,16 +69,11 @@ def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, s
     image = getattr(experiment.settings.calibration, "image", None)
     if image is not None:
         picture_target(filming, experiment.folder / image, seed)
-    film_trial = partial(_film_one, filming=filming, seed=seed)
+    paths = [trial.stated.video for trial in grown]
     with ProcessPoolExecutor(processes) as pool:
-        for i, name in enumerate(pool.map(film_trial, grown, range(len(grown)))):
-            print(f"filmed {i + 1} of {len(grown)}: {name}", flush=True)
-
-
-def _film_one(trial: VirtualTrial, number: int, filming: Filming, seed: int) -> str:
-    assert trial.stated.video is not None
-    truth = film(trial, filming, trial.stated.video, seed + number)
-    return f"{trial.stated.name}, {truth.time_s.size} frames"
+        truths = pool.map(film, grown, repeat(filming), paths, count(seed))
+        for i, (trial, truth) in enumerate(zip(grown, truths, strict=True), 1):
+            print(f"filmed {i} of {len(grown)}: {trial.stated.name}, {truth.time_s.size} frames", flush=True)
 
 
 if __name__ == "__main__":

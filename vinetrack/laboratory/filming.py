@@ -2,12 +2,11 @@
 
 A campaign is simulated first (`tracks.grow`), and its true motion is then filmed, so that the results of a tracker
 can be compared with it. An experiment of tracks is turned into one of recordings with the same sheet, a camera and a
-target. Files are H.264 as in cameras, FFV1 without loss, or a folder of PNG pictures.
+target. Files are H.264 as in cameras, or FFV1 without loss.
 """
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -19,8 +18,7 @@ import pandas as pd
 import yaml
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Trial
-from vinetrack.core.tables import replacing, write_csv, write_text
+from vinetrack.core.tables import replacing, write_bytes, write_csv, write_text
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.sheet import SHEET
@@ -34,28 +32,11 @@ Frame = NDArray[np.uint8 | np.uint16]
 def render_recording(
     scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, out_path: Path, seed: int = 0
 ) -> Truth:
-    """Film `motion` in `scene` and write the recording to `out_path`, completely or not at all: with an ending a film
-    with the scene's codec, without one a folder of numbered PNG pictures.
-    """
+    """Film `motion` in `scene` and write the recording to `out_path`, completely or not at all."""
     renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
-    out_path.parent.mkdir(parents=True, exist_ok=True)
-    draft = out_path.with_name("part-" + out_path.name)
-    (_write_video if out_path.suffix else _write_pictures)(renderer, draft)
-    if out_path.is_dir():
-        shutil.rmtree(out_path)
-    draft.replace(out_path)
+    with replacing(out_path) as draft:
+        _write_video(renderer, draft)
     return renderer.truth(np.arange(n_frames))
-
-
-def _write_pictures(renderer: FrameRenderer, folder: Path) -> None:
-    import cv2
-
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    for index in range(renderer.n_frames):
-        path = folder / f"frame_{index:06d}.png"
-        if not cv2.imwrite(str(path), renderer.frame(index), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise OSError(f"{path}: the picture could not be written; is the disk full?")
 
 
 def _write_video(renderer: FrameRenderer, path: Path) -> None:
@@ -81,9 +62,10 @@ def _write_video(renderer: FrameRenderer, path: Path) -> None:
             stream.gop_size = encoding.gop
             stream.codec_context.color_range = 1  # levels of 16…235
         for index in range(renderer.n_frames):
-            picture = av.VideoFrame(scene.camera.width_px, scene.camera.height_px, pixel_format)
+            picture: Any = av.VideoFrame(scene.camera.width_px, scene.camera.height_px, pixel_format)
             for plane, values in zip(picture.planes, (renderer.frame(index, **levels), *chroma), strict=False):
-                _fill(plane, values)
+                rows = np.frombuffer(plane, values.dtype).reshape(-1, plane.line_size // values.itemsize)
+                rows[: values.shape[0], : values.shape[1]] = values
             picture.pts = index
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
@@ -102,12 +84,6 @@ def _chroma(scene: Scene) -> tuple[Frame, Frame]:
     fade = np.linspace(0, 1, columns)[None, :] + 0.2 * np.linspace(0, 1, rows)[:, None]
     u, v = (12, -8) if scene.sensor.colour else (0, 0)  # a warm wall and bluish film under LED lamps
     return (128 - u * fade).astype(np.uint8), (128 - v * fade).astype(np.uint8)
-
-
-def _fill(plane: Any, values: Frame) -> None:
-    row = plane.line_size // values.itemsize
-    target = np.frombuffer(plane, dtype=values.dtype)[: row * values.shape[0]].reshape(values.shape[0], row)
-    target[:, : values.shape[1]] = values
 
 
 # ------------------------------------------------------------------------------
@@ -148,25 +124,20 @@ def make_filming(content: dict[str, Any]) -> Filming:
     return Filming(**{**content, "camera": Camera(**content.get("camera", {})), "target": Target(**target)})
 
 
-def scene_of(stated: Trial, filming: Filming) -> Scene:
-    """Return the scene with a tube of the size that the sheet states for the trial."""
-    base = preset(filming.scene)
-    subject = base.subject
+def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -> Truth:
+    """Film one simulated trial, with a tube of the stated size; its truth is returned and not written."""
+    stated, scene = trial.stated, preset(filming.scene)
+    subject, capture_fps = scene.subject, stated.capture_fps
     if isinstance(subject, Tube):
         payload_m = 0.6 * stated.diameter_m if stated.payload_kg > 0 else 0.0
         size = {"diameter_m": stated.diameter_m, "length_m": stated.length_m, "payload_diameter_m": payload_m}
         subject = replace(subject, **size)
-    return replace(base, subject=subject, camera=filming.camera, exposure_fraction=filming.exposure_fraction)
-
-
-def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -> Truth:
-    """Film one simulated trial; its truth is returned and not written."""
-    capture_fps = trial.stated.capture_fps
+    scene = replace(scene, subject=subject, camera=filming.camera, exposure_fraction=filming.exposure_fraction)
     n_frames = int(trial.track.time_s.size)
     time_s = np.linspace(0.0, n_frames / capture_fps, 8 * n_frames + 1)  # 8 samples a frame (chosen)
     motion = time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m
     how: dict[str, Any] = {"n_frames": n_frames, "capture_fps": capture_fps, "out_path": out_path, "seed": seed}
-    return render_recording(scene_of(trial.stated, filming), motion, **how)
+    return render_recording(scene, motion, **how)
 
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
@@ -174,9 +145,7 @@ def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
     import cv2
 
     picture = render_target(filming.target, replace(preset(filming.scene), camera=filming.camera), seed=seed)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+    write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 def recording_experiment(experiment: Experiment, trials: Sequence[str], filming: Filming, folder: Path) -> Experiment:

@@ -55,22 +55,18 @@ def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
     return (ramp * pool * (1 + look.texture * (blotches + grain))).astype(np.float32)
 
 
-def _paste(canvas: Image, patch: Image, matrix: NDArray[np.float64]) -> Image:
-    """Lay `patch` over `canvas` through the affine `matrix` (patch to canvas)."""
+def _paste(
+    canvas: Image, patch: Image, scene: Scene, corner: tuple[int, int], along_px: float, across_px: float
+) -> Image:
+    """Lay a patch drawn along the path over `canvas`, its top left at (along_px, across_px)."""
     import cv2
 
-    size = (canvas.shape[1], canvas.shape[0])
-    weight = cv2.warpAffine(np.ones_like(patch), matrix, size, flags=cv2.INTER_LINEAR)
-    laid = cv2.warpAffine(patch, matrix, size, flags=cv2.INTER_LINEAR)
-    return np.asarray(canvas * (1 - weight) + laid, dtype=np.float32)
-
-
-def _axis_matrix(scene: Scene, corner: tuple[int, int], along_px: float, across_px: float) -> NDArray[np.float64]:
-    """Affine map of a patch drawn along the path to the canvas; its top left is at (along_px, across_px)."""
     ux, uy = scene.direction
     x0 = scene.origin[0] - corner[0] + along_px * ux - across_px * uy
     y0 = scene.origin[1] - corner[1] + along_px * uy + across_px * ux
-    return np.array([[ux, -uy, x0], [uy, ux, y0]])
+    matrix, size = np.array([[ux, -uy, x0], [uy, ux, y0]]), (canvas.shape[1], canvas.shape[0])
+    weight, laid = (cv2.warpAffine(part, matrix, size, flags=cv2.INTER_LINEAR) for part in (np.ones_like(patch), patch))
+    return np.asarray(canvas * (1 - weight) + laid, dtype=np.float32)
 
 
 def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.Generator) -> Image:
@@ -158,14 +154,11 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
         canvas = _clutter(canvas, scene, rng)
     radius = scene.subject.diameter_m / scene.camera.m_per_px / 2
     if scene.backdrop.ruler:
-        length, width = int(along.max()) + 40, 34
-        patch = _ruler_patch(length, width, 1e-3 / scene.camera.m_per_px, rng)
-        matrix = _axis_matrix(scene, corner, 0.0, round(1.9 * radius + 14))
-        canvas = _paste(canvas, patch, matrix)
+        patch = _ruler_patch(int(along.max()) + 40, 34, 1e-3 / scene.camera.m_per_px, rng)
+        canvas = _paste(canvas, patch, scene, corner, 0.0, round(1.9 * radius + 14))
     if scene.backdrop.launcher:
         patch = _launcher_patch(radius, rng, 400)
-        matrix = _axis_matrix(scene, corner, -399.0, -patch.shape[0] / 2)
-        canvas = _paste(canvas, patch, matrix)
+        canvas = _paste(canvas, patch, scene, corner, -399.0, -patch.shape[0] / 2)
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), scene.psf_px), dtype=np.float32).clip(0, 1.5)
 
 
@@ -557,6 +550,9 @@ class SceneMotion:
         self._phase = rng.uniform(0, 2 * np.pi, (2, 6))
         self._hertz = rng.uniform(4, 55, 6)
         self._lamp_phase = float(rng.uniform(0, 2 * np.pi))
+        # Growth at which the sway is `sway_px`; sway grows with the square of the distance, as for a cantilever.
+        subject = scene.subject
+        self.sway_length_px = subject.length_m / scene.camera.m_per_px if isinstance(subject, Tube) else 1.0
 
     def _find_exit(self, grid_s: Floats, lead_m: Floats) -> tuple[float, float]:
         """Time at which the end of the tail leaves the tip, and its speed there (px/s), twice that of the tip."""
@@ -588,12 +584,6 @@ class SceneMotion:
             return np.asarray(riding)
         flying = end + self._exit_px_s * (np.asarray(time_s) - self._exit_s)
         return np.asarray(np.where(np.asarray(time_s) < self._exit_s, riding, flying))
-
-    @property
-    def sway_length_px(self) -> float:
-        """Growth at which the sway is `sway_px`; sway grows with the square of the distance, as for a cantilever."""
-        subject = self.scene.subject
-        return subject.length_m / self.scene.camera.m_per_px if isinstance(subject, Tube) else 1.0
 
     def sway_px(self, time_s: float) -> float:
         """Return the lateral displacement of the tube at `sway_length_px`, which starts smoothly at the release."""
@@ -640,10 +630,8 @@ class SceneMotion:
         across = np.array([self.sway_px(float(t)) for t in time_s]) * np.clip(along / self.sway_length_px, 0, 1.5) ** 2
         shake = np.array([self.shake_px(float(t)) for t in time_s]).reshape(-1, 2)
         ux, uy = self.scene.direction
-        plane = (
-            np.array(self.scene.origin) + along[:, None] * np.array([ux, uy]) + across[:, None] * np.array([-uy, ux])
-        )
-        return np.asarray(plane + shake)
+        on_path = np.array(self.scene.origin) + along[:, None] * np.array([ux, uy])
+        return np.asarray(on_path + across[:, None] * np.array([-uy, ux]) + shake)
 
 
 # ------------------------------------------------------------------------------
@@ -693,12 +681,8 @@ class TubeLayer:
         self._first_x, self._last_x = np.where(in_row, touched.argmax(axis=1), 0), np.where(in_row, last, 0)
         self._payload: BallLayer | None = None
         if self._tube.payload_diameter_m:
-            metal = Ball(
-                diameter_m=self._tube.payload_diameter_m,
-                brightness=2 * self._tube.payload_brightness,
-                texture=0.1,
-                specular=0.25,
-            )
+            size_m, brightness = self._tube.payload_diameter_m, 2 * self._tube.payload_brightness
+            metal = Ball(diameter_m=size_m, brightness=brightness, texture=0.1, specular=0.25)
             self._payload = BallLayer(scene_motion, maps, rng, metal, scene_motion.tail_end_px, emerges_at_px=0.0)
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
@@ -900,10 +884,8 @@ class FrameRenderer:
             self._subject = TubeLayer(self.scene_motion, maps, rng)
         else:
             radius = scene.subject.diameter_m / 2 / scene.camera.m_per_px
-            scene_motion = self.scene_motion
-            self._subject = BallLayer(
-                scene_motion, maps, rng, scene.subject, lambda time_s: scene_motion.lead_px(time_s) - radius
-            )
+            centre = lambda time_s: self.scene_motion.lead_px(time_s) - radius  # noqa: E731
+            self._subject = BallLayer(self.scene_motion, maps, rng, scene.subject, centre)
         self._door = DoorLayer(self.scene_motion, scene.door) if scene.door else None
         self._prepare_sensor()
 
@@ -954,9 +936,9 @@ class FrameRenderer:
         self._subject.lay(light, frame, (shake[0] * ux + shake[1] * uy, shake[1] * ux - shake[0] * uy))
         return light
 
-    def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
+    def frame(self, frame: int, **levels: float) -> NDArray[np.uint8 | np.uint16]:
         """Render the grey levels of one frame. Shape (height, width)."""
-        return self.expose(self.radiance(frame), frame, low=low, span=span)
+        return self.expose(self.radiance(frame), frame, **levels)
 
     def expose(
         self, light: Image, frame: int, *, low: float = 0.0, span: float | None = None

@@ -38,17 +38,6 @@ class Camera:
         return (self.width_px - 1) / 2, (self.height_px - 1) / 2
 
     @property
-    def is_plain(self) -> bool:
-        """Whether plane pixels and picture pixels are the same."""
-        return self.k1 == self.k2 == self.tilt_x_deg == self.tilt_y_deg == 0
-
-    @property
-    def matrix(self) -> Floats:
-        """Camera matrix, shape (3, 3), px."""
-        cx, cy = self.centre_px
-        return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]], dtype=float)
-
-    @property
     def rotation(self) -> Floats:
         """Rotation of the plane against the picture, shape (3, 3)."""
         ax, ay = math.radians(self.tilt_x_deg), math.radians(self.tilt_y_deg)
@@ -87,7 +76,8 @@ class Camera:
     def plane_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Plane pixel of each picture pixel: x and y, each of shape (height_px, width_px)."""
         grid = np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), axis=-1).astype(float)
-        plane = grid if self.is_plain else self.plane_from_picture(grid)
+        is_plain = self.k1 == self.k2 == self.tilt_x_deg == self.tilt_y_deg == 0
+        plane = grid if is_plain else self.plane_from_picture(grid)
         return plane[..., 0].astype(np.float32), plane[..., 1].astype(np.float32)
 
 
@@ -289,7 +279,13 @@ def _presets() -> dict[str, Scene]:
     demo = Scene()
     hard = _camera_like(demo)
     tube = Tube()
-    square = Camera(width_px=640, height_px=640)
+    ball = Scene(
+        camera=Camera(width_px=384, height_px=800, m_per_px=1 / 3660),
+        subject=Ball(),
+        door=None,
+        growth_angle_deg=90.0,
+        backdrop=Backdrop(launcher=False),
+    )
     return {
         "clean": clean,
         "demo": demo,
@@ -316,24 +312,16 @@ def _presets() -> dict[str, Scene]:
         "reflections": replace(hard, subject=replace(tube, specular=0.5, reflection=0.3)),
         "noisy": replace(hard, sensor=Sensor(full_well_e=1500, read_noise_e=35)),
         "strong_tail": replace(hard, subject=replace(tube, tail_texture=0.6, tail_opacity=0.6, opacity=0.3)),
-        "diagonal": _camera_like(replace(demo, camera=square, growth_angle_deg=37.0)),
+        "diagonal": _camera_like(replace(demo, camera=Camera(width_px=640, height_px=640), growth_angle_deg=37.0)),
         "downward": _camera_like(replace(demo, camera=Camera(width_px=320, height_px=960), growth_angle_deg=90.0)),
         "payload": replace(hard, subject=replace(tube, payload_diameter_m=0.014)),
         "light_stream": replace(demo, encoding=Encoding(crf=26, gop=250)),
         "twelve_bit": replace(demo, sensor=Sensor(bit_depth=12), encoding=Encoding(codec="ffv1")),
         "colour": replace(hard, sensor=Sensor(colour=True)),
-        "falling_ball": Scene(
-            camera=Camera(width_px=384, height_px=800, m_per_px=1 / 3660),
-            subject=Ball(),
-            door=None,
-            growth_angle_deg=90.0,
-            backdrop=Backdrop(launcher=False),
-        ),
-        "dark_ball": Scene(
-            camera=Camera(width_px=384, height_px=800, m_per_px=1 / 3660),
+        "falling_ball": ball,
+        "dark_ball": replace(
+            ball,
             subject=Ball(brightness=0.06, texture=0.2, specular=0.8),
-            door=None,
-            growth_angle_deg=90.0,
             backdrop=Backdrop(brightness=0.07, gradient=-0.04, texture=0.3, launcher=False),
         ),
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 import shlex
@@ -22,7 +21,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.diagnosis.ladder import compare
 from vinetrack.diagnosis.replicates import first_that_counts
-from vinetrack.dynamics.model import Model, Value, check_needs, host_for
+from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
@@ -286,9 +285,9 @@ def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[st
     return Prediction(tuple(predicted), errors_m, campaign.floors_m if floors_m is None else floors_m)
 
 
-def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
+def overall_m(errors: Mapping[str, float]) -> float:
     """Return the root mean square over conditions with a known error, m; NaN if there are none."""
-    known = [errors[name] for name in conditions if math.isfinite(errors.get(name, math.nan))]
+    known = [error for error in errors.values() if math.isfinite(error)]
     return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
 
 
@@ -378,17 +377,8 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
 def sized_model(campaign: Campaign, choice: ModelChoice) -> Model:
     """Return the chosen model with its sizes, ready to be simulated."""
     effects = tuple(campaign.effects[name] for name in choice.effects)
-    values: dict[str, Value] = {}
-    for effect in effects:
-        for size in sizes_of(campaign, effect):
-            value = choice.numbers[size.name]
-            if size.vine:
-                by_vine = values.get(size.key, {})
-                assert isinstance(by_vine, Mapping)
-                values[size.key] = {**by_vine, size.vine: value}
-            else:
-                values[size.key] = value
-    return Model(effects, values)
+    sizes = [size for effect in effects for size in sizes_of(campaign, effect)]
+    return Model(effects, values_by_key((size.key, size.vine, choice.numbers[size.name]) for size in sizes))
 
 
 # ------------------------------------------------------------------------------
@@ -481,14 +471,12 @@ def correlated_pairs_text(result: Fit) -> list[str]:
     # Chosen: with this correlation each standard error is 1/√(1 − 0.9²) = 2.3 times its value with the other
     # parameter known
     strong_correlation = 0.9
-    pairs = []
-    variance = np.diag(result.covariance)
-    known = np.flatnonzero(np.isfinite(variance) & (variance > 0))
-    for i, k in itertools.combinations(known.tolist(), 2):
-        r = float(result.covariance[i, k]) / math.sqrt(variance[i] * variance[k])
-        if abs(r) > strong_correlation:
-            pairs.append((abs(r), f"{result.numbers[i].title} and {result.numbers[k].title}: correlation {r:+.2f}"))
-    return [words for _, words in sorted(pairs, reverse=True)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigma = np.sqrt(np.diag(result.covariance))
+        correlation = np.triu(result.covariance / np.outer(sigma, sigma), 1)
+    strong = [(i, k) for i, k in np.argwhere(np.abs(correlation) > strong_correlation) if sigma[i] > 0 < sigma[k]]
+    pairs = [(correlation[i, k], result.numbers[i].title, result.numbers[k].title) for i, k in strong]
+    return [f"{a} and {b}: correlation {r:+.2f}" for r, a, b in sorted(pairs, key=lambda pair: -abs(pair[0]))]
 
 
 Progress = TypeVar("Progress")
@@ -507,7 +495,8 @@ class Job(Generic[Progress, Outcome]):
         on_end: Callable[[Outcome | None, str], None],
         soon: Callable[[Callable[[], None]], object] | None = None,
     ) -> None:
-        self._work, self._on_progress, self._on_end, self._soon = work, on_progress, on_end, soon
+        self._work, self._on_progress, self._on_end = work, on_progress, on_end
+        self._soon = soon or (lambda call: call())
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}job")
         self._thread.start()
@@ -530,14 +519,8 @@ class Job(Generic[Progress, Outcome]):
             reason = str(error)
         except Exception:
             log.exception("a job of the explorer")
-            reason = (
-                "A fault of the program, not of your data: run vinetrack explore with --log FILE for the traceback."
-            )
-        if self._cancelled.is_set():
-            return
-        if self._soon is None:
-            self._on_end(outcome, reason)
-        else:
+            reason = "A fault of the program, not of your data: --log FILE of vinetrack explore keeps the traceback."
+        if not self._cancelled.is_set():
             self._soon(partial(self._on_end, outcome, reason))
 
     def _watch(self, step: Progress) -> None:

@@ -61,12 +61,9 @@ class SizeSlider:
         unit, factor = size.shown
         what = size.vine or size.parameter.meaning
         self._opened = slider_range(size.key, size.parameter, value)
-        low, high = (factor * bound for bound in self._opened)
         self.slider = Slider(
-            start=low,
-            end=high,
+            **self._ends(value),
             value=factor * value,
-            step=_step(low, high),
             title=f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol,
             format=PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
             sizing_mode="stretch_width",
@@ -78,15 +75,17 @@ class SizeSlider:
         self.fitted = html_div(visible=False, name=f"found_{size.name}")
         self.slider.on_change("value", lambda _attr, _old, new: moved(size.name, float(new) / factor))
 
-    def set(self, value: float) -> None:
-        """Move the slider to a value, with a range that holds it and the one of the beginning."""
+    def _ends(self, value: float) -> dict[str, float]:
+        """Ends and step of a range that holds a value and the range of the beginning."""
         factor = self.size.shown[1]
         low, high = slider_range(self.size.key, self.size.parameter, value)
         low, high = factor * min(low, self._opened[0]), factor * max(high, self._opened[1])
-        if (self.slider.start, self.slider.end) != (low, high):
-            self.slider.update(start=low, end=high, step=_step(low, high))
-        if self.slider.value != value * factor:
-            self.slider.value = value * factor
+        # 400: steps of a slider; chosen: about one per pixel
+        return {"start": low, "end": high, "step": (high - low) / 400 or 1.0}
+
+    def set(self, value: float) -> None:
+        """Move the slider to a value; what does not change is not sent."""
+        self.slider.update(**self._ends(value), value=value * self.size.shown[1])
 
     def show_fitted(self, number: Number | None) -> None:
         """Show the estimate of a fit below the slider, or nothing."""
@@ -102,11 +101,6 @@ class SizeSlider:
             ends = f" (its {number.ends_at} bound)" if number.ends_at else ""
             text = f"<b>{value:.4g}{error}</b> {escape(unit)} · 95 %: {low:.4g} to {high:.4g}{ends}"
         self.fitted.update(text=f"<small>fitted: {text}</small>", visible=True)
-
-
-def _step(low: float, high: float) -> float:
-    # 400: steps of a slider; chosen: about one per pixel
-    return (high - low) / 400 or 1.0
 
 
 def _opens(inside: UIElement, title: str, look: str, **keywords: Any) -> Toggle:
@@ -221,9 +215,9 @@ class TrialSelector:
 
     def toggle(self, condition: str) -> None:
         """Select this condition alone; if it is alone already, select all."""
-        index = self.campaign.conditions.index(condition)
-        is_alone = self._conditions.active == [index]
-        self._conditions.active = list(range(len(self.campaign.conditions))) if is_alone else [index]
+        alone = [self.campaign.conditions.index(condition)]
+        every = list(range(len(self.campaign.conditions)))
+        self._conditions.active = every if self._conditions.active == alone else alone
 
     @property
     def conditions(self) -> list[str]:

@@ -83,8 +83,12 @@ def read_sheet(folder: Path) -> Table:
     if loose or table.nameless:
         message = "has cells without a column, which would be lost"
         remedy = "name their columns in the first line, or remove them"
-        raise ExperimentError([Problem(message=message, file=SHEET, line=loose[0] if loose else 1, remedy=remedy)])
+        raise _refusal(message, SHEET, remedy, line=loose[0] if loose else 1)
     return table
+
+
+def _refusal(message: str, file: str, remedy: str, **more: Any) -> ExperimentError:
+    return ExperimentError([Problem(message=message, file=file, remedy=remedy, **more)])
 
 
 def cells_of(sheet: Table) -> list[list[str]]:
@@ -219,15 +223,13 @@ def open_draft(folder: Path) -> Draft:
     """Read the files of a folder, and add a row for every recording that has none."""
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
-        remedy = "name the folder that holds the recordings"
-        raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
+        raise _refusal(message, str(folder), "name the folder that holds the recordings")
     settings = read_settings_text(folder)
     recordings = list_recordings(folder)
     sheet = read_sheet(folder)
     if not recordings and not sheet.rows:
-        message = "holds no recording"
         remedy = "put films (mp4, mov, avi, mkv) or folders of pictures in it"
-        raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
+        raise _refusal("holds no recording", str(folder), remedy)
     corrections, problems = read_corrections(folder)
     if problems:
         raise ExperimentError(problems)
@@ -247,9 +249,9 @@ def files_stamp(folder: Path) -> str:
 def write_draft(folder: Path, draft: Draft) -> list[str]:
     """Write the files that differ from the present ones; nothing else in the folder is changed."""
     if files_stamp(folder) != draft.stamp:
-        message = "has changed since it was read, and is left as it is"
         name = SHEET if (folder / SHEET).exists() else SETTINGS
-        raise ExperimentError([Problem(message=message, file=name, remedy="reload the page, and enter it again")])
+        message = "has changed since it was read, and is left as it is"
+        raise _refusal(message, name, "reload the page, and enter it again")
     texts = draft.texts()
     changed = {
         SHEET: not (folder / SHEET).exists() or cells_of(read_sheet(folder)) != cells_of(draft.sheet),

@@ -82,10 +82,8 @@ def headline(
     campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
 ) -> str:
     """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
-    now, before = (
-        overall_m({} if one is None else one.errors_m, campaign.conditions) for one in (prediction, opened_with)
-    )
-    floor = overall_m(campaign.floors_m if prediction is None else prediction.floors_m, campaign.conditions)
+    now, before = (overall_m({} if one is None else one.errors_m) for one in (prediction, opened_with))
+    floor = overall_m(campaign.floors_m if prediction is None else prediction.floors_m)
     words = model_text(choice.effects)
     return panel(
         "headline",
@@ -109,25 +107,24 @@ def numbers_panel(
     campaign: Campaign, fits: Sequence[Fitted], sizes_changed: bool, held: HeldModel | None, now: HeldModel
 ) -> str:
     """Return the held model beside the current one, the parameters of the last fit of this page, and all its fits."""
-    compared = [] if held is None else _compared(campaign, (held, now))
+    compared = [] if held is None else _compared((held, now))
     if not fits:
         return panel("numbers", compared=compared)
     seconds, fit = fits[-1].seconds, fits[-1].fit
-    vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
-    known = vines if len(vines) > 1 else {}
-    spreads = "; ".join(
-        f"{name} {100 * s.value:.2g} %{'' if s.estimated else ' (fixed)'}" for name, s in fit.spreads.items()
-    )
+    labels = {vine: label for vine, (label, _) in zip(campaign.vines, vine_colours(campaign), strict=True)}
+    known = labels if len(labels) > 1 else {}
+    fixed = {name: "" if spread.estimated else " (fixed)" for name, spread in fit.spreads.items()}
+    spreads = "; ".join(f"{name} {100 * fit.spreads[name].value:.2g} %{words}" for name, words in fixed.items())
     facts = (
         f"noise {1e3 * fit.noise_m:.2g} mm",
         f"χ² per degree of freedom {fit.chi2_per_dof:.3g}" if math.isfinite(fit.chi2_per_dof) else "",
         f"between-trial standard deviations: {spreads}" if spreads else "",
         f"{seconds:.2g} s",
     )
-    floor = overall_m(campaign.floors_m, campaign.conditions)
+    floor = overall_m(campaign.floors_m)
     ladder = []
     for fitted in fits:
-        rms = overall_m(fitted.prediction.errors_m, campaign.conditions)
+        rms = overall_m(fitted.prediction.errors_m)
         beyond = math.sqrt(max(rms**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
         ladder.append((model_text(fitted.choice.effects), _in_mm(rms), _in_mm(beyond) or "–"))
     return panel(
@@ -142,11 +139,11 @@ def numbers_panel(
     )
 
 
-def _compared(campaign: Campaign, models: Sequence[HeldModel]) -> list[tuple[str, ...]]:
+def _compared(models: Sequence[HeldModel]) -> list[tuple[str, ...]]:
     """Error and every fitted parameter of either of two models."""
     rows = [
         ("effects", *(model_text(model.effects) for model in models)),
-        ("rms of position", *(_in_mm(overall_m(model.errors_m, campaign.conditions)) for model in models)),
+        ("rms of position", *(_in_mm(overall_m(model.errors_m)) for model in models)),
     ]
     fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
     for name in dict.fromkeys(name for numbers in fits for name in numbers):
@@ -371,10 +368,7 @@ class Page:
 
     def _hold(self) -> None:
         """Hold the current model for comparison; pressed again, compare with the model in use."""
-        if self.held is not None:
-            self.held = None
-        elif self.shown is not None:
-            self.held = HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
+        self.held = None if self.held is not None or self.shown is None else self._now
         self.hold.label = "Hold to compare" if self.held is None else "Release"
         self._draw()
         self._update_text()
@@ -383,6 +377,10 @@ class Page:
     def last(self) -> Fitted | None:
         """The last fit."""
         return self.fits[-1] if self.fits else None
+
+    @property
+    def _now(self) -> HeldModel:
+        return HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
 
     @property
     def _reference(self) -> HeldModel:
@@ -505,8 +503,7 @@ class Page:
             set_text(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
         if self.shown is not None:
             self.film.set_predictions(self.shown, self._reference.prediction)
-        now = HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
-        set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, self.held, now))
+        set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, self.held, self._now))
         set_text(self.tied, tied_panel(self.campaign, self.diagnosis, self.last))
         set_text(self.next, next_panel(self.campaign, self.diagnosis))
         lines = self._commands()

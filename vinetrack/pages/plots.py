@@ -217,9 +217,8 @@ class Plots:
     def _draw_motion(self) -> Any:
         fig = plot(360, "since release (ms)", "growth (mm)", name="motion", x_range=Range1d(), y_range=Range1d())
         fig.patches("xs", "ys", source=self._band, fill_color=vine_colour(), fill_alpha=0.2, line_color=None)
-        lines = fig.multi_line(
-            "xs", "ys", source=self._measured, line_color=vine_colour(), line_width=1.6, line_alpha=0.9
-        )
+        look = {"line_color": vine_colour(), "line_width": 1.6, "line_alpha": 0.9}
+        lines = fig.multi_line("xs", "ys", source=self._measured, **look)
         ghost = {"line_color": MUTED, "line_width": 1.5, "line_dash": [2, 3]}
         fig.multi_line("xs", "ys", source=self._reference, **ghost)
         model = fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
@@ -234,9 +233,8 @@ class Plots:
         return fig
 
     def _draw_residual(self) -> Any:
-        fig = plot(
-            230, "growth (mm)", "measured − model (mm)", name="residual", x_range=Range1d(), y_range=Range1d(-1, 1)
-        )
+        ranges = {"x_range": Range1d(), "y_range": Range1d(-1, 1)}
+        fig = plot(230, "growth (mm)", "measured − model (mm)", name="residual", **ranges)
         fig.add_layout(Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
         lines = fig.multi_line("xs", "ys", source=self._residuals, line_color=vine_colour(), line_width=1.4)
         values = [("growth", "$x{0.0} mm"), ("measured − model", "$y{0.00} mm")]
@@ -250,29 +248,20 @@ class Plots:
         height = 70 + 25 * max(len(names), 2)
         fig = plot(height, "rms error of position (mm)", "", name="errors", y_range=names, x_range=Range1d(0, 1))
         common = {"y": "condition", "source": self._bars}
-        fig.hbar(
-            right="before", height=0.8, fill_color=GRID, fill_alpha=0.65, line_color=MUTED, line_alpha=0.5, **common
-        )
-        bars = fig.hbar(
-            right="now", height=0.44, fill_color=vine_colour(), line_color=None, fill_alpha="alpha", **common
-        )
-        floors = fig.scatter(
-            x="floor", marker="dash", angle=math.pi / 2, size=17, line_color=INK, line_width=2.6, **common
-        )
-        for drawn in (bars, floors, fig.renderers[0]):
+        pale = {"fill_color": GRID, "fill_alpha": 0.65, "line_color": MUTED, "line_alpha": 0.5}
+        held = fig.hbar(right="before", height=0.8, **pale, **common)
+        solid = {"fill_color": vine_colour(), "fill_alpha": "alpha", "line_color": None}
+        bars = fig.hbar(right="now", height=0.44, **solid, **common)
+        mark = {"marker": "dash", "angle": math.pi / 2, "size": 17, "line_color": INK, "line_width": 2.6}
+        for drawn in (bars, fig.scatter(x="floor", **mark, **common), held):
             drawn.nonselection_glyph = drawn.selection_glyph = None
-        tips = [
-            ("", "@label"),
-            ("now", "@now{0.000} mm"),
-            ("for comparison", "@before{0.000} mm"),
-            ("replicates", "@floor{0.000} mm"),
-        ]
-        fig.add_tools(HoverTool(renderers=[bars], tooltips=tips), TapTool(renderers=[bars, fig.renderers[0]]))
+        columns = {"now": "now", "for comparison": "before", "replicates": "floor"}
+        tips = [("", "@label"), *((words, f"@{column}{{0.000}} mm") for words, column in columns.items())]
+        fig.add_tools(HoverTool(renderers=[bars], tooltips=tips), TapTool(renderers=[bars, held]))
         self._bars.selected.on_change("indices", self._tapped)
         labels = [self.campaign.labels[name] for name in names]
-        fig.yaxis.formatter = CustomJSTickFormatter(
-            args={"names": names, "labels": labels}, code="return labels[names.indexOf(tick)] ?? tick"
-        )
+        code = "return labels[names.indexOf(tick)] ?? tick"
+        fig.yaxis.formatter = CustomJSTickFormatter(args={"names": names, "labels": labels}, code=code)
         fig.ygrid.visible = False
         # Toolbar buttons would cover the first bar; tapping needs none.
         fig.toolbar_location = None
@@ -280,11 +269,9 @@ class Plots:
         return fig
 
     def _tapped(self, _attr: str, _old: list[int], new: list[int]) -> None:
-        if not new:
-            return
-        names = list(reversed(self.campaign.conditions))
-        self._bars.selected.indices = []
-        self._on_condition_click(names[new[0]])
+        if new:
+            self._bars.selected.indices = []
+            self._on_condition_click(self.campaign.conditions[-1 - new[0]])
 
     def _lines(self, lines: Iterable[tuple[ExplorerTrial, Floats, Floats]]) -> Columns:
         """One line per trial, from its abscissae and ordinates in SI, scaled by 1000; none is drawn across frames that
@@ -512,30 +499,17 @@ class FilmPanel:
         common: dict[str, Any] = {"stylesheets": [stylesheet()], "margin": 0}
         self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial", **common)
         self.play = button("▶ play", "film_play", self._toggle_play, width=84)
-        self.frame = Slider(
-            start=0,
-            end=1,
-            value=0,
-            step=1,
-            title="frame",
-            sizing_mode="stretch_width",
-            name="film_frame",
-            stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; min-width: 180px; flex: 1 1 180px; }")],
-            margin=0,
-        )
+        look = stylesheet(":host { padding: 0 10px 0 4px; min-width: 180px; flex: 1 1 180px; }")
+        numbers = {"start": 0, "end": 1, "value": 0, "step": 1, "margin": 0, "sizing_mode": "stretch_width"}
+        self.frame = Slider(**numbers, title="frame", name="film_frame", stylesheets=[look])
         self.caption = html_div(name="film_caption")
         self._picture = ColumnDataSource({"image": []}, name="film_picture")
         self._edges = ColumnDataSource({"xs": [], "ys": [], "colour": [], "dash": []}, name="film_edges")
         self.figure = self._draw()
         self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
         self.frame.on_change("value", lambda _attr, _old, new: self._show_frame(int(new)))
-        controls = side_by_side(
-            self.trial_select,
-            self.play,
-            self.frame,
-            css=":host { flex-wrap: wrap; gap: 6px; align-items: end; }",
-            sizing_mode="stretch_width",
-        )
+        css = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
+        controls = side_by_side(self.trial_select, self.play, self.frame, css=css, sizing_mode="stretch_width")
         self.root = stacked(controls, self.figure, self.caption, name="film")
 
     def _draw(self) -> Any:
@@ -554,9 +528,8 @@ class FilmPanel:
         fig.axis.visible = False
         fig.grid.visible = False
         greys = LinearColorMapper(palette=list(Greys256), low=0, high=255)
-        self._image = fig.image(
-            "image", source=self._picture, x=-0.5, y=-0.5, dw=1, dh=1, color_mapper=greys, level="image"
-        )
+        place = {"x": -0.5, "y": -0.5, "dw": 1, "dh": 1, "level": "image"}
+        self._image = fig.image("image", source=self._picture, color_mapper=greys, **place)
         fig.multi_line("xs", "ys", source=self._edges, line_color="black", line_width=4.5, line_alpha=0.45)
         fig.multi_line("xs", "ys", source=self._edges, line_color="colour", line_width=2.6, line_dash={"field": "dash"})
         return fig

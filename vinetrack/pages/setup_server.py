@@ -98,13 +98,11 @@ def board_in(path: Path, name: str) -> dict[str, Any] | None:
     """The printed board in a picture or at the beginning of a film, as `experiment.yaml` names it, without sizes; None
     if there is no board.
     """
-    target = find_board(first_frame(path))
-    if target is None:
+    if (target := find_board(first_frame(path))) is None:
         return None
-    board: dict[str, Any] = {"kind": target.kind, "image": name, "squares": list(target.squares)}
-    if target.kind == "charuco":
-        board |= {"dictionary": target.dictionary, "marker_share": round(target.marker_share, 3)}
-    return board
+    markers = {"dictionary": target.dictionary, "marker_share": round(target.marker_share, 3)}
+    board = {"kind": target.kind, "image": name, "squares": list(target.squares)}
+    return board | (markers if target.kind == "charuco" else {})
 
 
 def axis_json(axis: Axis) -> dict[str, Any]:
@@ -140,14 +138,23 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
     else:
         # Widths are in millimetres: without a scale the axis has none.
         tracking = track_recording(trial, given_axis(trial, settings, math.nan))
+    track = tracking.track
     return {
-        **_track_json(tracking),
+        "strip": _strip_url(tracking),
+        "length_px": round(tracking.axis.length_px, 2),
+        "axis": axis_json(tracking.axis),
+        "time_s": _numbers(track.time_s, 6),
+        "edge_px": _numbers(track.edge_px, 2),
+        "position_mm": _numbers(1e3 * track.lead_position_m, 3),
+        "tracked_px": _numbers(track.edge_px if track.tracked_px is None else track.tracked_px, 2),
+        "flag": [str(flag) for flag in track.flag],
+        "shake_px": _numbers(tracking.shake_px, 2),
         "mm_per_px": _rounded(1e3 * m_per_px, 6),
         "growth_mm": _rounded(1e3 * growth_m, 2),
         "tube_width_mm": _rounded(1e3 * m_per_px * tracking.tube_width_px, 2),
         "timed": timed,
         "scaled": scaled,
-        "notes": [*remarks, *tracking.track.notes],
+        "notes": [*remarks, *track.notes],
         "pressure": _pressure_json(trial),
     }
 
@@ -167,27 +174,17 @@ def warm_up() -> None:
         return
 
 
-def _track_json(tracking: Tracking) -> dict[str, Any]:
-    track, strip = tracking.track, tracking.kymograph
+def _strip_url(tracking: Tracking) -> str:
+    strip = tracking.kymograph
     dark, light = np.nanpercentile(strip, [1, 99])
     # Grey level of the strip where no frame was decoded (chosen)
-    grey = np.full((len(track.time_s), strip.shape[1]), 128, np.uint8)
+    grey = np.full((len(tracking.track.time_s), strip.shape[1]), 128, np.uint8)
     grey[tracking.strip_rows] = (255 * (strip - dark) / max(float(light - dark), 1.0)).clip(0, 255).astype(np.uint8)
     # Time to the right, growth upwards.
     turned = np.ascontiguousarray(np.flipud(grey.T))
     size = (min(turned.shape[1], STRIP_PX), min(turned.shape[0], STRIP_PX))
     small = cv2.resize(turned, size, interpolation=cv2.INTER_AREA)
-    return {
-        "strip": "data:image/jpeg;base64," + base64.b64encode(jpeg(small)).decode(),
-        "length_px": round(tracking.axis.length_px, 2),
-        "axis": axis_json(tracking.axis),
-        "time_s": _numbers(track.time_s, 6),
-        "edge_px": _numbers(track.edge_px, 2),
-        "position_mm": _numbers(1e3 * track.lead_position_m, 3),
-        "tracked_px": _numbers(track.edge_px if track.tracked_px is None else track.tracked_px, 2),
-        "flag": [str(flag) for flag in track.flag],
-        "shake_px": _numbers(tracking.shake_px, 2),
-    }
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg(small)).decode()
 
 
 def _pressure_json(trial: Trial) -> dict[str, Any] | None:
@@ -353,7 +350,7 @@ class SetupServer(ThreadingHTTPServer):
         texts = dict(zip(("sheet_text", "settings_text", "corrections_text"), draft.texts().values(), strict=True))
         if not draft.corrections:
             texts["corrections_text"] = ""
-        return {**draft_problems(self.folder, draft, thorough=bool(content.get("thorough"))), **texts}
+        return draft_problems(self.folder, draft, thorough=bool(content.get("thorough"))) | texts
 
     def track(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Track the recording of one row of a draft."""
@@ -398,15 +395,11 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_authorised():
             return
         url = urlsplit(self.path.removeprefix(self.server.secret))
-        if url.path in ("/", "/setup.css") or url.path.endswith(".js"):
-            name = "setup.html" if url.path == "/" else url.path.lstrip("/")
-            path = TEMPLATES / name
-            if "/" in name or not path.is_file():
-                self._send(HTTPStatus.NOT_FOUND)
-                return
-            frame = page_frame().encode() if path.suffix == ".css" else b""
-            kind = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}[path.suffix]
-            self._send(HTTPStatus.OK, frame + path.read_bytes(), f"{kind}; charset=utf-8")
+        name = "setup.html" if url.path == "/" else url.path.removeprefix("/")
+        kind = {"js": "text/javascript", "css": "text/css", "html": "text/html"}.get(name.rpartition(".")[2])
+        if kind and "/" not in name and (TEMPLATES / name).is_file():
+            frame = page_frame().encode() if name.endswith(".css") else b""
+            self._send(HTTPStatus.OK, frame + (TEMPLATES / name).read_bytes(), f"{kind}; charset=utf-8")
         else:
             self._answer(f"GET {url.path}", lambda: dict(parse_qsl(url.query)))
 

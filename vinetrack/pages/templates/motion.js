@@ -1,5 +1,5 @@
 // The motion: strip along the axis with the tracked edge, position against time, and the measured pressure.
-import {$, ask, changed, content, decimals, el, round, state} from "./state.js";
+import {$, ask, changed, content, decimals, el, listed, round, state} from "./state.js";
 import {placesOf, row, showFrame, shownFrame} from "./picture.js";
 
 let last = null;
@@ -19,7 +19,8 @@ export async function track() {
     const made = await ask("api/track", content({row: chosen}));
     if (state.chosen === chosen) show({...made, name, seconds: (performance.now() - begun) / 1000});
   } catch (error) {
-    if (state.chosen === chosen) $("tracked").replaceChildren(el("ul", {class: "problems"}, ...(error.content?.problems ?? [{severity: "error", text: error.message}]).map((problem) => el("li", {class: problem.severity}, problem.text))));
+    const problems = error.content?.problems ?? [{severity: "error", text: error.message}];
+    if (state.chosen === chosen) $("tracked").replaceChildren(el("ul", {class: "problems"}, ...listed(problems)));
   }
   $("track").disabled = false;
 }
@@ -35,7 +36,13 @@ function show(made) {
   if (!made.scaled) notes.unshift("Positions are in pixels: give a scale.");
   if (made.pressure?.words) notes.unshift(`pressure_trace ${made.pressure.words}`);
   $("tracked").replaceChildren(el("p", {class: "fact"}, el("b", {}, made.name), `: ${facts.join("; ")}.`), strip(made), plot(made), el("p", {class: "readout", id: "readout"}, "Point at the strip or the curve to see the frame."), proofs(),
-    el("ul", {class: "problems"}, ...notes.map((text) => el("li", {class: "note"}, text))));
+    el("ul", {class: "problems"}, ...listed(notes.map((text) => ({severity: "note", text})))));
+}
+
+// A line through points, broken where there is none.
+function lineThrough(xs, ys) {
+  const place = (x, i) => (ys[i] === null ? "" : `${(ys[i - 1] ?? null) === null ? "M" : "L"}${x.toFixed(2)} ${ys[i].toFixed(2)}`);
+  return xs.map(place).join("");
 }
 
 const USABLE = /lost|rejected|duplicate|after_end|doubtful/;
@@ -44,19 +51,11 @@ function strip(made) {
   const n = made.edge_px.length;
   const height = made.length_px;
   const over = el("svg", {viewBox: `0 0 ${n} ${height}`, preserveAspectRatio: "none", role: "img", "aria-label": "Strip along the growth axis, time to the right, growth upwards, with the leading edge"});
-  let path = "";
-  let pen = false;
-  let odd = "";
-  let hand = "";
-  made.edge_px.forEach((edge, i) => {
-    if (edge === null) { pen = false; return; }
-    const place = `${i + 0.5} ${(height - edge).toFixed(2)}`;
-    if (made.flag[i].includes("corrected")) hand += `M${place}h0`;
-    else if (USABLE.test(made.flag[i])) odd += `M${place}h0`;
-    path += `${pen ? "L" : "M"}${place}`;
-    pen = true;
-  });
-  over.append(el("path", {class: "edge", d: path}), el("path", {class: "flagged", d: odd}), el("path", {class: "by-hand", d: hand}));
+  const [xs, ys] = [made.edge_px.map((_, i) => i + 0.5), made.edge_px.map((edge) => (edge === null ? null : height - edge))];
+  const byHand = (i) => made.flag[i].includes("corrected");
+  const dots = (wanted) => ys.map((y, i) => (y !== null && wanted(i) ? `M${xs[i]} ${y.toFixed(2)}h0` : "")).join("");
+  over.append(el("path", {class: "edge", d: lineThrough(xs, ys)}),
+    el("path", {class: "flagged", d: dots((i) => !byHand(i) && USABLE.test(made.flag[i]))}), el("path", {class: "by-hand", d: dots(byHand)}));
   over.addEventListener("pointermove", (event) => { const box = over.getBoundingClientRect(); point(Math.floor(((event.clientX - box.left) / box.width) * n)); });
   return el("div", {class: "strip"}, el("img", {src: made.strip, alt: ""}), over);
 }
@@ -70,35 +69,32 @@ function ticks(low, high, count) {
   return out;
 }
 
-const range = (values) => { const good = values.filter((value) => value !== null); return [Math.min(...good), Math.max(...good)]; };
-
 function plot(made) {
   const [W, H, left, right, top, bottom] = [560, 250, 52, made.pressure?.time_s ? 50 : 12, 18, 38];
   const per = made.timed ? 1000 : 1;
   const time = made.time_s.map((value) => value * per);
   const position = made.scaled ? made.position_mm : made.edge_px;
-  if (!position.some((value) => value !== null)) return el("p", {class: "hint"}, "There are no positions.");
-  const [t0, t1] = range(time);
-  const first = Math.min(...position.filter((value) => value !== null));
-  const grown = position.map((value) => (value === null ? null : value - first));
-  const high = Math.max(range(grown)[1], 1e-6) * 1.05;
+  const known = position.filter((value) => value !== null);
+  if (!known.length) return el("p", {class: "hint"}, "There are no positions.");
+  const [t0, t1, first] = [Math.min(...time), Math.max(...time), Math.min(...known)];
+  const high = Math.max(Math.max(...known) - first, 1e-6) * 1.05;
   const x = (value) => left + ((value - t0) / (t1 - t0 || 1)) * (W - left - right);
   const y = (value) => H - bottom - (value / high) * (H - top - bottom);
   const svg = el("svg", {class: "plot", viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": "Position against time"});
   svg.append(el("path", {class: "frame-line", d: `M${left} ${top}V${H - bottom}H${W - right}`}));
-  for (const value of ticks(t0, t1, 5)) svg.append(el("text", {class: "tick", x: x(value), y: H - bottom + 16, "text-anchor": "middle"}, String(value)));
-  for (const value of ticks(0, high, 4)) svg.append(el("text", {class: "tick", x: left - 6, y: y(value) + 4, "text-anchor": "end"}, String(value)));
+  const tick = (value, x, y, anchor) => svg.append(el("text", {class: "tick", x, y, "text-anchor": anchor}, String(value)));
+  for (const value of ticks(t0, t1, 5)) tick(value, x(value), H - bottom + 16, "middle");
+  for (const value of ticks(0, high, 4)) tick(value, left - 6, y(value) + 4, "end");
   svg.append(el("text", {x: (left + W - right) / 2, y: H - 4, "text-anchor": "middle"}, made.timed ? "time (ms)" : "frame"), el("text", {x: 4, y: 12}, made.scaled ? "position (mm)" : "position (px)"));
-  const line = (ts, values, scale) => { let pen = false; return ts.map((t, i) => { if (values[i] === null) { pen = false; return ""; } const place = `${pen ? "L" : "M"}${x(t).toFixed(1)} ${scale(values[i]).toFixed(1)}`; pen = true; return place; }).join(""); };
-  svg.append(el("path", {class: "curve", d: line(time, grown, y)}));
+  svg.append(el("path", {class: "curve", d: lineThrough(time.map(x), position.map((value) => (value === null ? null : y(value - first))))}));
   if (made.pressure?.time_s) {
     const kPa = made.pressure.pressure_kPa;
     const top_kPa = Math.max(...kPa, 1e-6) * 1.08;
     const p = (value) => H - bottom - (Math.max(value, 0) / top_kPa) * (H - top - bottom);
-    const inside = made.pressure.time_s.map((t) => t * per);
-    const keep = inside.map((t, i) => [t, kPa[i]]).filter(([t]) => t >= t0 && t <= t1);
-    svg.append(el("path", {class: "pressure", d: line(keep.map((pair) => pair[0]), keep.map((pair) => pair[1]), p)}), el("text", {x: W - 4, y: 12, "text-anchor": "end", class: "p-label"}, "pressure (kPa)"));
-    for (const value of ticks(0, top_kPa, 4)) svg.append(el("text", {class: "tick", x: W - right + 6, y: p(value) + 4}, String(value)));
+    const inside = made.pressure.time_s.map((t, i) => [t * per, kPa[i]]).filter(([t]) => t >= t0 && t <= t1);
+    const d = lineThrough(inside.map(([t]) => x(t)), inside.map(([, value]) => p(value)));
+    svg.append(el("path", {class: "pressure", d}), el("text", {x: W - 4, y: 12, "text-anchor": "end", class: "p-label"}, "pressure (kPa)"));
+    for (const value of ticks(0, top_kPa, 4)) tick(value, W - right + 6, p(value) + 4, "start");
   }
   const cursor = el("path", {class: "cursor", d: ""});
   svg.append(cursor);
@@ -106,9 +102,7 @@ function plot(made) {
   svg.addEventListener("pointermove", (event) => {
     const box = svg.getBoundingClientRect();
     const at = t0 + ((((event.clientX - box.left) / box.width) * W - left) / (W - left - right)) * (t1 - t0);
-    let best = 0;
-    time.forEach((t, i) => { if (Math.abs(t - at) < Math.abs(time[best] - at)) best = i; });
-    point(best);
+    point(time.reduce((best, t, i) => (Math.abs(t - at) < Math.abs(time[best] - at) ? i : best), 0));
   });
   return svg;
 }
@@ -134,9 +128,10 @@ function edgeAt(i) {
   const step = made.length_px / (places.length - 1);
   const half = 0.75 * (made.axis.width_px || 0.1 * made.length_px);
   const shake = made.shake_px[i] ?? 0;
-  // For a frame without an edge, propose the position of its neighbours.
-  const edge = made.edge_px[i] ?? nearest(made.edge_px, i);
-  if (edge === null) return null;
+  // For a frame without an edge, propose the position of the nearest that has one.
+  const nearest = made.edge_px.reduce((best, edge, j) => (edge !== null && Math.abs(j - i) < Math.abs(best - i) ? j : best), Infinity);
+  if (nearest === Infinity) return null;
+  const edge = made.edge_px[nearest];
   const s = edge + shake;
   const part = Math.max(0, Math.min(places.length - 2, Math.floor(s / step)));
   const [mx, my, ux, uy] = along(places, part, step, s - part * step);
@@ -166,22 +161,16 @@ function nearestAlong(places, step, [x, y]) {
   return best;
 }
 
-function nearest(values, i) {
-  for (let step = 1; step < values.length; step += 1) for (const j of [i - step, i + step]) if (values[j] !== null && values[j] !== undefined) return values[j];
-  return null;
-}
-
 // ---- corrections -------------------------------------------------------------------------------------------------
 
-const SETTLED = ["doubtful", "lost", "rejected", "after_end", "corrected"];
+const SETTLED = ["doubtful", "lost", "rejected", "after_end"];
 
 function proofs() {
-  const act = (action) => () => correct(shownFrame(), action);
+  const act = (id, words) => el("button", {type: "button", id, onclick: () => correct(shownFrame(), id)}, words);
+  const step = (by, name, words) => el("button", {type: "button", "aria-label": name, onclick: () => point(shownFrame() + by)}, words);
   return el("div", {class: "row", id: "proofs", role: "group", "aria-label": "Correct the frame that is shown"},
-    el("span", {class: "muted"}, "This frame:"), el("button", {type: "button", id: "confirm", onclick: act("confirm")}, "Confirm"),
-    el("button", {type: "button", id: "drop", onclick: act("drop")}, "Drop"), el("button", {type: "button", id: "undo", onclick: act("undo")}, "As tracked"),
-    el("button", {type: "button", "aria-label": "Previous frame", onclick: () => point(shownFrame() - 1)}, "◀"), el("button", {type: "button", "aria-label": "Next frame", onclick: () => point(shownFrame() + 1)}, "▶"),
-    el("span", {class: "muted"}, "or drag its edge in the picture"));
+    el("span", {class: "muted"}, "This frame:"), act("confirm", "Confirm"), act("drop", "Drop"), act("undo", "As tracked"),
+    step(-1, "Previous frame", "◀"), step(1, "Next frame", "▶"), el("span", {class: "muted"}, "or drag its edge in the picture"));
 }
 
 function correct(i, action, edge = null) {
@@ -189,22 +178,16 @@ function correct(i, action, edge = null) {
   if (action === "confirm" && made.edge_px[i] === null) { $("readout").textContent = `frame ${i} has no edge to be confirmed: drag it to where the edge is`; return; }
   const {name} = made;
   const others = (state.corrections[name] ?? []).filter((one) => one.frame !== i);
-  const mm = made.mm_per_px ?? null;
-  made.first_flag ??= [...made.flag];
-  made.first_edge ??= [...made.edge_px];
-  made.first_mm ??= [...made.position_mm];
-  const bare = made.first_flag[i].split(";").filter((flag) => flag && !SETTLED.includes(flag));
-  if (action === "undo") {
-    made.edge_px[i] = made.tracked_px[i];
-    made.flag[i] = made.first_flag[i].split(";").filter((flag) => flag !== "corrected").join(";");
-  } else {
-    others.push({frame: i, action, edge_px: edge});
-    made.edge_px[i] = action === "move" ? edge : action === "drop" ? null : made.tracked_px[i];
-    made.flag[i] = [...bare, ...(action === "drop" ? ["rejected"] : []), "corrected"].join(";");
-  }
+  made.first ??= {flag: [...made.flag], edge_px: [...made.edge_px], position_mm: [...made.position_mm]};
+  const flags = made.first.flag[i].split(";").filter((flag) => flag && flag !== "corrected");
+  if (action !== "undo") others.push({frame: i, action, edge_px: edge});
+  made.edge_px[i] = action === "move" ? edge : action === "drop" ? null : made.tracked_px[i];
+  const settled = [...flags.filter((flag) => !SETTLED.includes(flag)), ...(action === "drop" ? ["rejected"] : []), "corrected"];
+  made.flag[i] = (action === "undo" ? flags : settled).join(";");
   // Approximate, with a constant scale, until it is tracked again.
-  const known = made.first_edge.findIndex((value, j) => value !== null && made.first_mm[j] !== null);
-  made.position_mm[i] = made.edge_px[i] === null || mm === null || known < 0 ? null : made.first_mm[known] + mm * (made.edge_px[i] - made.first_edge[known]);
+  const known = made.first.edge_px.findIndex((value, j) => value !== null && made.first.position_mm[j] !== null);
+  const from_known = made.mm_per_px * (made.edge_px[i] - made.first.edge_px[known]);
+  made.position_mm[i] = made.edge_px[i] === null || !made.mm_per_px || known < 0 ? null : made.first.position_mm[known] + from_known;
   state.corrections[name] = others;
   if (!others.length) delete state.corrections[name];
   changed();

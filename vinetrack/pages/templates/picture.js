@@ -1,5 +1,5 @@
 // The picture: frames of the chosen recording, the growth axis dragged on it, and its scale.
-import {$, ask, changed, decimals, el, numberOf, round, state, url} from "./state.js";
+import {$, ask, changed, decimals, el, listed, numberOf, round, state, url} from "./state.js";
 
 const view = {source: "", frame: 0, tool: "axis", image: null, width: 1, height: 1, board: "", words: "", edge: null};
 const LENS = 7; // Screen pixels per pixel of the picture.
@@ -40,12 +40,16 @@ function drawSources() {
 
 const imageOf = (frame) => (view.source ? url("api/picture", {picture: view.source}) : url("api/frame", {recording: row().video, frame}));
 
+function showNumber() {
+  $("frame").value = view.frame;
+  $("frame-at").textContent = `${view.frame} of ${state.clip.frames - 1}`;
+}
+
 export function showFrame(frame, edge = null) {
   view.frame = Math.max(0, Math.min(state.clip.frames - 1, frame));
   view.edge = edge;
   if (view.source) { view.source = ""; drawSources(); drawPicture(); return; }
-  $("frame").value = view.frame;
-  $("frame-at").textContent = `${view.frame} of ${state.clip.frames - 1}`;
+  showNumber();
   if (view.image) view.image.src = imageOf(view.frame);
   drawOver();
 }
@@ -55,8 +59,7 @@ export function drawPicture() {
   const image = el("img", {alt: view.source || `Frame ${view.frame} of ${row().video}`, draggable: "false", src: imageOf(view.frame)});
   view.image = image;
   image.onload = () => {
-    view.width = image.naturalWidth;
-    view.height = image.naturalHeight;
+    Object.assign(view, {width: image.naturalWidth, height: image.naturalHeight});
     drawOver();
   };
   const over = el("svg", {id: "over", preserveAspectRatio: "none"});
@@ -64,9 +67,8 @@ export function drawPicture() {
   over.addEventListener("pointerdown", place);
   over.addEventListener("pointermove", (event) => { if (view.tool === "scale" && scaleKind() === "two_points") lens(event); });
   over.addEventListener("pointerleave", () => document.querySelector(".lens")?.remove());
-  $("frame").value = view.frame;
   $("frame").disabled = Boolean(view.source);
-  $("frame-at").textContent = `${view.frame} of ${state.clip.frames - 1}`;
+  showNumber();
   $("frame").oninput = (event) => showFrame(Number(event.target.value));
   for (const radio of document.querySelectorAll("input[name=tool]")) {
     radio.onchange = () => { view.tool = radio.value; $("axis-tool").hidden = view.tool !== "axis"; $("scale-tool").hidden = view.tool !== "scale"; drawOver(); drawTools(); };
@@ -95,9 +97,16 @@ export function currentAxis() {
   return state.clip?.axis ? {...state.clip.axis, given: ""} : null;
 }
 
+function redraw() {
+  drawOver();
+  drawTools();
+}
+
+const rounded = (point) => point.map((v) => round(v));
+
 function setAxis(axis, scope) {
-  const ends = {from_px: axis.from_px.map((v) => round(v)), to_px: axis.to_px.map((v) => round(v))};
-  if (axis.via_px?.length) ends.via_px = axis.via_px.map((point) => point.map((v) => round(v)));
+  const ends = {from_px: rounded(axis.from_px), to_px: rounded(axis.to_px)};
+  if (axis.via_px?.length) ends.via_px = axis.via_px.map(rounded);
   if (scope === "trial") {
     const width = axis.width ? `:${axis.width}` : "";
     row().axis = `${[ends.from_px, ...(ends.via_px ?? []), ends.to_px].map((point) => point.join(",")).join(":")}${width}`;
@@ -107,6 +116,13 @@ function setAxis(axis, scope) {
     if (row().axis) row().axis = "";
   }
   changed();
+  redraw();
+}
+
+// Change points of the axis, in the scope that it has or that is chosen.
+function changeAxis(points) {
+  const now = currentAxis();
+  setAxis({...now, ...points}, now.given || ($("axis-scope")?.value ?? "all"));
 }
 
 const pointsOf = (axis) => [axis.from_px, ...(axis.via_px ?? []), axis.to_px];
@@ -126,14 +142,6 @@ export function placesOf(axis) {
   return curve.path_px ?? pointsOf(axis);
 }
 
-// The axis with other bends and the same scope.
-function setBends(via_px) {
-  const now = currentAxis();
-  setAxis({...now, via_px}, now.given || scopeWanted());
-  drawOver();
-  drawTools();
-}
-
 function addBend() {
   const now = currentAxis(), points = pointsOf(now), path = placesOf(now);
   const apart = ([x0, y0], [x1, y1]) => Math.hypot(x1 - x0, y1 - y0);
@@ -142,24 +150,25 @@ function addBend() {
   // In the middle of the longest segment: on the curve, if there is one.
   const nearest = (point) => path.reduce((best, one, k) => (apart(one, point) < apart(path[best], point) ? k : best), 0);
   const middle = points[i].map((v, k) => (v + points[i + 1][k]) / 2);
-  setBends((now.via_px ?? []).toSpliced(i, 0, path.length > 2 ? path[Math.round((nearest(points[i]) + nearest(points[i + 1])) / 2)] : middle));
-  document.querySelector(`[data-handle="${bendWords(i)}"]`)?.focus();
+  const bend = path.length > 2 ? path[Math.round((nearest(points[i]) + nearest(points[i + 1])) / 2)] : middle;
+  changeAxis({via_px: (now.via_px ?? []).toSpliced(i, 0, bend)});
+  focusOn(bendWords(i));
 }
 
 function removeBend(i) {
-  setBends(currentAxis().via_px.toSpliced(i, 1));
-  const next = currentAxis().via_px?.length ? bendWords(Math.max(i - 1, 0)) : "Start of the growth axis";
-  document.querySelector(`[data-handle="${next}"]`)?.focus();
+  changeAxis({via_px: currentAxis().via_px.toSpliced(i, 1)});
+  focusOn(currentAxis().via_px?.length ? bendWords(Math.max(i - 1, 0)) : AXIS_ENDS.from_px);
 }
 
+const AXIS_ENDS = {from_px: "Start of the growth axis", to_px: "End of the growth axis"};
 const bendWords = (i) => `Bend ${i + 1} of the growth axis`;
+const focusOn = (words) => document.querySelector(`[data-handle="${words}"]`)?.focus();
 
 function clearAxis() {
   if (row().axis) row().axis = "";
   else state.axis = null;
   changed();
-  drawOver();
-  drawTools();
+  redraw();
 }
 
 // ---- what is drawn over the picture ------------------------------------------------------------------------------
@@ -182,16 +191,11 @@ export function drawOver() {
     if (axis) drawAxis(small, axis, state.clip.width / Math.max(button.clientWidth, 1), false);
   }
   if (view.tool === "scale" && scaleKind() === "two_points") drawMarks(over, unit);
-  if (view.edge && !view.source) drawEdge(over, unit);
-  if (held) over.querySelector(`[data-handle="${held}"]`)?.focus();
-}
-
-// The edge in this frame, which can be moved along the axis.
-function drawEdge(over, unit) {
-  const {line, middle, put} = view.edge;
-  over.append(el("line", {...line, class: "edge-line", "stroke-width": 2 * unit}));
-  const words = "Leading edge in this frame";
-  over.append(handle("circle", {cx: middle()[0], cy: middle()[1], r: 8 * unit, "stroke-width": 2 * unit, class: "handle given"}, words, middle, (point) => put(point)));
+  if (view.edge && !view.source) {
+    const {line, middle, put} = view.edge;
+    over.append(el("line", {...line, class: "edge-line", "stroke-width": 2 * unit}), knob(8 * unit, unit, true, "Leading edge in this frame", middle, put));
+  }
+  if (held) focusOn(held);
 }
 
 function drawAxis(over, axis, unit, handles) {
@@ -201,31 +205,28 @@ function drawAxis(over, axis, unit, handles) {
   if (places.length > 2) over.append(el("polyline", {class: kind, fill: "none", points: places.slice(0, -1).join(" "), "stroke-width": 2 * unit}));
   const line = (cls, dx, dy, width) => el("line", {class: cls, x1: x0 + dx, y1: y0 + dy, x2: x1 + dx, y2: y1 + dy, "stroke-width": width * unit});
   const length = Math.hypot(x1 - x0, y1 - y0) || 1;
-  const half = (axis.width_px ?? 0) / 2;
-  if (half && places.length === 2) for (const side of [-half, half]) over.append(line(`${kind} side`, (-side * (y1 - y0)) / length, (side * (x1 - x0)) / length, 1));
-  over.append(line(kind, 0, 0, 2));
   const [ux, uy] = [(x1 - x0) / length, (y1 - y0) / length];
+  const half = (axis.width_px ?? 0) / 2;
+  if (half && places.length === 2) for (const side of [-half, half]) over.append(line(`${kind} side`, -side * uy, side * ux, 1));
+  over.append(line(kind, 0, 0, 2));
   const tip = 11 * unit;
   over.append(el("path", {class: kind, "stroke-width": 2 * unit, d: `M${x1 - tip * (ux + 0.5 * uy)} ${y1 - tip * (uy - 0.5 * ux)} L${x1} ${y1} L${x1 - tip * (ux - 0.5 * uy)} ${y1 - tip * (uy + 0.5 * ux)}`}));
   if (!handles) return;
-  for (const end of ["from_px", "to_px"]) {
-    const words = end === "from_px" ? "Start of the growth axis" : "End of the growth axis";
-    over.append(handle("circle", {cx: axis[end][0], cy: axis[end][1], r: 8 * unit, "stroke-width": 2 * unit, class: axis.given ? "handle given" : "handle"}, words, () => currentAxis()[end], (point) => {
-      const now = currentAxis();
-      setAxis({...now, [end]: point}, now.given || scopeWanted());
-      drawOver();
-      drawTools();
-    }));
+  for (const [end, words] of Object.entries(AXIS_ENDS)) {
+    over.append(knob(8 * unit, unit, axis.given, words, () => currentAxis()[end], (point) => changeAxis({[end]: point})));
   }
-  (axis.via_px ?? []).forEach((point, i) => {
-    const put = (place) => setBends(currentAxis().via_px.with(i, place));
-    const made = handle("circle", {cx: point[0], cy: point[1], r: 6 * unit, "stroke-width": 2 * unit, class: axis.given ? "handle given" : "handle"}, bendWords(i), () => currentAxis().via_px[i], put, "Delete removes it");
+  (axis.via_px ?? []).forEach((_, i) => {
+    const put = (place) => changeAxis({via_px: currentAxis().via_px.with(i, place)});
+    const made = knob(6 * unit, unit, axis.given, bendWords(i), () => currentAxis().via_px[i], put, "Delete removes it");
     made.addEventListener("keydown", (event) => { if (["Delete", "Backspace"].includes(event.key)) { event.preventDefault(); removeBend(i); } });
     over.append(made);
   });
 }
 
-const scopeWanted = () => document.querySelector("#axis-scope")?.value ?? "all";
+function knob(r, unit, given, words, where, put, more) {
+  const [cx, cy] = where();
+  return handle("circle", {cx, cy, r, "stroke-width": 2 * unit, class: given ? "handle given" : "handle"}, words, where, put, more);
+}
 
 function handle(tag, given, words, where, put, more = "") {
   const made = el(tag, {...given, tabindex: 0, role: "button", "aria-label": `${words}; arrow keys move it by a pixel, with Shift by ten, with Alt by a tenth${more && `; ${more}`}`, "data-handle": words});
@@ -237,7 +238,7 @@ function handle(tag, given, words, where, put, more = "") {
     event.preventDefault();
     const [x, y] = where();
     put(inside([x + by[0], y + by[1]]));
-    document.querySelector(`[data-handle="${words}"]`)?.focus();
+    focusOn(words);
   });
   return made;
 }
@@ -257,7 +258,7 @@ function drag(event, words, put) {
   const end = () => {
     over.removeEventListener("pointermove", move);
     document.querySelector(".lens")?.remove();
-    document.querySelector(`[data-handle="${words}"]`)?.focus();
+    focusOn(words);
   };
   over.addEventListener("pointermove", move);
   over.addEventListener("pointerup", end, {once: true});
@@ -293,31 +294,30 @@ const scaleKind = () => (kind === "checkerboard" || kind === "charuco" ? "board"
 
 function place(event) {
   if (view.tool !== "scale" || scaleKind() !== "two_points") return;
-  const point = at(event).map((v) => round(v));
-  if (!marks.from_px) marks.from_px = point;
-  else if (!marks.to_px) marks.to_px = point;
-  else return;
-  writeScale();
-  drawOver();
-  drawTools();
+  const end = Object.keys(MARKS).find((key) => !marks[key]);
+  if (!end) return;
+  setMark(end, at(event));
   // Pressing moves the focus to the pressed element.
   if (marks.to_px) addEventListener("pointerup", () => setTimeout(() => $("length")?.focus()), {once: true});
 }
 
+const MARKS = {from_px: "First ruler mark", to_px: "Second ruler mark"};
+
+function setMark(end, point) {
+  marks[end] = rounded(point);
+  writeScale();
+  redraw();
+}
+
 function drawMarks(over, unit) {
-  if (marks.from_px && marks.to_px) {
-    over.append(el("line", {class: "ruler-line", x1: marks.from_px[0], y1: marks.from_px[1], x2: marks.to_px[0], y2: marks.to_px[1], "stroke-width": 1.5 * unit}));
-  }
-  for (const [end, words] of [["from_px", "First ruler mark"], ["to_px", "Second ruler mark"]]) {
+  const [from, to] = [marks.from_px, marks.to_px];
+  if (from && to) over.append(el("line", {class: "ruler-line", x1: from[0], y1: from[1], x2: to[0], y2: to[1], "stroke-width": 1.5 * unit}));
+  for (const [end, words] of Object.entries(MARKS)) {
     if (!marks[end]) continue;
     const [x, y] = marks[end];
     const r = 9 * unit;
-    over.append(handle("path", {class: "mark", "stroke-width": 1.6 * unit, d: `M${x - r} ${y}H${x + r}M${x} ${y - r}V${y + r}M${x - r * 0.6} ${y}a${r * 0.6} ${r * 0.6} 0 1 0 ${r * 1.2} 0a${r * 0.6} ${r * 0.6} 0 1 0 ${-r * 1.2} 0`}, words, () => marks[end], (point) => {
-      marks[end] = point.map((v) => round(v));
-      writeScale();
-      drawOver();
-      drawTools();
-    }));
+    const d = `M${x - r} ${y}H${x + r}M${x} ${y - r}V${y + r}M${x - r * 0.6} ${y}a${r * 0.6} ${r * 0.6} 0 1 0 ${r * 1.2} 0a${r * 0.6} ${r * 0.6} 0 1 0 ${-r * 1.2} 0`;
+    over.append(handle("path", {class: "mark", "stroke-width": 1.6 * unit, d}, words, () => marks[end], (point) => setMark(end, point)));
   }
 }
 
@@ -329,7 +329,8 @@ function writeScale() {
     const {board} = marks;
     const [square, marker] = [numberOf(marks.square), numberOf(marks.marker)];
     const whole = board && square > 0 && (board.kind === "checkerboard" || marker > 0);
-    state.calibration = whole ? {kind: board.kind, image: board.image, squares: board.squares, square_mm: square, ...(board.kind === "charuco" ? {marker_mm: marker, dictionary: board.dictionary} : {})} : null;
+    const markers = board?.kind === "charuco" ? {marker_mm: marker, dictionary: board.dictionary} : {};
+    state.calibration = whole ? {kind: board.kind, image: board.image, squares: board.squares, square_mm: square, ...markers} : null;
   }
   changed();
 }
@@ -361,7 +362,7 @@ const suggested = () => (marks.board?.marker_share ? String(round(numberOf(marks
 
 function said(field) {
   const found = state.problems.filter((problem) => problem.field === field || (problem.field === "cell" && problem.column === field && problem.trial === row()?.trial));
-  return el("ul", {class: "problems"}, ...found.map((problem) => el("li", {class: problem.severity}, problem.text)));
+  return el("ul", {class: "problems"}, ...listed(found));
 }
 
 function field(id, label, value, write, more = {}) {
@@ -385,16 +386,17 @@ function drawAxisTool() {
     "": axis ? "Found from the motion of this recording. Nothing is written: the axis of each recording is found separately. Drag an end if it is wrong." : `No axis found: ${state.clip.no_axis}.`,
     all: "Given for all trials, in experiment.yaml.", trial: `Given for ${row().trial} alone, in its row.`,
   }[axis?.given ?? ""];
-  const ends = axis ? ["from_px", "to_px"].map((end) => axis[end].map((v) => round(v)).join(", ")).join(" to ") : "";
-  const scope = el("select", {id: "axis-scope", onchange: (event) => { const now = currentAxis(); if (now?.given) { const value = event.target.value; if (value === "trial") setAxis(now, "trial"); else setAxis(now, "all"); drawOver(); drawTools(); } }},
+  const ends = axis ? [axis.from_px, axis.to_px].map((end) => rounded(end).join(", ")).join(" to ") : "";
+  const scope = el("select", {id: "axis-scope", onchange: (event) => { if (axis?.given) setAxis(axis, event.target.value); }},
     el("option", {value: "all", selected: axis?.given !== "trial"}, "all trials"), el("option", {value: "trial", selected: axis?.given === "trial"}, "this trial alone"));
-  const place = () => { const [w, h] = [state.clip.width, state.clip.height]; setAxis({from_px: [0.1 * w, h / 2], to_px: [0.9 * w, h / 2]}, "all"); drawOver(); drawTools(); };
+  const {width, height} = state.clip;
+  const place = () => setAxis({from_px: [0.1 * width, height / 2], to_px: [0.9 * width, height / 2]}, "all");
   const moved = Object.values(state.corrections).flat().filter((one) => one.action === "move").length;
   const warning = moved ? el("p", {class: "hint", id: "moved-points", role: "note"}, `${moved === 1 ? "A moved point refers" : `${moved} moved points refer`} to the former axis: after a change of the axis, move them again.`) : null;
   $("axis-tool").replaceChildren(...[said("axis"), el("p", {class: "hint"}, words), warning].filter(Boolean), el("div", {class: "row"},
     axis ? el("span", {class: "fact"}, el("b", {}, ends), " px") : el("button", {type: "button", onclick: place}, "Draw one"),
     axis ? el("button", {type: "button", class: "plain", id: "add-bend", onclick: addBend, title: "Adds a point in the middle of the longest segment; drag it to where the vine bends. Delete removes a point."}, "Add a bend") : null,
-    axis?.via_px?.length ? el("button", {type: "button", class: "plain", id: "straighten", onclick: () => setBends([])}, "Make it straight") : null,
+    axis?.via_px?.length ? el("button", {type: "button", class: "plain", id: "straighten", onclick: () => changeAxis({via_px: []})}, "Make it straight") : null,
     el("label", {}, "A dragged axis applies to ", scope), axis?.given ? el("button", {type: "button", class: "plain", onclick: clearAxis}, "Use the axis found from the motion") : null));
 }
 
@@ -413,7 +415,7 @@ function facts() {
 
 function drawScaleTool() {
   const kinds = [["two_points", "Two marks on a ruler"], ["board", "A printed board"], ["mm_per_px", "The scale itself"]];
-  const choose = (value) => { kind = value === "board" ? marks.board?.kind ?? "charuco" : value; writeScale(); drawOver(); drawTools(); };
+  const choose = (value) => { kind = value === "board" ? marks.board?.kind ?? "charuco" : value; writeScale(); redraw(); };
   const segments = el("div", {class: "segments", role: "radiogroup", "aria-label": "Where the scale comes from"}, ...kinds.map(([value, words]) =>
     el("label", {}, el("input", {type: "radio", name: "scale", id: `scale-${value}`, value, checked: scaleKind() === value, onchange: () => choose(value)}), words)));
   const parts = [];
@@ -422,7 +424,7 @@ function drawScaleTool() {
     parts.push(el("p", {class: "hint"}, step), el("div", {class: "row"},
       field("length", "Length between them", marks.length, (value) => { marks.length = value; }),
       el("select", {id: "length-unit", "aria-label": "Unit of the length", onchange: (event) => { lengthUnit = event.target.value; writeScale(); facts(); }}, ...Object.keys(MM).map((unit) => el("option", {value: unit, selected: unit === lengthUnit}, unit))),
-      marks.from_px ? el("button", {type: "button", class: "plain", onclick: () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); drawOver(); drawTools(); }}, "Click both again") : null));
+      marks.from_px ? el("button", {type: "button", class: "plain", onclick: () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); redraw(); }}, "Click both again") : null));
   } else if (kind === "mm_per_px") {
     parts.push(el("div", {class: "row"}, field("own-scale", "Millimetres per pixel", marks.own, (value) => { marks.own = value; })));
   } else {

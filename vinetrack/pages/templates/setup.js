@@ -1,5 +1,5 @@
 // Entry point of the page: load, handle events, check and save.
-import {$, ask, content, el, listeners, settle, state} from "./state.js";
+import {$, ask, content, listed, listeners, settle, state} from "./state.js";
 import {drawOver, drawProblems, readCalibration, showRecording} from "./picture.js";
 import {drawTable, markProblems} from "./table.js";
 import {forget, track} from "./motion.js";
@@ -12,22 +12,17 @@ function choose(i) {
   showRecording();
 }
 
-// Without `true` only the sheet was checked: whether the recordings agree with it is not known yet.
-function headline(n, errors) {
-  if (errors) return `${n} trials, ${errors} ${errors === 1 ? "thing" : "things"} to fill in or correct`;
-  return state.compared ? `${n} trials, ready to run` : `${n} trials, complete; Check compares them with the recordings`;
-}
-
 function showWhole(extra = []) {
-  const found = [...extra, ...state.problems.filter((problem) => problem.field === "whole")];
-  $("whole").replaceChildren(...found.map((problem) => el("li", {class: problem.severity}, problem.text)));
+  $("whole").replaceChildren(...listed([...extra, ...state.problems.filter((problem) => problem.field === "whole")]));
 }
 
 function showState(notes = []) {
   const errors = state.problems.filter((problem) => problem.severity === "error").length;
   const warnings = state.problems.length - errors;
-  const n = state.sheet.rows.length;
-  $("headline").textContent = headline(n, errors);
+  // Until the recordings were compared only the sheet was checked: whether they agree with it is not known yet.
+  const ready = state.compared ? "ready to run" : "complete; Check compares them with the recordings";
+  const todo = `${errors} ${errors === 1 ? "thing" : "things"} to fill in or correct`;
+  $("headline").textContent = `${state.sheet.rows.length} trials, ${errors ? todo : ready}`;
   const words = [];
   if (warnings) words.push(`${warnings} ${warnings === 1 ? "warning" : "warnings"}`);
   words.push(state.dirty ? "not saved" : "saved as shown", ...notes);
@@ -46,9 +41,7 @@ async function check(thorough = false) {
     if (mine !== turn) return;
     state.problems = found.problems;
     if (thorough) state.compared = true;
-    $("sheet-text").textContent = found.sheet_text;
-    $("settings-text").textContent = found.settings_text;
-    $("corrections-text").textContent = found.corrections_text;
+    for (const name of ["sheet", "settings", "corrections"]) $(`${name}-text`).textContent = found[`${name}_text`];
     $("corrections-shown").hidden = !found.corrections_text;
     showWhole(markProblems());
     $("understood").hidden = !found.understood.length;

@@ -66,10 +66,9 @@ export function labelOf(name) {
   return (known && known.units.length > 1 ? known.quantity : name).replaceAll("_", " ");
 }
 
-export function sharedValue(name) {
-  const key = Object.keys(state.shared).find((other) => quantityOf(other) === quantityOf(name));
-  return key === undefined ? "" : state.shared[key];
-}
+// The name, in whichever unit, under which all trials share a quantity.
+export const sharedKey = (name) => Object.keys(state.shared).find((key) => quantityOf(key) === quantityOf(name));
+export const sharedValue = (name) => state.shared[sharedKey(name)] ?? "";
 
 // Empty columns are not written, unless the sheet had them.
 export function content(more = {}) {
@@ -90,6 +89,9 @@ export function changed() {
 
 // Avoid a second check when one is already pending.
 export const settle = () => clearTimeout(waiting);
+
+// Problems as items of a list.
+export const listed = (problems) => problems.map(({severity, text}) => el("li", {class: severity}, text));
 
 export const decimals = (value, digits) => (value === null || value === undefined ? "–" : Number(value.toPrecision(digits)).toString());
 export const numberOf = (text) => { const value = parseFloat(String(text).replace(",", ".")); return Number.isFinite(value) ? value : null; };

@@ -1,5 +1,5 @@
 // The table: one row for all trials, one for each trial, with problems under the cell concerned.
-import {$, ask, baseOf, changed, el, labelOf, quantityOf, sharedValue, shownColumns, state, url} from "./state.js";
+import {$, ask, baseOf, changed, el, labelOf, listed, quantityOf, sharedKey, sharedValue, shownColumns, state, url} from "./state.js";
 
 export function drawTable(choose) {
   const columns = shownColumns();
@@ -16,12 +16,11 @@ function head(columns) {
   const cells = columns.map((name) => {
     const known = state.known[baseOf(name)];
     const title = known ? [known.meaning, known.measured, known.default && `Blank: ${known.default}.`].filter(Boolean).join(" ") : "Not a column of a trial sheet: kept, but ignored.";
-    const label = el("span", {title}, labelOf(name));
     const unit = known && known.units.length > 1
       ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => setUnit(name, event.target.value)},
         ...known.units.map((key) => el("option", {value: key, selected: name.endsWith(`_${key}`) && unitOf(name) === key}, state.units[key])))
       : el("span", {class: "unit"});
-    return el("th", {scope: "col"}, label, unit);
+    return el("th", {scope: "col"}, el("span", {title}, labelOf(name)), unit);
   });
   return el("thead", {}, el("tr", {}, el("th"), el("th", {scope: "col"}, "trial", el("span", {class: "unit"}, "recording")), ...cells));
 }
@@ -30,14 +29,12 @@ const unitOf = (name) => name.slice(quantityOf(name).length + 1);
 
 function setUnit(name, unit) {
   const other = `${quantityOf(name)}_${unit}`;
-  state.sheet.columns = state.sheet.columns.map((column) => (column === name ? other : column));
-  state.kept = state.kept.map((column) => (column === name ? other : column));
-  state.offered = state.offered.map((column) => (column === name ? other : column));
-  for (const row of state.sheet.rows) {
-    if (name in row) { row[other] = row[name]; delete row[name]; }
+  for (const [place, key] of [[state.sheet, "columns"], [state, "kept"], [state, "offered"]]) {
+    place[key] = place[key].map((column) => (column === name ? other : column));
   }
-  const key = Object.keys(state.shared).find((shared) => quantityOf(shared) === quantityOf(name));
-  if (key !== undefined && key !== other) { state.shared[other] = state.shared[key]; delete state.shared[key]; }
+  const rename = (cells, from) => { if (from in cells && from !== other) { cells[other] = cells[from]; delete cells[from]; } };
+  for (const row of state.sheet.rows) rename(row, name);
+  rename(state.shared, sharedKey(name));
   changed();
   redraw();
 }
@@ -49,7 +46,7 @@ function sharedRow(columns) {
   const cells = columns.map((name) => {
     const known = state.known[baseOf(name)];
     if (!known?.shared) return el("td");
-    const key = Object.keys(state.shared).find((other) => quantityOf(other) === quantityOf(name)) ?? name;
+    const key = sharedKey(name) ?? name;
     const blank = known.default.startsWith("required") ? "" : known.default.split(":")[0].slice(0, 12);
     return cell(name, "shared", state.shared[key] ?? "", blank, (value) => { state.shared[key] = value; placeholders(name); });
   });
@@ -69,13 +66,15 @@ function trialRow(row, i, columns, choose) {
   });
   name.classList.add("name");
   name.append(el("small", {class: "file"}, row.video || row.track || ""));
-  const cells = columns.map((column) => cell(column, i, row[column] ?? "", sharedValue(column), (value) => {
-    row[column] = value;
-    if (!state.sheet.columns.includes(column)) state.sheet.columns.push(column);
-  }));
+  const cells = columns.map((column) => cell(column, i, row[column] ?? "", sharedValue(column), (value) => setCell(row, column, value)));
   const line = el("tr", {"data-row": i, class: i === state.chosen ? "chosen" : ""}, el("td", {class: "pic"}, picture), name, ...cells);
   line.addEventListener("focusin", (event) => { if (event.target.matches("input, td select")) choose(i); });
   return line;
+}
+
+function setCell(row, column, value) {
+  row[column] = value;
+  if (!state.sheet.columns.includes(column)) state.sheet.columns.push(column);
 }
 
 function cell(column, row, value, placeholder, write) {
@@ -121,12 +120,11 @@ async function paste(event) {
   }
   before = structuredClone({sheet: state.sheet, shared: state.shared});
   for (const [at, name, value] of placed.cells) {
-    if (at === "shared") state.shared[Object.keys(state.shared).find((key) => quantityOf(key) === quantityOf(name)) ?? name] = value;
-    else state.sheet.rows[at][name] = value;
-    if (at !== "shared" && !state.sheet.columns.includes(name)) state.sheet.columns.push(name);
+    if (at === "shared") state.shared[sharedKey(name) ?? name] = value;
+    else setCell(state.sheet.rows[at], name, value);
   }
   refreshAt(column, row);
-  $("pasted").replaceChildren(...placed.notes.map((words) => el("li", {class: "warning"}, words)));
+  $("pasted").replaceChildren(...listed(placed.notes.map((text) => ({severity: "warning", text}))));
 }
 
 function refreshAt(column, row) {
