@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, join_flags, with_flag
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
@@ -131,7 +130,7 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: floa
     return track
 
 
-def _flag_visible_gaps(track: Track, frames: NDArray[np.int_]) -> Track:
+def _flag_visible_gaps(track: Track, frames: Indices) -> Track:
     """Flag `gap` on the first row after each spacing of two frames or more that nothing has marked yet."""
     out = track
     for before in np.flatnonzero((frames > 1) & ~with_flag(track.flag[1:], "gap")):
@@ -166,7 +165,7 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     return None
 
 
-def _suspect_steps(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
+def _suspect_steps(speed: Floats, noise_m: Floats) -> Indices:
     """Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening.
     A point with a large stated error, such as one that a door half hides, makes no step that is conclusive about
     frames.
@@ -183,9 +182,7 @@ def _suspect_steps(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
     return np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * np.fmax(before, after))))
 
 
-def _dropped_frames(
-    frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: NDArray[np.int_]
-) -> _Fault | None:
+def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
     """The fault where frames are missing between points i and i + 1, or None."""
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
@@ -206,9 +203,7 @@ def _dropped_frames(
     return _Fault("dropped", int(rows[i + 1]), missing)
 
 
-def _repeated_frame(
-    frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: NDArray[np.int_]
-) -> _Fault | None:
+def _repeated_frame(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
     """The fault where point i + 1 repeats point i, whether it replaced a frame or was inserted, or None."""
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 2, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:

@@ -13,9 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track, Trial, hand_corrected, join_flags
+from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, hand_corrected, join_flags
 
 # ------------------------------------------------------------------------------
 # Detect positions that were smoothed before they were handed in, by the frequencies that their noise lacks.
@@ -390,7 +389,7 @@ class LocalFit:
     gain: Floats
     spread_m: Floats
     share: Floats
-    near: NDArray[np.int_]
+    near: Indices
     speed_m_s: Floats
 
 
@@ -447,7 +446,7 @@ def local_noise(distance_m: Floats, half_width: int = 20) -> Floats:
     return np.asarray(view[middle])
 
 
-def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = False) -> NDArray[np.bool_]:
+def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = False) -> Bools:
     """Mark the points that lie far off the motion around them. The largest deviations are rejected first, others only
     if they remain without those: an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) →
     (n_points,).
@@ -504,7 +503,7 @@ def rejected_points_note(tracks: Mapping[str, Track]) -> str:
     return f"{points} far off the motion around, so left out: {', '.join(places[:most_named])}{more}."
 
 
-def _places(track: Track, outlying: NDArray[np.int_]) -> list[str]:
+def _places(track: Track, outlying: Indices) -> list[str]:
     """Time of every rejected point and its distance from the line between its usable neighbours, in words."""
     usable_rows = np.flatnonzero(track.usable)
     distance_m = track.lead_position_m[outlying] - np.interp(
@@ -517,7 +516,7 @@ def _places(track: Track, outlying: NDArray[np.int_]) -> list[str]:
     ]
 
 
-def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> NDArray[np.bool_]:
+def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> Bools:
     """Points beyond the limit whose neighbours follow one cubic without them."""
     noise_m, _ = position_noise(time_s, position_m, robust=True)
     fit = local_fit(time_s, position_m, noise_m)

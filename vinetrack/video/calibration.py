@@ -87,16 +87,30 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
     """Find the inner corners of a checkerboard in the picture (px), all of which must be there, and on the board (m),
     both of shape (n, 2).
     """
-    grey = eight_bits(picture)
-    across, down = board.squares
+    import cv2
+
+    grey, (across, down) = eight_bits(picture), board.squares
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     for enlarge in (1, 2):
         for columns, rows in dict.fromkeys([(across, down), (down, across)]):
-            found_px = _sector_corners(grey, columns - 1, rows - 1, enlarge)
-            if found_px is None:
+            # The sector-based detector (Duda & Frese 2018)
+            shape = (columns - 1, rows - 1)
+            seen, found_px = cv2.findChessboardCornersSB(_enlarged(grey, enlarge), shape, flags=flags)
+            if not seen:
                 continue
+            found_px = _in_original(found_px.reshape(-1, 2), enlarge)
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
             return _enough(found_px, grid.astype(float) * (board.square_mm / 1000), "all are seen")
-    raise CornersError(_no_checkerboard(grey, across, down))
+    what = f"no checkerboard of {across} × {down} squares is seen"
+    if (squares := checkerboard_squares(grey)) is not None:
+        raise CornersError(
+            f"{what}, but {squares[0]} × {squares[1]} squares are; correct `squares` (squares, not inner corners), or "
+            "show the whole board"
+        )
+    raise CornersError(
+        f"{what}; the whole board with a white border must be in the picture, in focus and evenly lit, and `squares` "
+        "counts squares, not inner corners"
+    )
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
@@ -107,9 +121,12 @@ def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
 
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
     seen, corners, shape = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
-    if seen and _is_a_grid(corners.reshape(*shape.shape, 2)):
-        return shape.shape[1] + 1, shape.shape[0] + 1
-    return None
+    if not seen:
+        return None
+    grid = corners.reshape(*shape.shape, 2)  # evenly spaced where second differences are below a tenth of a square
+    step = np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2))
+    bends = [np.linalg.norm(np.diff(grid, 2, axis=axis), axis=2).max() for axis in (0, 1)]
+    return (grid.shape[1] + 1, grid.shape[0] + 1) if max(bends) < 0.1 * step else None
 
 
 def _enlarged(grey: Grey, times: int) -> Grey:
@@ -192,15 +209,6 @@ def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], b
     return float(inside.sum()) / len(ids), size_mm
 
 
-def _sector_corners(grey: Grey, columns: int, rows: int, enlarge: int = 1) -> Floats | None:
-    """Inner corners by the sector-based detector (Duda & Frese 2018), (columns · rows, 2), px; None where not found."""
-    import cv2
-
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    seen, corners = cv2.findChessboardCornersSB(_enlarged(grey, enlarge), (columns, rows), flags=flags)
-    return _in_original(corners.reshape(-1, 2), enlarge) if seen else None
-
-
 def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floats]:
     """Corners and their places on the board, both of shape (n, 2), unless they are too few or on one line."""
     if len(grid_m) >= FEWEST_CORNERS:
@@ -211,13 +219,6 @@ def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floa
         f"only {len(grid_m)} corners of the board can be read ({seen}; at least {FEWEST_CORNERS}, not on one line, are "
         "needed); show more of it, larger, in focus, evenly lit and not mirrored"
     )
-
-
-def _is_a_grid(corners_px: NDArray[Any]) -> bool:
-    """Whether corners, shape (rows, columns, 2), are evenly spaced: second differences below a tenth of a square."""
-    steps = np.linalg.norm(np.diff(corners_px, axis=1), axis=2)
-    bends = [np.linalg.norm(np.diff(corners_px, 2, axis=axis), axis=2).max() for axis in (0, 1)]
-    return bool(max(bends) < 0.1 * np.median(steps))
 
 
 def _no_markers(grey: Grey, dictionary: str) -> str:
@@ -233,20 +234,6 @@ def _no_markers(grey: Grey, dictionary: str) -> str:
     return (
         f"no marker of {dictionary} is seen; check `dictionary`, and that the board is in the picture, in focus, "
         "not mirrored and larger than 5 pixels a marker bit"
-    )
-
-
-def _no_checkerboard(grey: Grey, across: int, down: int) -> str:
-    """Say that there is no such checkerboard, and name the size of the one that is there, if any."""
-    squares = checkerboard_squares(grey)
-    if squares is not None:
-        return (
-            f"no checkerboard of {across} × {down} squares is seen, but {squares[0]} × {squares[1]} squares are; "
-            "correct `squares` (squares, not inner corners), or show the whole board"
-        )
-    return (
-        f"no checkerboard of {across} × {down} squares is seen; the whole board with a white border must be in the "
-        "picture, in focus and evenly lit, and `squares` counts squares, not inner corners"
     )
 
 
@@ -389,18 +376,24 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
 
     size = (width_px, height_px)
     corners = [_half_diagonals(picture, size) for picture, _ in views]
-    boards = [board for _, board in views]
-    reach_m = max(float(np.ptp(board, axis=0).max()) for board in boards)
-    start = [_first_homography(view, board / reach_m) for view, board in zip(corners, boards, strict=True)]
+    reach_m = max(float(np.ptp(board, axis=0).max()) for _, board in views)
+    places = [board / reach_m for _, board in views]
+    start = [_first_homography(*view) for view in zip(corners, places, strict=True)]
     values = np.concatenate([*start, np.zeros(N_LENS)])
     unit_px = _half_diagonal_px(*size)
     noise_px = 0.1
+
+    def misfit(values: Floats) -> Floats:
+        """Residuals over the noise, followed by the parameters with priors over their prior standard deviations."""
+        fits = np.concatenate([view.ravel() for view in _residuals(values, corners, places)]) / (noise_px / unit_px)
+        tilts = values[: len(views) * N_PLANE].reshape(-1, N_PLANE)[:, 6:] / PRIOR_SIGMA[:2]
+        return np.concatenate([fits, tilts.ravel(), values[len(views) * N_PLANE :] / np.array(PRIOR_SIGMA[2:])])
+
     # 3: iterations of fit and noise estimate (chosen)
     for _ in range(3):
-        arguments = (corners, [board / reach_m for board in boards], noise_px / unit_px)
-        fit = least_squares(_misfit, values, args=arguments, method="lm", xtol=1e-12, ftol=1e-12)
+        fit = least_squares(misfit, values, method="lm", xtol=1e-12, ftol=1e-12)
         values = fit.x
-        residuals = _residuals(values, *arguments[:2])
+        residuals = _residuals(values, corners, places)
         n_degrees = 2 * sum(len(view) for view in corners) - N_PLANE * len(views) - N_LENS
         sum_of_squares = sum(float((view**2).sum()) for view in residuals)
         # 0.01: chosen: no corner is located better
@@ -457,16 +450,6 @@ def _residuals(values: Floats, corners: list[Floats], boards: list[Floats]) -> l
         radius2 = (ideal**2).sum(axis=-1, keepdims=True)
         residuals.append(corner - ideal * (1 + lens[0] * radius2 + lens[1] * radius2**2))
     return residuals
-
-
-def _misfit(values: Floats, corners: list[Floats], boards: list[Floats], noise: float) -> Floats:
-    """Residuals over the noise, followed by the parameters with priors over their prior standard deviations."""
-    n_views = len(corners)
-    fits = np.concatenate([view.ravel() for view in _residuals(values, corners, boards)]) / noise
-    tilts = np.concatenate([values[k * N_PLANE + 6 : k * N_PLANE + 8] for k in range(n_views)])
-    lens = values[N_PLANE * n_views :]
-    priors = np.concatenate([tilts / np.tile(PRIOR_SIGMA[:2], n_views), lens / np.array(PRIOR_SIGMA[2:])])
-    return np.concatenate([fits, priors])
 
 
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
@@ -612,7 +595,12 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
             board.image,
         )
     corners_px = _median_corners(views)[0] if stationary else views[0][0]
-    notes += _coverage_note(corners_px, width, height, board.image)
+    # Beyond a target that spans less than half of the picture, scale and distortion are extrapolated.
+    share = float(np.ptp(corners_px[:, 0 if width >= height else 1])) / max(width, height)
+    if share < 0.5:
+        notes.append(
+            f"{board.image}: the target spans only {share:.0%} of the picture; fill it to know the scale everywhere"
+        )
     # 0.05: bias that the corners at one end of a target may share, px: the error of one (measured)
     bias_rel = 0.05 * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
     covered = (*corners_px.min(axis=0), *corners_px.max(axis=0))
@@ -665,15 +653,6 @@ def _median_corners(views: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Flo
     return corners, np.array(list(gathered)) * 1e-6
 
 
-def _coverage_note(corners_px: Floats, width: int, height: int, name: str) -> list[str]:
-    """Warn where the target spans less than half of the picture: beyond it scale and distortion are extrapolated."""
-    longer = 0 if width >= height else 1
-    share = float(np.ptp(corners_px[:, longer])) / max(width, height)
-    if share >= 0.5:
-        return []
-    return [f"{name}: the target spans only {share:.0%} of the picture; fill it to know the scale everywhere"]
-
-
 # ------------------------------------------------------------------------------
 # Apply corrections by hand to a track: points moved, dropped or confirmed, each flagged `corrected`.
 
@@ -684,8 +663,8 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
     """
     if not corrections:
         return track
-    edge, sigma = track.edge_px.copy(), track.lead_position_sigma_m.copy()
-    slow = None if track.lead_position_systematic_m is None else track.lead_position_systematic_m.copy()
+    edge, sigma, slow = track.edge_px.copy(), track.lead_position_sigma_m.copy(), track.lead_position_systematic_m
+    slow = None if slow is None else slow.copy()
     flag = track.flag.astype("<U80")
     settled = {"doubtful", "lost", "rejected", "after_end"}  # once a person has placed or confirmed a point
     past_tense = {"move": "moved", "drop": "dropped", "confirm": "confirmed"}

@@ -13,11 +13,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Bools, Floats
 from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, front_share, pixels_on_front
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, along_axis, find_axis, front_share, share_on_front
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 
@@ -271,15 +270,10 @@ def find_growth_axis(small: SmallPictures) -> Axis:
 
 def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
     """Share of all growth in the picture that is a front passing once along an axis, straight or curved."""
-    x, y, time, weight, n_times = small.grown
-    if len(x) < 12:
+    if len(small.grown.x) < 12:
         return 0.0
-    along, across = axis.along_and_across((np.column_stack([x, y]) + 0.5) * small.factor - 0.5)
-    band = max(0.6 * axis.width_px / small.factor, 2.0)
-    if not (np.abs(across) < band * small.factor).any():
-        return 0.0
-    on_front = pixels_on_front(along / small.factor, across / small.factor, time, weight, n_times, band)
-    return float(weight[on_front].sum() / weight.sum())
+    along, band = along_axis(small, small.grown, axis), max(0.6 * axis.width_px / small.factor, 2.0)
+    return share_on_front(along, band) if (np.abs(along.y) < band).any() else 0.0
 
 
 def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | None:
@@ -289,8 +283,12 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | N
     # 3.0: least length of the band, in its widths, that has a path (chosen)
     if band is None or path is None or len(path) < 3.0 * band.width:
         return None
+    # Turned round where its pixels changed from its end to its beginning
+    times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
+    finite = np.flatnonzero(np.isfinite(times))
+    trend = np.sum((finite - finite.mean()) * (times[finite] - times[finite].mean())) if finite.size else 0.0
     # 1.5: distance of the curve's knots in widths of the band (chosen)
-    middle = _smoothed_knots(_in_order_of_time(path, band), max(1.5 * band.width, 6.0))
+    middle = _smoothed_knots(path if trend >= 0 else path[::-1], max(1.5 * band.width, 6.0))
     if middle is None:
         return None
     size = small.shape[1], small.shape[0]
@@ -311,7 +309,7 @@ class Band:
     `width` is the width along most of its length.
     """
 
-    region: NDArray[np.bool_]
+    region: Bools
     depth: Floats
     when: Floats
     width: float
@@ -319,29 +317,21 @@ class Band:
 
 def _changed_band(small: SmallPictures) -> Band | None:
     """The largest connected region that changed; None where hardly anything does."""
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, distance_transform_edt, label
 
-    x, y, time, _, _ = small.grown
-    if len(x) < 12:
+    if len(small.grown.x) < 12:
         return None
     when = np.full(small.frames.shape[1:], np.nan)
-    when[y.astype(int), x.astype(int)] = time
-    region = _largest_region(np.isfinite(when))
+    when[small.grown.y.astype(int), small.grown.x.astype(int)] = small.grown.time
+    # With gaps closed and threads removed
+    region = np.isfinite(when)
+    closed = binary_closing(np.pad(region, 3), iterations=2)[3:-3, 3:-3]
+    parts, count = label(binary_opening(binary_fill_holes(closed), iterations=1), np.ones((3, 3)))
+    if count:
+        region = np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
     depth = np.asarray(distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1])
     half = float(np.quantile(depth[region], 0.9))
     return Band(region, depth, when, 2 * half + 1)
-
-
-def _largest_region(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The largest connected region, with gaps closed and threads removed."""
-    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, label
-
-    closed = binary_closing(np.pad(changed, 3), iterations=2)[3:-3, 3:-3]
-    opened = binary_opening(binary_fill_holes(closed), iterations=1)
-    parts, count = label(opened, np.ones((3, 3)))
-    if count == 0:
-        return changed
-    return np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
 
 
 def _centreline(band: Band) -> Floats | None:
@@ -362,14 +352,6 @@ def _centreline(band: Band) -> Floats | None:
     paths = MCP_Geometric(np.where(band.region, 1 / np.maximum(band.depth, 0.5) ** 3.0, blocked))
     paths.find_costs([start], [end])
     return np.array(paths.traceback(end), dtype=float)[:, ::-1]
-
-
-def _in_order_of_time(path: Floats, band: Band) -> Floats:
-    """The path, turned round where its pixels changed from its end to its beginning."""
-    times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
-    finite = np.flatnonzero(np.isfinite(times))
-    trend = np.sum((finite - finite.mean()) * (times[finite] - times[finite].mean())) if finite.size else 0.0
-    return path if trend >= 0 else path[::-1]
 
 
 def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools, Floats
+from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
@@ -103,27 +103,12 @@ def shared_disagreement(lead_px: Floats) -> float:
     return float(np.sqrt(max(band_variance, 0.0) / bands))
 
 
-def noise_and_slow(bands_px: Floats, seen_px: Floats, apart_px: Floats) -> tuple[Floats, Floats]:
-    """Split what is added to the error of an edge into a random part and a slow part. Random errors are independent
-    between frames; slow ones are shared by neighbouring frames. Returns random and slow error, each of shape
-    (n_frames,), px; their sum in quadrature is `apart_px`. Shapes: bands_px, seen_px, apart_px (n_frames,).
-    """
-    # Part of the error near the start, and of an edge that is a guess, since a door or the mouth hides it, that differs
-    # from frame to frame (measured, chosen)
-    start_part, guess_part = 0.4, math.sqrt(0.5)
-    near = np.sqrt(np.maximum(seen_px**2 - bands_px**2, 0.0))
-    guess = np.sqrt(np.maximum(apart_px**2 - seen_px**2, 0.0))
-    noise = np.sqrt(bands_px**2 + (start_part * near) ** 2 + (guess_part * guess) ** 2)
-    slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
-    return noise, slow
-
-
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
 # Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
 LEAST_FITTED_AMPLITUDE = 0.5
 
 
-def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
+def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> Floats:
     """Replace fits that break the motion or hardly fit by the best ones where the motion leads. Goes from the middle of
     the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
     more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
@@ -136,7 +121,10 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
     out = fit.copy()
     bad_misfit = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
     decentrality = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
-    anchor = int(moving[np.argmin(decentrality + _is_rough(fit[moving, 0]) + (fit[moving, 2] > bad_misfit))])
+    # Rough are points further from the mean of their neighbours than a pixel and 0.15 of the step.
+    at, rough = fit[moving, 0], np.ones(len(moving), dtype=bool)
+    rough[1:-1] = np.abs(at[1:-1] - 0.5 * (at[2:] + at[:-2])) > 1.0 + 0.15 * np.abs(at[2:] - at[:-2]) / 2
+    anchor = int(moving[np.argmin(decentrality + rough + (fit[moving, 2] > bad_misfit))])
     first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
     edge = out[:, 0].tolist()
     for sense in (-1, 1):
@@ -154,11 +142,12 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
                 continue
             replacement = _best_between(strip, state, t, low, high, 1 if resting > long_rest_frames else 9)
             is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
+            ratio = abs(edge[t] - previous) / max(step, 1e-6)
             if inside:
                 if replacement is not None and (faint or replacement[2] < out[t, 2]):
                     out[t] = replacement
-            elif not faint and _spans_missing_frames(edge[t] - previous, step) and is_better:
-                continue
+            elif not faint and is_better and step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25:
+                continue  # two to four whole steps: frames are missing, and the point is right
             elif replacement is None:
                 expected = previous if math.isnan(edge[t]) else edge[t]
                 out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0, 0)
@@ -168,7 +157,7 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
     return _repair_strays(strip, state, out, moving, bad_misfit)
 
 
-def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[np.int_], bad_misfit: float) -> Floats:
+def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: Indices, bad_misfit: float) -> Floats:
     """Replace bad fits that stray from the parabola through two neighbours on each side by the best fit near it. A good
     fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
     """
@@ -188,20 +177,6 @@ def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[
     return out
 
 
-def _spans_missing_frames(stride: float, step: float) -> bool:
-    """Whether a stride is two to four whole steps: frames are missing, and the point is right."""
-    ratio = abs(stride) / max(step, 1e-6)
-    return step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25
-
-
-def _is_rough(edge: Floats) -> NDArray[np.bool_]:
-    """Points further from the mean of their neighbours than a pixel and 0.15 of the step, (n,)."""
-    rough = np.ones(len(edge), dtype=bool)
-    step = np.abs(edge[2:] - edge[:-2]) / 2
-    rough[1:-1] = np.abs(edge[1:-1] - 0.5 * (edge[2:] + edge[:-2])) > 1.0 + 0.15 * step
-    return rough
-
-
 def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int) -> Floats | None:
     """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
     places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]
@@ -214,7 +189,7 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
 BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
 
 
-def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
+def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: Bools) -> tuple[Floats, float]:
     """Error of the edge from the disagreement of its bands, (n_frames,), px, zeros where there is one band only; and
     the slow part of it (`shared_disagreement`). The weighted mean of K independent bands has the variance
     Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by for long in the `core` frames is the shape of the tip,
@@ -226,7 +201,16 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
         return np.zeros(len(edge)), 0.0
     lead_px = np.nan_to_num(edges - edge[:, None])
     slow = shared_disagreement(lead_px[core])
-    lead_px = lead_px - _band_offsets(lead_px, edge, np.flatnonzero(core))
+    # 7, 50.0: fewest core frames nearby over which a median lead is taken, and the growth over which it is, px (chosen)
+    fewest, core_edge = min(7, int(core.sum())), edge[core]
+    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
+    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
+    offsets = np.empty((len(places), lead_px.shape[1]))
+    for i, place in enumerate(places):
+        distance = np.abs(core_edge - place)
+        near = distance <= max(50.0, float(np.partition(distance, fewest - 1)[fewest - 1]))
+        offsets[i] = np.median(lead_px[core][near], axis=0)
+    lead_px = lead_px - offsets[frame_places]
     weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
     median_lead = np.median(lead_px, axis=1, keepdims=True)
     # 2.0: deviation of a band, in median absolute deviations of those of its frame, at which it is clipped (chosen)
@@ -241,8 +225,7 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
     return np.asarray(np.sqrt(1.27 * running_median)), slow
 
 
-# Part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
-BLUR_SIGMA_PART = 0.25
+BLUR_SIGMA_PART = 0.25  # Part of the distance between both ends of an uncertain blur that is its sd (derived)
 
 
 def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
@@ -279,20 +262,6 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
         edges.append(fit[:, 0])
         sigmas.append(fit[:, 1])
     return np.stack(edges, axis=1), np.stack(sigmas, axis=1)
-
-
-def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
-    """Median lead of each band over the core frames nearby, (n_frames, n_bands)."""
-    # 7, 50.0: fewest frames from which that offset is taken, and the growth over which it is, px (chosen)
-    fewest = min(7, len(core))
-    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
-    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
-    out = np.empty((len(places), lead_px.shape[1]))
-    for i, place in enumerate(places):
-        distance = np.abs(edge[core] - place)
-        near = distance <= max(50.0, float(np.partition(distance, fewest - 1)[fewest - 1]))
-        out[i] = np.median(lead_px[core[near]], axis=0)
-    return out[frame_places]
 
 
 # ------------------------------------------------------------------------------
@@ -342,7 +311,9 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     beside = BORDER_GAP_PX + BORDER_SIDE_PX
     film_picture = _middle_picture(strip, exited, slice(near[0] - beside, later[-1] + beside))
     near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
-    borders = _borders(film_picture)
+    # Step of brightness across each column, by row; the first column is `beside`.
+    sides = np.lib.stride_tricks.sliding_window_view(film_picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
+    borders = sides[:, beside + BORDER_GAP_PX :] - sides[:, : -beside - BORDER_GAP_PX]
     border_steps = borders[:, near - beside].T
     border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
     border_step = float(np.median(border))
@@ -357,7 +328,14 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     clear_px = rest_px + 3 * state.blur + 1
     exit_frame = first + int(np.argmax(edge[first:] > clear_px))
     after_exit = edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT]
-    return np.arange(len(edge)) < exit_frame, _moved_behind(after_exit, rest_px)
+    at_mouth = np.arange(len(edge)) < exit_frame
+    if len(after_exit) < FRAMES_AFTER_EXIT:
+        return at_mouth, False
+    # From rest under its present acceleration a the tip would have come v²/2a, with v its present speed; this is
+    # compared with the way from the resting place. As much again, and 5 px, are allowed for an acceleration that falls.
+    half_acceleration, speed, start_px = np.polyfit(np.arange(FRAMES_AFTER_EXIT), after_exit, 2)
+    run_up_px = speed**2 / (4 * half_acceleration) if half_acceleration > 0 else np.inf
+    return at_mouth, bool(run_up_px > 2 * (start_px - rest_px) + 5)
 
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
@@ -407,7 +385,7 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
 
 
-def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> NDArray[np.float32]:
+def _middle_picture(strip: Strip, frames: Indices, columns: slice) -> NDArray[np.float32]:
     """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker, in some columns. The moving
     tail averages out.
     """
@@ -418,27 +396,6 @@ def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> N
     values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
     level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
     return np.asarray(np.median(level, axis=0), dtype=np.float32)
-
-
-def _borders(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Step of brightness across each column, by row; the first column is BORDER_GAP_PX + BORDER_SIDE_PX. Shape (n_rows,
-    n_columns).
-    """
-    sides = np.lib.stride_tricks.sliding_window_view(picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
-    apart = 2 * BORDER_GAP_PX + BORDER_SIDE_PX
-    return np.asarray(sides[:, apart:] - sides[:, :-apart], dtype=np.float32)
-
-
-def _moved_behind(edge: Floats, rest_px: float) -> bool:
-    """Whether a tip first seen at `edge` started further back than at `rest_px`. From rest under its present
-    acceleration a it would have come v²/2a, with v its present speed; this is compared with the distance from
-    `rest_px`. As much again, and 5 px, are allowed for an acceleration that falls.
-    """
-    if len(edge) < FRAMES_AFTER_EXIT:
-        return False
-    half_acceleration, speed, start_px = np.polyfit(np.arange(FRAMES_AFTER_EXIT), edge, 2)
-    run_up_px = speed**2 / (4 * half_acceleration) if half_acceleration > 0 else np.inf
-    return bool(run_up_px > 2 * (start_px - rest_px) + 5)
 
 
 def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
@@ -503,7 +460,7 @@ def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
 
 def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> float:
     """Residual sum of a path over some columns, with the film and background that follow from it."""
-    pictures = appearance_about_path(strip, path, columns)
+    pictures = ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns)
 
     def residuals_of(first: int, last: int) -> Floats:
         part = slice(first, last)
@@ -512,13 +469,6 @@ def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> f
         )
 
     return float(np.concatenate(in_parts(residuals_of, len(strip.values), FEWEST_PICTURES)).sum())
-
-
-def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:
-    """Average each pixel over the 12 frames (derived) after (film) and before (background) the front passes it. Shapes:
-    path (n_frames,) → (2, n_across, n_columns).
-    """
-    return ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns, 12)
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -640,7 +590,7 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     degrees off and would cut the tube obliquely.
     """
     path, passed = initial_front_path(strip)
-    film, background = appearance_about_path(strip, path, passed)
+    film, background = ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *passed)
     power = (film - background).astype(float) ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
@@ -655,7 +605,9 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     typical = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
     typical |= ~typical.any()  # two widths, equally frequent: neither is typical, so all are used
     place, centre = place[typical], side[typical].mean(axis=1)
-    slope, intercept = _robust_line(place, centre)
+    i, j = np.triu_indices(len(place), 1)  # a line by the median of pairwise slopes (Theil-Sen)
+    slope = float(np.median((centre[j] - centre[i]) / (place[j] - place[i]))) if len(i) else 0.0
+    intercept = float(np.median(centre - slope * place))
     median_width = float(np.median(width))
     width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
     # 25.0, 0.15: contrast, in grey levels, below which the sides of a tube fade into the background (measured)
@@ -686,13 +638,6 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
     return float(row + outwards * excess[row] / (excess[row] - min(excess[row + outwards], 0.0)))
 
 
-def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
-    """Fit a line by the median of pairwise slopes (Theil-Sen); return slope and intercept."""
-    i, j = np.triu_indices(len(x), 1)
-    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i]))) if len(i) else 0.0
-    return slope, float(np.median(y - slope * x))
-
-
 def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
     """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
     # Distance, in standard deviations, at which the difference of a pixel from film or background is clipped
@@ -709,17 +654,12 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
 
     evidence = np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
-    path = ky.dividing_path(evidence * _frame_weights(change, state.edge)[:, None])
+    # Each frame counts by how much it differs from the one before it, 0.05 (chosen) to 1: while the tip rests behind a
+    # closed door that looks like film, a hundred frames carry no more information than one.
+    usual, floor = float(np.median(change[moving_frames(state.edge)])), float(np.quantile(change, 0.05))
+    frame_weights = np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
+    path = ky.dividing_path(evidence * frame_weights[:, None])
     return np.clip(path - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
-
-
-def _frame_weights(change: Floats, edge: Floats) -> NDArray[np.float32]:
-    """Weight each frame by how much it differs from the one before it, 0.05 (chosen) to 1, shape (n_frames,). While the
-    tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
-    """
-    usual = float(np.median(change[moving_frames(edge)]))
-    floor = float(np.quantile(change, 0.05))
-    return np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
 
 
 def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
@@ -768,8 +708,15 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_ERROR_PX) | in_mouth
     extra = np.maximum(extra, leap_error_px(edge_now, hidden))
-    bands, slow_bands = noise_and_slow(bands, visible_error, extra)
-    slow = np.hypot(slow_bands, slow_error_px(edge_now, contrast, shared))
+    # What is added is split into a part that differs from frame to frame and one that neighbours share. Here the parts
+    # of the error near the start, and of an edge that is a guess, since a door or the mouth hides it, that differ from
+    # frame to frame (measured, chosen):
+    start_part, guess_part = 0.4, math.sqrt(0.5)
+    near = np.sqrt(np.maximum(visible_error**2 - bands**2, 0.0))
+    guess = np.sqrt(np.maximum(extra**2 - visible_error**2, 0.0))
+    bands = np.sqrt(bands**2 + (start_part * near) ** 2 + (guess_part * guess) ** 2)
+    slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
+    slow = np.hypot(slow, slow_error_px(edge_now, contrast, shared))
     return Positions(
         edge_px=edge, sigma_px=sigma, unsure=_unsure(fit, sigma, extra, hidden), blur_px=state.blur,
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,

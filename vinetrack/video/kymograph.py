@@ -281,12 +281,12 @@ def _votes(
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def mean_appearance(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int, window: int
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int
 ) -> np.ndarray:
-    """Return the mean brightness of each pixel in the frames after (film) and before (background) the front passes it.
+    """Return the mean brightness of each pixel in the 12 frames after (film) and before (background) the front passes.
     Shapes: strip (n_frames, n_across, n_along); scale, offset, path (n_frames,) → (2, n_across, end − begin).
     """
-    n, rows, _ = strip.shape
+    window, (n, rows, _) = 12, strip.shape  # frames that are averaged (derived)
     front = np.empty(n + 1, np.int64)
     for t in range(n):
         front[t] = min(max(math.ceil(path[t]), begin), end)

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools, Floats
+from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video.axis import Axis
 
@@ -112,7 +112,7 @@ def _noise(values: NDArray[Any], scale: Floats) -> float:
     return max(1.0, float(np.quantile(medians, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))
 
 
-def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: Floats | None = None) -> NDArray[Any]:
+def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | None = None) -> NDArray[Any]:
     """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along). An axis
     along rows or columns of the picture is sliced without interpolation, after moving it by less than half a pixel.
     Given `shift_px`, every frame is interpolated at its own displacement. Shapes: luma (n_frames, height, width);
@@ -191,7 +191,7 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     return unit / gain, -fit[:, 1] * unit / gain, shift, shaken
 
 
-def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> NDArray[np.int_]:
+def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> Indices:
     """Whole pixels (x, y) of the background on both sides of a tube, from its start to its end, shape (n, 2); none
     where there is hardly any.
     """
@@ -208,7 +208,7 @@ def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> NDArray[np.int_]:
     return places[np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1]
 
 
-def _followed(luma: NDArray[Any], places: NDArray[np.int_], picks: NDArray[np.int_]) -> tuple[Floats, Floats, Floats]:
+def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floats, Floats, Floats]:
     """Register every frame again and again, each time from where it was found: fit, shift and its standard error."""
     largest_step_px, converged_px = 1.5, 0.02  # Largest shift of one round, and change that is none (chosen)
     basis, shift = _reference(luma[picks], places, None), np.zeros((len(luma), 2))
@@ -239,7 +239,7 @@ def shifts_agree(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) ->
     return float(np.mean(difference[strongest])) < limit
 
 
-def _reference(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | None) -> Floats:
+def _reference(luma: NDArray[Any], places: Indices, shift_px: Floats | None) -> Floats:
     """Median over some frames of pixels of the background, ones, and minus the slopes along x and y, (4, n_pixels)."""
     beside = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
     middle, left, right, above, below = (
@@ -248,7 +248,7 @@ def _reference(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | 
     return np.stack([middle, np.ones(len(places)), (left - right) / 2, (above - below) / 2])
 
 
-def _pixels(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | None) -> NDArray[Any]:
+def _pixels(luma: NDArray[Any], places: Indices, shift_px: Floats | None) -> NDArray[Any]:
     """Pixels (x, y) of every frame, each moved by its own shift, bicubic; shape (n_frames, n_pixels)."""
     import cv2
 
@@ -264,9 +264,7 @@ def _pixels(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | Non
     return np.stack(moved).reshape(len(luma), -1)[:, : len(places)]
 
 
-def register(
-    luma: NDArray[Any], places: NDArray[np.int_], basis: Floats, shift_px: Floats | None
-) -> tuple[Floats, Floats]:
+def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Floats | None) -> tuple[Floats, Floats]:
     """Register every frame to the static background by robust least squares. The model is frame(x) = gain · picture(x −
     shift) + level, linearised in the shift. A ridge keeps the level near zero, and the shift at zero where the
     background has no texture. Returns gain, level, shift in x and y of every frame, shape (n_frames, 4), and the

@@ -101,11 +101,10 @@ def measure_recording(
         along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
     tracking = in_metres(tracking, trial, m_per_px, position_m)
-    notes = [*tracking.track.notes]
     # Notes on a scale that was merely given belong to the experiment, not to each of its trials.
     if calibration is not None and math.isfinite(calibration.reprojection_px):
-        notes += calibration.notes
-    tracking = replace(tracking, track=replace(tracking.track, notes=tuple(notes)))
+        notes = (*tracking.track.notes, *calibration.notes)
+        tracking = replace(tracking, track=replace(tracking.track, notes=notes))
     return Measurement(tracking, m_per_px, rel_sigma, calibration, capture_fps, recording)
 
 
@@ -188,19 +187,24 @@ class RecordingFacts:
         return math.nan if self.n_frames is None else (self.n_frames - 1) / self.capture_fps
 
 
+def _facts(
+    trial: Trial, recording: Recording, m_per_px: float, scale_rel_sigma: float, capture_fps: float,
+    n_frames: int | None, axis: Axis | None,
+) -> RecordingFacts:  # fmt: skip
+    """Facts of one recording that its header and the sheet state."""
+    return RecordingFacts(
+        trial=trial.name, n_frames=n_frames, capture_fps=capture_fps, playback_fps=recording.playback_fps, axis=axis,
+        mm_per_px=1e3 * m_per_px, scale_rel_sigma=scale_rel_sigma, picture_mm=1e3 * m_per_px * recording.width,
+    )  # fmt: skip
+
+
 def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
     """Facts of a recording that was tracked."""
     tracking = measurement.tracking
     mm_per_px = 1e3 * measurement.m_per_px
-    return RecordingFacts(
-        trial=trial.name,
-        n_frames=len(tracking.track.time_s),
-        capture_fps=measurement.capture_fps,
-        playback_fps=measurement.recording.playback_fps,
-        mm_per_px=mm_per_px,
-        scale_rel_sigma=measurement.scale_rel_sigma,
-        picture_mm=mm_per_px * measurement.recording.width,
-        axis=tracking.axis,
+    stated = measurement.recording, measurement.m_per_px, measurement.scale_rel_sigma, measurement.capture_fps
+    return replace(
+        _facts(trial, *stated, len(tracking.track.time_s), tracking.axis),
         tube_width_mm=mm_per_px * tracking.tube_width_px,
         tube_width_sigma_mm=mm_per_px * tracking.tube_width_sigma_px,
         growth_mm=1e3 * measurement.growth_m,
@@ -291,9 +295,7 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
         (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
         (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
     )
-    return [
-        f"growth runs {way} in the picture ({_named(names)}) and {remark}" for names, way, remark in findings if names
-    ]
+    return [f"growth runs {way} in the picture ({_named(who)}) and {remark}" for who, way, remark in findings if who]
 
 
 def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
@@ -329,31 +331,20 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
 def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
     """Convert the facts of a recording to a JSON mapping; units are in the keys."""
     axis = None if facts.axis is None else axis_entry(facts.axis)
-    return {key: value for key, value in vars(facts).items() if key != "axis"} | {
-        "duration_s": facts.duration_s,
-        "axis": axis,
-    }
+    return vars(facts) | {"duration_s": facts.duration_s, "axis": axis}
 
 
 def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
     """Cells of one recording's row."""
     ends = () if facts.axis is None else (*facts.axis.from_px, *facts.axis.to_px)
     axis = "{},{} → {},{}".format(*(round(end) for end in ends)) if ends else "–"
+    frames, plays = facts.n_frames, facts.playback_fps
     return (
-        facts.trial,
-        "–" if facts.n_frames is None else str(facts.n_frames),
-        f"{facts.capture_fps:g}",
-        "–" if facts.playback_fps is None else f"{facts.playback_fps:.4g}",
-        number(facts.duration_s),
-        number(facts.mm_per_px, 4),
-        number(facts.picture_mm),
-        axis,
-        f"{math.degrees(trial.growth_angle_rad):g}",
-        number(facts.tube_width_mm),
-        number(1e3 * trial.diameter_m),
-        number(facts.growth_mm),
-        number(1e3 * trial.length_m),
-    )
+        facts.trial, "–" if frames is None else str(frames), f"{facts.capture_fps:g}",
+        "–" if plays is None else f"{plays:.4g}", number(facts.duration_s), number(facts.mm_per_px, 4),
+        number(facts.picture_mm), axis, f"{math.degrees(trial.growth_angle_rad):g}", number(facts.tube_width_mm),
+        number(1e3 * trial.diameter_m), number(facts.growth_mm), number(1e3 * trial.length_m),
+    )  # fmt: skip
 
 
 SETTINGS = "experiment.yaml"
@@ -421,16 +412,9 @@ def _stated_facts(
     if not math.isfinite(m_per_px) and scale is not None:
         m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
     count = _frames_present(recording)
-    return RecordingFacts(
-        trial=trial.name,
-        n_frames=recording.declared_frames if count is None else count,
-        capture_fps=capture_rate(trial, recording),
-        playback_fps=recording.playback_fps,
-        mm_per_px=1e3 * m_per_px,
-        scale_rel_sigma=rel_sigma,
-        picture_mm=1e3 * m_per_px * recording.width,
-        axis=given_axis(trial, settings, m_per_px),
-    )
+    count = recording.declared_frames if count is None else count
+    axis = given_axis(trial, settings, m_per_px)
+    return _facts(trial, recording, m_per_px, rel_sigma, capture_rate(trial, recording), count, axis)
 
 
 def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
