@@ -154,7 +154,11 @@ def steady_force(motion: TrialMotion, window: Window, model: Model) -> SteadyFor
     measured_Pa = np.empty(0) if trace_Pa is None else trace_Pa[(time_s >= window.from_s) & (time_s <= window.to_s)]
     measured_Pa = measured_Pa[np.isfinite(measured_Pa)]
     if measured_Pa.size:
-        pressure_Pa, sigma_Pa, source = float(measured_Pa.mean()), _mean_error(measured_Pa), "trace"
+        pressure_Pa, sigma_Pa, source = float(measured_Pa.mean()), 0.0, "trace"
+        if measured_Pa.size >= 4:  # error of the mean from the scatter about the linear trend, which is not an error
+            steps = np.arange(measured_Pa.size)
+            residual = measured_Pa - np.polyval(np.polyfit(steps, measured_Pa, 1), steps)
+            sigma_Pa = float(np.sqrt(np.sum(residual**2) / (measured_Pa.size - 2) / measured_Pa.size))
     else:
         pressure_Pa = float(np.mean(_modelled_pressure(motion, model)[inside]))
         sigma_Pa, source = trial.pressure_sigma_Pa, "set"
@@ -196,15 +200,6 @@ def _modelled_pressure(motion: TrialMotion, model: Model) -> Floats:
     travel_m = np.maximum(kinematics.lead_position_m - release.lead_position_m, 0.0)
     since_s = np.maximum(kinematics.time_s - start_s, 0.0)
     return evaluate(model, motion.trial, since_s, travel_m, np.maximum(kinematics.lead_velocity_m_s, 0.0)).pressure_Pa
-
-
-def _mean_error(measured_Pa: Floats) -> float:
-    """Standard error of the mean of a trace, from the scatter about its linear trend, which is not an error."""
-    if measured_Pa.size < 4:
-        return 0.0
-    steps = np.arange(measured_Pa.size)
-    residual = measured_Pa - np.polyval(np.polyfit(steps, measured_Pa, 1), steps)
-    return float(np.sqrt(np.sum(residual**2) / (measured_Pa.size - 2) / measured_Pa.size))
 
 
 def why_not_in_fit(trial: Trial) -> str:

@@ -72,7 +72,10 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
     weights, covariance, terms = _scaled(*_even_design(width, order), order, rho)
     results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
-    odd = _uneven_windows(time_s, width)
+    # Odd windows contain a spacing different from the median, by more than 1 % (chosen).
+    spacing = np.diff(time_s)
+    uneven = np.concatenate([[0], np.cumsum(np.abs(spacing / np.median(spacing) - 1) > 0.01)])
+    odd = uneven[width - 1 :] > uneven[: uneven.size - width + 1]
     odd_covariance = None
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
@@ -94,15 +97,6 @@ def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
     slope[1:] = k[1:] * value[:-1]
     curve[2:] = k[2:] * (k[2:] - 1) * value[:-2]
     return value, slope, curve
-
-
-def _uneven_windows(time_s: Floats, width: int) -> Bools:
-    """Mask of windows that contain a spacing different from the median, shape (n − width + 1,)."""
-    spacing = np.diff(time_s)
-    # 0.01: spacings within this fraction of their median count as even (chosen)
-    is_uneven = np.abs(spacing / np.median(spacing) - 1) > 0.01
-    count = np.concatenate([[0], np.cumsum(is_uneven)])
-    return count[width - 1 :] > count[: count.size - width + 1]
 
 
 def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:

@@ -69,7 +69,12 @@ def _correct_timing(track: Track) -> Track:
     # Spacings must be whole numbers of frames to within 5 %.
     if np.any(np.abs(frames - np.rint(frames)) > 0.05 * np.maximum(np.rint(frames), 1.0)):
         return track
-    out = _flag_visible_gaps(track, np.rint(frames).astype(int))
+    out = track
+    # `gap` on the first row after each spacing of two frames or more that nothing has marked yet
+    for before in np.flatnonzero((np.rint(frames) > 1) & ~with_flag(track.flag[1:], "gap")):
+        missing = frames_are(int(np.rint(frames[before])) - 1)
+        note = f"{missing} missing before {track.time_s[before + 1]:.5g} s, as the times say"
+        out = _mark(out, int(before) + 1, "gap", note)
     noise_m, rho = _noise(out)
     out = _retime_known_copies(out, step_s, noise_m, rho)
     checked_to = 0
@@ -130,16 +135,6 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: floa
     return track
 
 
-def _flag_visible_gaps(track: Track, frames: Indices) -> Track:
-    """Flag `gap` on the first row after each spacing of two frames or more that nothing has marked yet."""
-    out = track
-    for before in np.flatnonzero((frames > 1) & ~with_flag(track.flag[1:], "gap")):
-        missing = int(frames[before]) - 1
-        note = f"{frames_are(missing)} missing before {track.time_s[before + 1]:.5g} s, as the times say"
-        out = _mark(out, int(before) + 1, "gap", note)
-    return out
-
-
 def frames_are(frames: int) -> str:
     """A number of frames as the beginning of a sentence, with its verb."""
     return "1 frame is" if frames == 1 else f"{frames} frames are"
@@ -147,6 +142,8 @@ def frames_are(frames: int) -> str:
 
 def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> _Fault | None:
     """The first fault on a row beyond `after`."""
+    import pandas as pd
+
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
         return None
@@ -155,7 +152,15 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     speed = np.diff(y) / np.diff(frame)
     stated = track.lead_position_sigma_m[rows]
     noise_m = noise_m[rows]
-    for i in _suspect_steps(speed, np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))):
+    # Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening. A
+    # point with a large stated error, such as one that a door half hides, makes no step conclusive about frames.
+    # The neighbours are medians of the three steps before and the three after, NaN where there are none.
+    earlier, later = (
+        pd.Series(one_way).shift(1).rolling(3, min_periods=1).median().to_numpy() for one_way in (speed, speed[::-1])
+    )
+    smaller, larger = np.fmin(np.abs(earlier), np.abs(later[::-1])), np.fmax(earlier, later[::-1])
+    clear = larger > CLEAR_STEP_SIGMAS * np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))
+    for i in np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * larger))):
         if rows[i + 1] <= after:
             continue
         around = frame, y, i, noise_m[i], rho, rows
@@ -163,23 +168,6 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
         if fault is not None:
             return fault
     return None
-
-
-def _suspect_steps(speed: Floats, noise_m: Floats) -> Indices:
-    """Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening.
-    A point with a large stated error, such as one that a door half hides, makes no step that is conclusive about
-    frames.
-    """
-    import pandas as pd
-
-    # Medians of the three steps before and the three after each step, NaN where there are none.
-    before, after = (
-        pd.Series(one_way).shift(1).rolling(3, min_periods=1).median().to_numpy() for one_way in (speed, speed[::-1])
-    )
-    after = after[::-1]
-    smaller = np.fmin(np.abs(before), np.abs(after))
-    clear = np.fmax(before, after) > CLEAR_STEP_SIGMAS * noise_m
-    return np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * np.fmax(before, after))))
 
 
 def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
@@ -255,8 +243,12 @@ def _outlier_explains(sides: _Sides, noise_m: float) -> bool:
     t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
     t = t - (t_left[-1] + t_right[0]) / 2
     smooth = np.column_stack([np.ones(t.size), t, t**2])
-    with_jump = _residual_squares(np.column_stack([smooth, t > 0]), y)
-    with_outlier = min(_residual_squares(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
+
+    def squares(basis: Floats, y: Floats) -> float:
+        return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
+
+    with_jump = squares(np.column_stack([smooth, t > 0]), y)
+    with_outlier = min(squares(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
     # A single outlier must leave this many times the sum of squares that a jump leaves.
     return with_outlier < max(3.0 * with_jump, with_jump + (4.0 * noise_m) ** 2)
 
@@ -276,11 +268,6 @@ def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) 
     fit = np.linalg.pinv(basis) @ points
     misfit_m = math.sqrt(float(np.sum((points - basis @ fit) ** 2)) / (t.size - 5))
     return float(fit[4]) if misfit_m < 2.5 * noise_m else sign * math.inf
-
-
-def _residual_squares(basis: Floats, y: Floats) -> float:
-    """Sum of squares that least squares leave."""
-    return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
 
 
 def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> _Jump | None:
