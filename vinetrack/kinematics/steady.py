@@ -430,43 +430,36 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
     if time_s.size < min_points + 2:
         return Window("paper", False, f"{time_s.size} points are too few for {min_points} central differences")
     velocity = (position_m[2:] - position_m[:-2]) / (time_s[2:] - time_s[:-2])
-    run = _longest_run(velocity, cv_limit, min_points)
-    if run is None:
-        return Window("paper", False, f"no {min_points} consecutive velocities vary by less than {cv_limit:.0%}")
-    start, stop = run
-    chosen = velocity[start : stop + 1] * travel_ratio
-    mean, sd = float(chosen.mean()), float(chosen.std(ddof=1))
-    drift = float(np.polyfit(np.linspace(-0.5, 0.5, chosen.size), chosen, 1)[0]) / mean
-    cv = sd / abs(mean)
-    return Window(
-        rule="paper",
-        accepted=True,
-        reason=f"longest run with a coefficient of variation below {cv_limit:.0%}: {chosen.size} velocities, {cv:.2%}",
-        from_s=float(time_s[start + 1]),
-        to_s=float(time_s[stop + 1]),
-        n_points=chosen.size,
-        x_ss_m_s=mean,
-        x_ss_sigma_m_s=sd / math.sqrt(chosen.size),
-        drift=drift,
-        cv=cv,
-    )
-
-
-def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[int, int] | None:
-    """First and last index of the longest run with coefficient of variation below the limit; the lowest of ties."""
     level = float(np.median(velocity))
     zero = 1e-9 * float(np.max(np.abs(velocity)))  # a mean below this is a rounding error of 0
     total = np.concatenate([[0.0], np.cumsum(velocity - level)])
     square = np.concatenate([[0.0], np.cumsum((velocity - level) ** 2)])
-    for length in range(velocity.size, min_points - 1, -1):
+    for length in range(velocity.size, min_points - 1, -1):  # the longest; of several the one that varies least
         sums = total[length:] - total[:-length]
         spread = np.maximum(square[length:] - square[:-length] - sums**2 / length, 0.0) / (length - 1)
         mean = sums / length + level
         good = np.flatnonzero((spread < (cv_limit * mean) ** 2) & (np.abs(mean) > zero))
         if good.size:
             start = int(good[np.argmin(spread[good] / mean[good] ** 2)])
-            return start, start + length - 1
-    return None
+            break
+    else:
+        return Window("paper", False, f"no {min_points} consecutive velocities vary by less than {cv_limit:.0%}")
+    chosen = velocity[start : start + length] * travel_ratio
+    x_ss, sd = float(chosen.mean()), float(chosen.std(ddof=1))
+    drift = float(np.polyfit(np.linspace(-0.5, 0.5, chosen.size), chosen, 1)[0]) / x_ss
+    cv = sd / abs(x_ss)
+    return Window(
+        rule="paper",
+        accepted=True,
+        reason=f"longest run with a coefficient of variation below {cv_limit:.0%}: {chosen.size} velocities, {cv:.2%}",
+        from_s=float(time_s[start + 1]),
+        to_s=float(time_s[start + length]),
+        n_points=chosen.size,
+        x_ss_m_s=x_ss,
+        x_ss_sigma_m_s=sd / math.sqrt(chosen.size),
+        drift=drift,
+        cv=cv,
+    )
 
 
 # ------------------------------------------------------------------------------

@@ -228,9 +228,27 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         sides = (frame[left][-points:], y[left][-points:]), (frame[right][:points], y[right][:points])
         if min(t.size for t, _ in sides) < SIDE_POINTS[-1]:
             return None
-        jump = _parabola_with_step(sides, noise_m, rho)
-        if jump is not None:
-            return jump
+        (t_left, y_left), (t_right, y_right) = sides
+        near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
+        near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
+        slower, faster = min(near_left, near_right), max(near_left, near_right)
+        # Both sides must move by three quarters of a clear step, and a larger ratio of speeds may be acceleration.
+        if slower < 0.75 * CLEAR_STEP_SIGMAS * noise_m or slower <= 0 or faster > 1.8 * slower:
+            continue
+        t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
+        t = t - (t_left[-1] + t_right[0]) / 2
+        basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
+        weights = np.linalg.pinv(basis)
+        fit = weights @ y
+        misfit_m = math.sqrt(float(np.sum((y - basis @ fit) ** 2)) / (t.size - 4))
+        step = float(fit[1])
+        # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
+        if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
+            continue
+        lag = np.abs(np.subtract.outer(t, t))
+        correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
+        sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
+        return _Jump(float(fit[3]), sigma, step, sides)
     return None
 
 
@@ -268,33 +286,6 @@ def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) 
     fit = np.linalg.pinv(basis) @ points
     misfit_m = math.sqrt(float(np.sum((points - basis @ fit) ** 2)) / (t.size - 5))
     return float(fit[4]) if misfit_m < 2.5 * noise_m else sign * math.inf
-
-
-def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> _Jump | None:
-    """Fit a parabola with a step, if both sides follow it at a clear and similar speed."""
-    (t_left, y_left), (t_right, y_right) = sides
-    near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
-    near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
-    # Both sides must move by three quarters of a clear step.
-    if min(near_left, near_right) < 0.75 * CLEAR_STEP_SIGMAS * noise_m or min(near_left, near_right) <= 0:
-        return None
-    # A larger ratio of the speeds before and after may be acceleration.
-    if max(near_left, near_right) > 1.8 * min(near_left, near_right):
-        return None
-    t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
-    t = t - (t_left[-1] + t_right[0]) / 2
-    basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
-    weights = np.linalg.pinv(basis)
-    fit = weights @ y
-    misfit_m = math.sqrt(float(np.sum((y - basis @ fit) ** 2)) / (t.size - 4))
-    step = float(fit[1])
-    # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
-    if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
-        return None
-    lag = np.abs(np.subtract.outer(t, t))
-    correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
-    sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
-    return _Jump(float(fit[3]), sigma, step, sides)
 
 
 def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:

@@ -213,7 +213,13 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     unit = _text(panel, "length_unit").strip()
     if not unit:
         notes.append("The project names no unit of length; metres are assumed.")
-    world_m = _to_world(frames, pixels, _axes(panel)) * _factor(unit or "m", "m")
+    axes = _axes(panel)
+    which = np.clip(np.searchsorted(sorted(axes), frames, side="right") - 1, 0, None)
+    valid = np.array([axes[start] for start in sorted(axes)])[which]
+    angle = np.array([math.radians(degrees) for degrees in valid[:, 2]])
+    right, up = ((pixels - valid[:, :2]) / valid[:, 3:]).T * np.array([[1.0], [-1.0]])
+    world = [np.cos(angle) * right + np.sin(angle) * up, np.cos(angle) * up - np.sin(angle) * right]
+    world_m = np.column_stack(world) * _factor(unit or "m", "m")
     position_m, note = _project_on_axis(world_m)
     edge_px, _ = _project_on_axis(pixels)
     missing = int(frames[-1] - frames[0]) + 1 - len(frames)
@@ -286,16 +292,6 @@ def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
     if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in values.values()):
         raise TrackError("was never calibrated (1 pixel is 1 m)", "set a calibration stick or tape in Tracker")
     return values
-
-
-def _to_world(frames: np.ndarray, pixels: Floats, axes: dict[int, tuple[float, ...]]) -> Floats:
-    """World coordinates, in units of length, of points in px; shape (n, 2)."""
-    starts = sorted(axes)
-    which = np.clip(np.searchsorted(starts, frames, side="right") - 1, 0, None)
-    valid = np.array([axes[start] for start in starts])[which]
-    angle = np.array([math.radians(degrees) for degrees in valid[:, 2]])
-    right, up = ((pixels - valid[:, :2]) / valid[:, 3:]).T * np.array([[1.0], [-1.0]])
-    return np.column_stack([np.cos(angle) * right + np.sin(angle) * up, np.cos(angle) * up - np.sin(angle) * right])
 
 
 def _clock(panel: Element) -> tuple[float, float, int]:

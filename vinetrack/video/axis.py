@@ -95,7 +95,16 @@ def find_axis(small: SmallPictures, grows: bool = True) -> Axis:
         best = _line_of_beginning(small, best, grows)
     if best.collected <= 0:
         raise RecordingError("nothing moves in the picture")
-    return _to_picture(best, small.factor, small.shape)
+    # In full pixels, with a margin behind the line, and extended ahead to the border of the picture
+    along, factor, (height, width) = np.array([np.cos(best.angle), np.sin(best.angle)]), small.factor, small.shape
+    centre = (best.middle + 0.5) * factor - 0.5
+    low, high = (best.ends[0] - (6.0 * best.half + 12.0)) * factor, np.inf
+    for origin, unit, size in ((centre[0], along[0], width), (centre[1], along[1], height)):
+        if abs(unit) > 1e-6:
+            a, b = sorted([(0.0 - origin) / unit, (size - 1.0 - origin) / unit])
+            low, high = max(low, a), min(high, b)
+    first, last = centre + low * along, centre + high * along
+    return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * best.half * factor)
 
 
 def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line:
@@ -300,22 +309,6 @@ def _refine_once(
     ends = float(np.quantile(along, 0.002)), float(np.quantile(along, 0.998))
     direction = float(np.arctan2(principal[1], principal[0]))
     return direction, centre + shift * side, half, ends, float(on_front_weight.sum())
-
-
-def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
-    """Convert a line to full pixels, with a margin behind it, and extended ahead to the border of the picture."""
-    along, (height, width) = np.array([np.cos(line.angle), np.sin(line.angle)]), shape
-    margin = 6.0 * line.half + 12.0
-    centre = (line.middle + 0.5) * factor - 0.5
-    start, stop = (line.ends[0] - margin) * factor, np.inf
-    low, high = -np.inf, np.inf
-    for origin, unit, size in ((centre[0], along[0], width), (centre[1], along[1], height)):
-        if abs(unit) > 1e-6:
-            a, b = sorted([(0.0 - origin) / unit, (size - 1.0 - origin) / unit])
-            low, high = max(low, a), min(high, b)
-    start, stop = max(start, low), min(stop, high)
-    first, last = centre + start * along, centre + stop * along
-    return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * line.half * factor)
 
 
 # ------------------------------------------------------------------------------

@@ -258,30 +258,23 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     grey = eight_bits(picture)
     seen = [(*_detect_markers(grey, _dictionary(_largest(family))), family) for family in OTHER_DICTIONARIES]
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
-    # 6: fewest markers that distinguish a board from chance (chosen)
-    board = _charuco(corners, ids, family) if len(ids) >= 6 else None
-    if board is not None:
-        return board
-    squares = checkerboard_squares(grey)
-    return None if squares is None else BoardSeen("checkerboard", squares)
-
-
-def _charuco(corners: Any, ids: NDArray[np.int32], family: str) -> BoardSeen | None:
-    """The layout on which most markers lie in place; None where no layout has enough of them."""
-    best_share, best_board, n_markers = 0.0, None, int(ids.max()) + 1
+    best_share, best_board, n_markers = 0.0, None, int(ids.max(initial=0)) + 1
     # Squares across and down, at most 40, of the boards with this many markers, of which two may be hidden (chosen)
-    for across, down in itertools.product(range(2, 41), repeat=2):
-        squares = across, down
-        if not n_markers <= across * down // 2 <= n_markers + 2:
+    for squares in itertools.product(range(2, 41), repeat=2):
+        count = squares[0] * squares[1] // 2
+        # 6: fewest markers that distinguish a board from chance (chosen)
+        if len(ids) < 6 or not n_markers <= count <= n_markers + 2:
             continue
         # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
         board = Charuco(kind="charuco", image="", squares=squares, square_mm=1.0, marker_mm=0.7, dictionary=family)
         share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
-            dictionary = _smallest(family, across * down // 2)
-            best_share, best_board = share, BoardSeen("charuco", squares, dictionary, marker)
+            best_share, best_board = share, BoardSeen("charuco", squares, _smallest(family, count), marker)
     # 0.8: least share of the markers that must lie where a board has them (chosen)
-    return best_board if best_share >= 0.8 else None
+    if best_share >= 0.8:
+        return best_board
+    squares = checkerboard_squares(grey)
+    return None if squares is None else BoardSeen("checkerboard", squares)
 
 
 def _largest(family: str) -> str:

@@ -209,7 +209,16 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
     """
     # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
-    offsets = _local_lines(sides.places_px, sides.middles_px, knots)
+    # Middle of the tube at the knots, by Gaussian-weighted local lines; level beyond the outermost stretches
+    places, middles, offsets = sides.places_px, sides.middles_px, np.empty(len(knots))
+    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
+    for k, place in enumerate(np.clip(knots, places[0], places[-1])):
+        # 1.0: standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
+        away = (places - place) / (1.0 * spacing)
+        weight = np.exp(-0.5 * away**2)
+        design = np.column_stack([np.ones(len(places)), away])
+        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
+        offsets[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
     through = axis.points(knots, offsets)
     separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
     try:
@@ -219,21 +228,6 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
     if not isinstance(curve, CurvedAxis) or sides.half_px > curve.largest_half_px:
         return axis, 0.0
     return curve, float(np.abs(offsets).max())
-
-
-def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
-    """Middle of the tube at places along it, by Gaussian-weighted local lines; level beyond the outermost stretches."""
-    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
-    queries = np.clip(queries, places[0], places[-1])
-    out = np.empty(len(queries))
-    for k, place in enumerate(queries):
-        # 1.0: standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
-        offset = (places - place) / (1.0 * spacing)
-        weight = np.exp(-0.5 * offset**2)
-        design = np.column_stack([np.ones(len(places)), offset])
-        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
-        out[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
-    return out
 
 
 # ------------------------------------------------------------------------------

@@ -196,9 +196,16 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: Bools)
     not an error.
     """
     neighbours = 2  # Frames on each side over which the median disagreement is taken (chosen)
-    edges, sigmas = band_fits(strip, state, edge)
-    if edges.shape[1] < 2:
+    # The bands share the rows that are informative about the edge evenly, each of four rows or more (chosen).
+    contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)
+    contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
+    cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
+    limits = pairwise([0, *cuts.tolist(), strip.values.shape[1]])
+    placed = replace(state, edge=edge)
+    fits = [fit_edges(strip, placed, rows=(low, high)) for low, high in limits if high - low >= 4]
+    if len(fits) < 2:
         return np.zeros(len(edge)), 0.0
+    edges, sigmas = (np.stack([fit[:, k] for fit in fits], axis=1) for k in (0, 1))
     lead_px = np.nan_to_num(edges - edge[:, None])
     slow = shared_disagreement(lead_px[core])
     # 7, 50.0: fewest core frames nearby over which a median lead is taken, and the growth over which it is, px (chosen)
@@ -241,27 +248,6 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
     within = np.maximum(exposure_frames / 2 - np.abs(from_middle), 0.0)
     behind = speed * within**2 / (2 * exposure_frames)
     return np.asarray(np.hypot(behind, BLUR_SIGMA_PART * exposure_frames / 4 * np.abs(steps[2:-1] - steps[1:-2])))
-
-
-def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Floats]:
-    """Fit the edge of each band of rows alone; NaN where a band shows none. The bands share the rows that are
-    informative about the edge evenly. Returns edge and its standard error, each of shape (n_frames, n_bands), px.
-    Shapes: edge (n_frames,).
-    """
-    rows = strip.values.shape[1]
-    contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)
-    contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
-    cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
-    limits = np.concatenate([[0], cuts, [rows]])
-    edges, sigmas = [], []
-    for low, high in pairwise(limits):
-        # 4: fewest rows of a band (chosen)
-        if high - low < 4:
-            continue
-        fit = fit_edges(strip, replace(state, edge=edge), rows=(int(low), int(high)))
-        edges.append(fit[:, 0])
-        sigmas.append(fit[:, 1])
-    return np.stack(edges, axis=1), np.stack(sigmas, axis=1)
 
 
 # ------------------------------------------------------------------------------
@@ -488,26 +474,22 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[i
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
-    return _run_up(np.clip(path, *passed)), passed
-
-
-def _run_up(path: Floats) -> Floats:
-    """Replace the beginning of a path by steps that decrease going back in time, as from rest. An object such as a door
-    may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
-    columns in between turn out to be film from the start, and the second path corrects this.
-    """
+    # A run-up: the beginning is replaced by steps that decrease going back in time, as from rest. An object such as a
+    # door may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
+    # columns in between turn out to be film from the start, and the second path corrects this.
+    path = np.clip(path, *passed)
     steps = np.diff(path)
     onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0
     later = path[onset + 1 :]
     if onset < 2 or len(later) < 5:
-        return path
+        return path, passed
     # 0.1, 0.2: minimum decrease from step to step of the run-up, going back in time (chosen)
     fall = max(float(np.median(np.diff(later[:5], 2))), 0.1 * float(later[1] - later[0]), 0.2)
-    out, step = path.copy(), float(np.median(np.diff(later[:4])))
+    step = float(np.median(np.diff(later[:4])))
     for t in range(onset, -1, -1):
         step = max(step - fall, 0.0)
-        out[t] = max(out[t + 1] - step, 0.0)
-    return out
+        path[t] = max(path[t + 1] - step, 0.0)
+    return path, passed
 
 
 START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
@@ -551,20 +533,6 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
         return finished
     blur_exposure, speed = seen_exposure(strip, state, fit, exposure)
     return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
-
-
-def _unsure(fit: Floats, sigma_px: Floats, extra_px: Floats, hidden: Bools) -> Bools:
-    """Frames in which the fit is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain. Shapes: fit
-    (n_frames, 6), all others (n_frames,).
-    """
-    # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
-    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
-    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
-    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
-    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
-    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
-    uncertain = (extra_px > 1.0) | (sigma_px > np.maximum(1.0, 5.0 * np.nanmedian(sigma_px)))
-    return np.asarray(odd | uncertain | hidden)
 
 
 @dataclass(frozen=True)
@@ -708,6 +676,14 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_ERROR_PX) | in_mouth
     extra = np.maximum(extra, leap_error_px(edge_now, hidden))
+    # Unsure is a poor fit: odd contrast, large misfit, disagreeing bands, hidden, uncertain.
+    # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
+    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
+    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
+    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
+    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
+    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
+    uncertain = (extra > 1.0) | (sigma > np.maximum(1.0, 5.0 * np.nanmedian(sigma)))
     # What is added is split into a part that differs from frame to frame and one that neighbours share. Here the parts
     # of the error near the start, and of an edge that is a guess, since a door or the mouth hides it, that differ from
     # frame to frame (measured, chosen):
@@ -718,7 +694,7 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
     slow = np.hypot(slow, slow_error_px(edge_now, contrast, shared))
     return Positions(
-        edge_px=edge, sigma_px=sigma, unsure=_unsure(fit, sigma, extra, hidden), blur_px=state.blur,
+        edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden), blur_px=state.blur,
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
         bands_sigma_px=bands,
     )  # fmt: skip

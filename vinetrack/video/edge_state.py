@@ -97,25 +97,18 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
     appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
-    film_all_along = _film_at_start(state, appearance)
+    # Columns near the start whose background looks like their film were film all along. If the initial edge is placed
+    # too far back, film serves as its own background; without contrast nothing corrects it.
+    contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
+    columns, clear = np.arange(len(contrast)), clear_of_start(state.edge)
+    near = (columns > state.edge[0] - 5) & (columns < clear)
+    later = (columns >= clear) & (columns < state.edge.max() - 5)
+    # 0.4: part of the typical contrast below which film and background are the same material (chosen)
+    film_all_along = near & (contrast < 0.4 * float(np.median(contrast[later]))) if later.sum() >= 10 else near & False
     if film_all_along.any():
         sums[1, :, :, film_all_along] = 0.0
         appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     return replace(state, appearance=appearance)
-
-
-def _film_at_start(state: EdgeState, appearance: NDArray[np.float32]) -> Bools:
-    """Mark columns near the start whose background looks like their film: they were film all along. Shape (n_along,).
-    If the initial edge is placed too far back, film serves as its own background; without contrast nothing corrects it.
-    """
-    contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
-    columns = np.arange(len(contrast))
-    near = (columns > state.edge[0] - 5) & (columns < clear_of_start(state.edge))
-    later = (columns >= clear_of_start(state.edge)) & (columns < state.edge.max() - 5)
-    if later.sum() < 10:
-        return np.zeros(len(contrast), dtype=bool)
-    # 0.4: part of the typical contrast below which film and background are the same material (chosen)
-    return near & (contrast < 0.4 * float(np.median(contrast[later])))
 
 
 def _passage_frames(state: EdgeState, columns: int) -> tuple[Floats, Floats]:

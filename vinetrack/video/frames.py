@@ -530,18 +530,14 @@ def _inspect_container(path: Path) -> Recording:
             return Recording(path, "container", first.width, first.height, depth, declared, playback_fps=playback)
     except (av.error.FFmpegError, UnicodeDecodeError) as error:
         # PyAV decodes names in a header as UTF-8, which fails for a damaged one.
-        raise RecordingError(*_why_unreadable(path, messages, str(error)), path.name) from error
-
-
-def _why_unreadable(path: Path, messages: list[str], error: str) -> tuple[str, str]:
-    """What is wrong with a file that cannot be opened, and what to do."""
-    if "moov atom not found" in " ".join([*messages, error]):
-        with path.open("rb") as stream:
-            if stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}:
-                return "cut short: the index that is written last is missing", "copy the file again, or repair it"
-    if path.suffix.lower() not in CONTAINERS:
-        return "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
-    return "not a video, or its beginning is damaged", "copy it from the camera again"
+        why = "not a video, or its beginning is damaged", "copy it from the camera again"
+        if path.suffix.lower() not in CONTAINERS:
+            why = "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
+        with path.open("rb") as begin:
+            is_film = begin.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
+        if is_film and "moov atom not found" in " ".join([*messages, str(error)]):
+            why = "cut short: the index that is written last is missing", "copy the file again, or repair it"
+        raise RecordingError(*why, path.name) from error
 
 
 def _assemble(recording: Recording, decoded: Decoded, index: PacketIndex | None) -> Frames:

@@ -80,7 +80,15 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
     else:
         scale, offset, shift, stabilised = before.scale, before.offset, before.shift_px, before.stabilised
     values = sample(luma, axis, np.arange(-half, half + 1), shift if stabilised else None)
-    return Strip(values, scale, offset, shift, _noise(values, scale), axis, stabilised)
+    # Noise of a pixel from differences of neighbouring frames, grey levels. Medians over pixels, since motion affects
+    # few of them; at least 1, since compression freezes a picture at rest, while moving pixels are never known better.
+    step = max(1, len(values) // 40)
+    first, second = values[:-1:step, ::4, ::4], values[1::step, ::4, ::4]
+    n = min(len(first), len(second))
+    change = np.abs(second[:n].astype(np.float32) - first[:n].astype(np.float32))
+    medians = np.median(change, axis=(1, 2)) if n else np.zeros(1)
+    noise = max(1.0, float(np.quantile(medians, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))
+    return Strip(values, scale, offset, shift, noise, axis, stabilised)
 
 
 def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
@@ -90,26 +98,12 @@ def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
     if axis.bends:
         return axis
     (x0, y0), (x1, y1) = axis.from_px, axis.to_px
+    x, y = round((x0 + x1) / 2), round((y0 + y1) / 2)
     if abs(y1 - y0) <= tolerance_px and abs(x1 - x0) > 10:
-        y = round((y0 + y1) / 2)
         return Axis((round(x0), y), (round(x1), y), axis.width_px)
     if abs(x1 - x0) <= tolerance_px and abs(y1 - y0) > 10:
-        x = round((x0 + x1) / 2)
         return Axis((x, round(y0)), (x, round(y1)), axis.width_px)
     return axis
-
-
-def _noise(values: NDArray[Any], scale: Floats) -> float:
-    """Estimate the standard deviation of a pixel from differences of neighbouring frames, grey levels, at least 1.
-    Medians over pixels are used, since motion affects few of them. The minimum is needed because compression freezes a
-    picture at rest, while moving pixels are never known better than to a grey level.
-    """
-    step = max(1, len(values) // 40)
-    first, second = values[:-1:step, ::4, ::4], values[1::step, ::4, ::4]
-    n = min(len(first), len(second))
-    change = np.abs(second[:n].astype(np.float32) - first[:n].astype(np.float32))
-    medians = np.median(change, axis=(1, 2)) if n else np.zeros(1)
-    return max(1.0, float(np.quantile(medians, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))
 
 
 def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | None = None) -> NDArray[Any]:

@@ -60,12 +60,6 @@ class Measurement:
     capture_fps: float
     recording: Recording
 
-    @property
-    def growth_m(self) -> float:
-        """Distance from the first usable position to the furthest, m."""
-        position_m = self.tracking.track.lead_position_m[self.tracking.track.usable]
-        return float(np.max(position_m) - position_m[0]) if position_m.size else math.nan
-
 
 Keep = Callable[[tuple[object, ...], Callable[[], Tracking]], Tracking]
 
@@ -200,14 +194,14 @@ def _facts(
 
 def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
     """Facts of a recording that was tracked."""
-    tracking = measurement.tracking
-    mm_per_px = 1e3 * measurement.m_per_px
+    tracking, mm_per_px = measurement.tracking, 1e3 * measurement.m_per_px
+    position_m = tracking.track.lead_position_m[tracking.track.usable]
     stated = measurement.recording, measurement.m_per_px, measurement.scale_rel_sigma, measurement.capture_fps
     return replace(
         _facts(trial, *stated, len(tracking.track.time_s), tracking.axis),
         tube_width_mm=mm_per_px * tracking.tube_width_px,
         tube_width_sigma_mm=mm_per_px * tracking.tube_width_sigma_px,
-        growth_mm=1e3 * measurement.growth_m,
+        growth_mm=1e3 * float(np.max(position_m) - position_m[0]) if position_m.size else math.nan,
         mean_speed_m_s=mean_speed(tracking.track),
     )
 
@@ -482,8 +476,17 @@ def _scale_problems(
         lacking = "no recording has a scale" if none else f"{len(unscaled)} recordings have no scale"
         remedy = "give it here, or mm_per_px in the sheet"
         problems.append(Problem(f"is missing: {lacking}", file=SETTINGS, column="calibration", remedy=remedy))
-    elif unscaled:
-        problems += _calibration_problems(settings, folder, sizes, calibrations)
+    image = getattr(settings.calibration, "image", None)
+    if unscaled and settings.calibration is not None and (image is None or (folder / image).exists()):
+        place: dict[str, Any] = {"file": SETTINGS, "column": "calibration" if image is None else "calibration.image"}
+        notes: dict[str, None] = {}
+        try:
+            for size in sizes:
+                calibrations[size] = calibrate(settings.calibration, folder, *size)
+                notes |= dict.fromkeys(calibrations[size].notes if image is not None else ())
+            problems += [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
+        except CalibrationError as error:  # only the first is reported
+            problems.append(Problem(message=f"cannot be used: {error.what}", remedy=error.remedy, **place))
     of_all: list[Problem] = []  # of the axis that all share, in the first picture that it does not fit
     for trial, recording in opened.items():
         if trial.axis is not None:
@@ -511,23 +514,3 @@ def _axis_problems(
     width_m = trial.diameter_m if width_mm is None or math.isnan(width_mm) else width_mm / 1e3
     complaint = curve_problem(axis_through(through), width_m / m_per_px / 2, (recording.width, recording.height))
     return [] if complaint is None else [Problem(message=complaint[0], column="axis", remedy=complaint[1], **place)]
-
-
-def _calibration_problems(
-    settings: ExperimentSettings, folder: Path, sizes: list[tuple[int, int]], calibrations: Calibrations
-) -> list[Problem]:
-    """Read the calibration for each picture size into `calibrations`; only the first problem is reported."""
-    image = getattr(settings.calibration, "image", None)
-    if settings.calibration is None or (image is not None and not (folder / image).exists()):
-        return []
-    place: dict[str, Any] = {"file": SETTINGS, "column": "calibration" if image is None else "calibration.image"}
-    notes: dict[str, None] = {}
-    for width_px, height_px in sizes:
-        try:
-            calibration = calibrate(settings.calibration, folder, width_px, height_px)
-            calibrations[width_px, height_px] = calibration
-        except CalibrationError as error:
-            return [Problem(message=f"cannot be used: {error.what}", remedy=error.remedy, **place)]
-        if image is not None:
-            notes |= dict.fromkeys(calibration.notes)
-    return [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]

@@ -255,7 +255,12 @@ def track_pixels(
         repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
     )  # fmt: skip
     if quality.last_moving < 0:
-        raise RecordingError(f"{_why_motionless(total_px, quality)}", name=name)
+        lost = ~(total_px < LOST_SIGMA_PX) | ~(np.hypot(total_px, quality.departure_px) < LOST_SIGMA_PX)
+        # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
+        if np.mean(lost) > 0.5:
+            what = "something moves, but its edge is too vague to be followed"
+            raise RecordingError(what, "film it nearer, with more light or contrast, or at more frames a second", name)
+        raise RecordingError("nothing moves along the axis", "check the recording, or give the axis", name)
     # Random, with the disagreement of bands and the distance of outliers; and shared by neighbouring frames: of edge,
     # stabilisation and path.
     random_px = np.hypot(np.maximum(random_px, followed.bands_sigma_px), quality.departure_px)
@@ -318,18 +323,6 @@ def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Float
     random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
     return random_px, np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
-
-
-def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
-    """The message for a recording in which no frame is moving."""
-    lost = ~(total_px < LOST_SIGMA_PX) | ~(np.hypot(total_px, quality.departure_px) < LOST_SIGMA_PX)
-    # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
-    if np.mean(lost) > 0.5:
-        return (
-            "something moves, but its edge is too vague to be followed: film it nearer, with more light or"
-            " contrast, or at more frames a second"
-        )
-    return "nothing moves along the axis; check the recording, or give the axis"
 
 
 def _notes(
