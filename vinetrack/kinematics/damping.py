@@ -255,9 +255,9 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
         return np.zeros_like(data.log_force), np.ones_like(data.log_force)
     from scipy.optimize import brentq
 
-    def scatter_of(squares: Floats, stated: Floats) -> float:
+    def scatter_of(residual: Floats, stated: Floats) -> float:
         """Variance s with Σ residual²/(stated + s) = dof, or nearly 0 where the stated variances suffice."""
-        ends = (1e-12, float(squares.sum()) / max(dof, 1) + 1e-12)
+        squares, ends = residual**2, (1e-12, float(residual @ residual) / max(dof, 1) + 1e-12)
         low, high = (float(np.sum(squares / (stated + s))) - max(dof, 1) for s in ends)
         if not low > 0 > high:
             return ends[0]
@@ -274,7 +274,7 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
         residual = data.log_force - log_B[0][data.vine] - n[0] * data.log_speed
         # The scatter of ln F, beyond the stated errors, for which χ² equals its degrees of freedom.
         stated = force_variance + n[0] ** 2 * data.speed_error**2 + data.set_error**2
-        before, scatter = scatter, scatter_of(residual**2, stated)
+        before, scatter = scatter, scatter_of(residual, stated)
         if abs(scatter - before) <= 1e-6 * (scatter + 1e-12):
             break
     return speed_variance, np.maximum(force_variance, 1e-14)

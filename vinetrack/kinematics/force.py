@@ -209,12 +209,3 @@ def why_not_in_fit(trial: Trial) -> str:
     if trial.payload_kg > 0:
         return f"carries a payload of {trial.payload_kg * 1e3:g} g"
     return ""
-
-
-def why_not_force(force: SteadyForce | None) -> str:
-    """Return why a force cannot enter the damping fit; blank if it can."""
-    if force is None:
-        return "no steady window"
-    if not force.force_N > 0:
-        return f"the force in the window is {force.force_N:.3g} N: the pressure does not exceed the yield pressure"
-    return ""

@@ -29,7 +29,6 @@ from vinetrack.kinematics.force import (
     known_pressure,
     paper_force_N,
     steady_force,
-    why_not_force,
     why_not_in_fit,
 )
 from vinetrack.kinematics.steady import gated_window, paper_window, quasi_steady_window, user_window
@@ -294,7 +293,11 @@ def _chosen(windows: Mapping[str, Window]) -> Window | None:
 def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
     """Return the row of a trial in the damping fit, with `used` and the `reason` if not."""
     window, force = steady.window, steady.force
-    reason, nan = why_not_in_fit(trial) or why_not_force(force), math.nan
+    reason, nan = why_not_in_fit(trial), math.nan
+    if force is None:
+        reason = reason or "no steady window"
+    elif not reason and not force.force_N > 0:
+        reason = f"the force in the window is {force.force_N:.3g} N: the pressure does not exceed the yield pressure"
     return {
         "trial": trial.name,
         "vine": trial.vine,

@@ -160,7 +160,7 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     )
     smaller, larger = np.fmin(np.abs(earlier), np.abs(later[::-1])), np.fmax(earlier, later[::-1])
     clear = larger > CLEAR_STEP_SIGMAS * np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))
-    for i in np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * larger))):
+    for i in np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * larger))).tolist():
         if rows[i + 1] <= after:
             continue
         around = frame, y, i, noise_m[i], rho, rows
@@ -235,12 +235,11 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         # Both sides must move by three quarters of a clear step, and a larger ratio of speeds may be acceleration.
         if slower < 0.75 * CLEAR_STEP_SIGMAS * noise_m or slower <= 0 or faster > 1.8 * slower:
             continue
-        t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
-        t = t - (t_left[-1] + t_right[0]) / 2
+        both, t = np.concatenate([y_left, y_right]), np.concatenate([t_left, t_right]) - (t_left[-1] + t_right[0]) / 2
         basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
         weights = np.linalg.pinv(basis)
-        fit = weights @ y
-        misfit_m = math.sqrt(float(np.sum((y - basis @ fit) ** 2)) / (t.size - 4))
+        fit = weights @ both
+        misfit_m = math.sqrt(float(np.sum((both - basis @ fit) ** 2)) / (t.size - 4))
         step = float(fit[1])
         # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
         if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:

@@ -198,7 +198,18 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
     `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
     """
-    panel = _parse_panel(text)
+    from xml.etree import ElementTree
+
+    # Documents that define entities are refused: they can expand without end.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise TrackError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
+    try:
+        root = ElementTree.fromstring(text.lstrip("\ufeff \n"))
+    except (ElementTree.ParseError, ValueError, RecursionError):
+        raise TrackError("is not a Tracker project", "unpack a .trz, or save as .trk in Tracker") from None
+    panel = next((node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")), None)
+    if panel is None:
+        raise TrackError("holds no Tracker panel", "save the project as .trk in Tracker")
     name, marks, others = _choose_mass(panel, point_mass)
     first, last = frames_used or (0, max(marks))
     marks = {frame: place for frame, place in marks.items() if first <= frame <= last}
@@ -227,22 +238,6 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
         notes.append(f"{missing} frames between the first and the last point have none.")
     time_s = start_s + (frames - start_frame) * frame_s
     return new_track(time_s, position_m, edge_px=edge_px, notes=[*notes, note])
-
-
-def _parse_panel(text: str) -> Element:
-    """The element of Tracker's panel. Documents that define entities are refused: they can expand without end."""
-    from xml.etree import ElementTree
-
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise TrackError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
-    try:
-        root = ElementTree.fromstring(text.lstrip("\ufeff \n"))
-    except (ElementTree.ParseError, ValueError, RecursionError):
-        raise TrackError("is not a Tracker project", "unpack a .trz, or save as .trk in Tracker") from None
-    panels = [node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")]
-    if not panels:
-        raise TrackError("holds no Tracker panel", "save the project as .trk in Tracker")
-    return panels[0]
 
 
 def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:

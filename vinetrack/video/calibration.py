@@ -260,16 +260,16 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
     best_share, best_board, n_markers = 0.0, None, int(ids.max(initial=0)) + 1
     # Squares across and down, at most 40, of the boards with this many markers, of which two may be hidden (chosen)
-    for squares in itertools.product(range(2, 41), repeat=2):
-        count = squares[0] * squares[1] // 2
+    for across, down in itertools.product(range(2, 41), repeat=2):
+        layout, count = (across, down), across * down // 2
         # 6: fewest markers that distinguish a board from chance (chosen)
         if len(ids) < 6 or not n_markers <= count <= n_markers + 2:
             continue
         # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
-        board = Charuco(kind="charuco", image="", squares=squares, square_mm=1.0, marker_mm=0.7, dictionary=family)
+        board = Charuco(kind="charuco", image="", squares=layout, square_mm=1.0, marker_mm=0.7, dictionary=family)
         share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
-            best_share, best_board = share, BoardSeen("charuco", squares, _smallest(family, count), marker)
+            best_share, best_board = share, BoardSeen("charuco", layout, _smallest(family, count), marker)
     # 0.8: least share of the markers that must lie where a board has them (chosen)
     if best_share >= 0.8:
         return best_board

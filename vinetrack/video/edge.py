@@ -61,48 +61,6 @@ from vinetrack.video.strip import SLOW_PX, Positions, Strip
 # camera was stabilised the slow part of the shake stays.
 
 
-def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats:
-    """Slow error of each frame's edge, one standard deviation. Shapes: edge_px (n_frames,); contrast (n_along,) →
-    (n_frames,).
-    """
-    from scipy.ndimage import median_filter
-
-    everywhere_px = float(np.hypot(SLOW_PX, shared_px))
-    finite = np.isfinite(contrast)
-    if not finite.any():
-        return np.full(len(edge_px), everywhere_px)
-    columns = np.arange(len(contrast))
-    # 21: columns over which the contrast at an edge is taken, px (chosen)
-    smooth_contrast = median_filter(np.interp(columns, columns[finite], np.abs(contrast[finite])), 21, mode="nearest")
-    local_contrast = np.interp(np.nan_to_num(edge_px), columns, smooth_contrast)
-    # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
-    # 1.0: least contrast, in grey levels (chosen)
-    return np.asarray(np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0)))
-
-
-def shared_disagreement(lead_px: Floats) -> float:
-    """Slow error of the mean of bands, from the part of their disagreement that lasts over several frames. Bands that
-    mirror each other about the axis are averaged first, since a tip that tilts moves one ahead and the other behind and
-    leaves the mean unchanged. What all frames share is the shape of the tip and is removed. Shapes: lead_px (n_frames,
-    n_bands).
-    """
-    lags = (1, 2)  # Lags, in frames, at which bands that still disagree alike share a cause (chosen)
-    frames, bands = lead_px.shape
-    if bands < 4 or frames < max(lags):
-        return 0.0
-    deviation = lead_px - lead_px.mean(axis=1, keepdims=True)
-    deviation = deviation - np.median(deviation, axis=0)
-    pairs = (deviation + deviation[:, ::-1])[:, : bands // 2] / 2
-    pairs = pairs - pairs.mean(axis=1, keepdims=True)
-    # 4: fewest pairs of frames at a lag (chosen)
-    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in lags if frames - lag >= 4]
-    if not products:
-        return 0.0
-    # The mean of a pair has half the variance of a band.
-    band_variance = 2 * float(np.mean(products)) / (bands // 2 - 1)
-    return float(np.sqrt(max(band_variance, 0.0) / bands))
-
-
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
 # Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
 LEAST_FITTED_AMPLITUDE = 0.5
@@ -191,9 +149,8 @@ BANDS = 4  # Bands across the strip: enough to show which errs, few enough that 
 
 def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: Bools) -> tuple[Floats, float]:
     """Error of the edge from the disagreement of its bands, (n_frames,), px, zeros where there is one band only; and
-    the slow part of it (`shared_disagreement`). The weighted mean of K independent bands has the variance
-    Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by for long in the `core` frames is the shape of the tip,
-    not an error.
+    the slow part of it. The weighted mean of K independent bands has the variance Σ w (y − ȳ)² / ((K − 1) Σ w). What a
+    band leads or lags by for long in the `core` frames is the shape of the tip, not an error.
     """
     neighbours = 2  # Frames on each side over which the median disagreement is taken (chosen)
     # The bands share the rows that are informative about the edge evenly, each of four rows or more (chosen).
@@ -207,7 +164,21 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: Bools)
         return np.zeros(len(edge)), 0.0
     edges, sigmas = (np.stack([fit[:, k] for fit in fits], axis=1) for k in (0, 1))
     lead_px = np.nan_to_num(edges - edge[:, None])
-    slow = shared_disagreement(lead_px[core])
+    # Slow error of the mean of bands, from the part of their disagreement that lasts over several frames: bands that
+    # disagree alike at lags of one and two frames (chosen) share a cause. Bands that mirror each other about the axis
+    # are averaged first, since a tip that tilts moves one ahead and the other behind and leaves the mean unchanged.
+    # What all frames share is the shape of the tip and is removed.
+    core_px = lead_px[core]
+    n_frames, n_bands = core_px.shape
+    away = core_px - core_px.mean(axis=1, keepdims=True)
+    away = away - np.median(away, axis=0)
+    pairs = (away + away[:, ::-1])[:, : n_bands // 2] / 2
+    pairs = pairs - pairs.mean(axis=1, keepdims=True)
+    # 4: fewest pairs of frames at a lag (chosen)
+    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in (1, 2) if n_frames - lag >= 4]
+    slow = 0.0
+    if n_bands >= 4 and products:  # the mean of a pair has half the variance of a band
+        slow = float(np.sqrt(max(2 * float(np.mean(products)) / (n_bands // 2 - 1), 0.0) / n_bands))
     # 7, 50.0: fewest core frames nearby over which a median lead is taken, and the growth over which it is, px (chosen)
     fewest, core_edge = min(7, int(core.sum())), edge[core]
     # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
@@ -232,9 +203,6 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: Bools)
     return np.asarray(np.sqrt(1.27 * running_median)), slow
 
 
-BLUR_SIGMA_PART = 0.25  # Part of the distance between both ends of an uncertain blur that is its sd (derived)
-
-
 def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
     """Standard error of an edge that stops or starts within an exposure or next to it. The model's blur is that of
     uniform motion at the mean of the speeds before and after. Where these differ by Δv, either may be the speed during
@@ -247,7 +215,8 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
     from_middle = (steps[1:-2] + steps[2:-1]) / np.maximum(speed, 1e-9) - 1
     within = np.maximum(exposure_frames / 2 - np.abs(from_middle), 0.0)
     behind = speed * within**2 / (2 * exposure_frames)
-    return np.asarray(np.hypot(behind, BLUR_SIGMA_PART * exposure_frames / 4 * np.abs(steps[2:-1] - steps[1:-2])))
+    # 0.25: part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
+    return np.asarray(np.hypot(behind, 0.25 * exposure_frames / 4 * np.abs(steps[2:-1] - steps[1:-2])))
 
 
 # ------------------------------------------------------------------------------
@@ -646,6 +615,8 @@ def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:
     """Add to a converged fit the errors of bands, start, doors and leaps, and refer the edge to mid-exposure."""
+    from scipy.ndimage import median_filter
+
     core = core_frames(state, fit)
     # Where a frame departs from the model (a door, a glint), the error exceeds that from the curvature of ln L.
     # 100.0: upper limit of a frame's misfit relative to the median (chosen)
@@ -692,7 +663,18 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     guess = np.sqrt(np.maximum(extra**2 - visible_error**2, 0.0))
     bands = np.sqrt(bands**2 + (start_part * near) ** 2 + (guess_part * guess) ** 2)
     slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
-    slow = np.hypot(slow, slow_error_px(edge_now, contrast, shared))
+    # Slow error of any edge, and where film or background differ from their pictures: about 1/contrast
+    everywhere_px, finite = float(np.hypot(SLOW_PX, shared)), np.isfinite(contrast)
+    slow_px: Floats | float = everywhere_px
+    if finite.any():
+        columns = np.arange(len(contrast))
+        # 21: columns over which the contrast at an edge is taken, px (chosen)
+        level = np.interp(columns, columns[finite], np.abs(contrast[finite]))
+        local_contrast = np.interp(np.nan_to_num(edge_now), columns, median_filter(level, 21, mode="nearest"))
+        # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
+        # 1.0: least contrast, in grey levels (chosen)
+        slow_px = np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0))
+    slow = np.hypot(slow, slow_px)
     return Positions(
         edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden), blur_px=state.blur,
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,

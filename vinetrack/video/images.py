@@ -476,20 +476,13 @@ def _stack_pages(recording: Recording) -> Iterator[NDArray[Any]]:
             yield np.asarray(page)
 
 
-def _dng_pages(tiff: Any) -> Iterator[Any]:
-    """Pages of a DNG file with their sub-pages."""
-    for page in tiff.pages:
-        yield page
-        yield from page.pages or ()
-
-
 def _dng_clock(file: Path) -> tuple[float | None, float | None]:
     """Capture rate (tag 51044 of CinemaDNG) and exposure (33434 of TIFF/EP, ISO 12234-2) of a frame, None if absent."""
     import tifffile
 
     values: dict[int, float] = {}
     with tifffile.TiffFile(file) as tiff:
-        for page in _dng_pages(tiff):
+        for page in (part for whole in tiff.pages for part in (whole, *(whole.pages or ()))):
             for code in (51044, 33434):
                 if code in page.tags and code not in values:
                     value = page.tags[code].value
@@ -504,18 +497,19 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
     import tifffile
 
     with tifffile.TiffFile(file) as tiff:
-        pages = [p for p in _dng_pages(tiff) if p.photometric in (32803, 34892, 1, 2)]
+        parts = (part for whole in tiff.pages for part in (whole, *(whole.pages or ())))
+        pages = [part for part in parts if part.photometric in (32803, 34892, 1, 2)]
         page = max(pages, key=lambda p: int(p.imagewidth) * int(p.imagelength) * (2 if p.photometric == 32803 else 1))
         if page.compression == 1 and page.bitspersample == 12:
             # Two pixels in three bytes, rows beginning on whole bytes
             with file.open("rb") as stream:
-                parts = []
+                strips = []
                 for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
                     stream.seek(offset)
-                    parts.append(stream.read(count))
+                    strips.append(stream.read(count))
             height, width = int(page.imagelength), int(page.imagewidth)
             row = (width * 12 + 7) // 8
-            data = np.frombuffer(b"".join(parts), np.uint8)[: height * row].reshape(height, row)
+            data = np.frombuffer(b"".join(strips), np.uint8)[: height * row].reshape(height, row)
             padded = np.pad(data, ((0, 0), (0, -row % 3)))
             raw = unpack_pixels(padded.ravel(), 12).reshape(height, -1)[:, :width]
         else:
