@@ -166,8 +166,17 @@ def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
     inside = (np.abs(across) < reach) & (np.abs(from_middle) < 0.6 * scaled.length_px)
     if inside.sum() < 12:
         raise RecordingError("nothing moves along the axis")
-    line = _line_near(small.changed.where(inside), scaled, reach)
-    if line is None:
+    # The line near the given one along which most change is collected in order; those off its middle count less.
+    pixels, band = small.changed.where(inside), float(np.clip(0.25 * reach, 2.0, 6.0))
+    start_rad = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
+    angles = start_rad + np.radians(np.arange(-MOST_TURN_DEG, MOST_TURN_DEG + 0.5, 2.0))
+    half_length, middle = (int(2 * scaled.length_px) + 4) / 2, np.asarray(scaled.points(np.array(scaled.length_px / 2)))
+    angle, point, value = _best_line(pixels, angles, middle, (half_length, reach), band, centred=True)
+    if value <= 0:
+        return given
+    try:
+        line = _refined_line(pixels, angle, point, 2 * band, reach)
+    except RecordingError:
         return given
     turned = np.array([np.cos(line.angle), np.sin(line.angle)])
     slope = float(turned @ scaled.normal) / max(float(turned @ scaled.direction), 0.5)
@@ -210,24 +219,6 @@ def _line_through(small: SmallPictures, changed: Pixels, early_first: bool = Fal
         if insist:
             raise
         return _NO_LINE
-
-
-def _line_near(pixels: Pixels, given: Axis, half_width: float) -> _Line | None:
-    """Refine the line near a given one along which most change is collected in order; None where there is none. All in
-    the small pictures. Lines that leave the middle of the given width count less, down to a half at its border.
-    """
-    band = float(np.clip(0.25 * half_width, 2.0, 6.0))
-    start = float(np.arctan2(given.direction[1], given.direction[0]))
-    middle = np.asarray(given.points(np.array(given.length_px / 2)))
-    angles = start + np.radians(np.arange(-MOST_TURN_DEG, MOST_TURN_DEG + 0.5, 2.0))
-    reach = (int(2 * given.length_px) + 4) / 2, half_width
-    angle, point, value = _best_line(pixels, angles, middle, reach, band, centred=True)
-    if value <= 0:
-        return None
-    try:
-        return _refined_line(pixels, angle, point, 2 * band, half_width)
-    except RecordingError:
-        return None
 
 
 def _best_line(

@@ -209,27 +209,22 @@ def _register_all(
     first: bool,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Place (n, 2) along and across, its error along (n,) and correlation (n,) in every frame."""
-    out, error, match = place.copy(), np.full(len(place), np.nan), np.zeros(len(place))
-    slope_across, slope_along = np.gradient(template, axis=0), np.gradient(template, axis=1)
-    for t, picture in enumerate(pictures):
-        guess = _by_correlation(picture, template, place[t], half) if first else place[t]
-        out[t], error[t], match[t] = _register(picture, template, weight, slope_along, slope_across, guess, half)
-    return out, error, match
-
-
-def _by_correlation(picture: NDArray[np.float32], template: NDArray[np.float32], guess: Floats, half: int) -> Floats:
-    """Whole-pixel place of the best normalised correlation about `guess`."""
     import cv2
 
+    out, error, match = place.copy(), np.full(len(place), np.nan), np.zeros(len(place))
+    slope_across, slope_along = np.gradient(template, axis=0), np.gradient(template, axis=1)
     # 14: distance along the axis searched about the expected place (chosen)
-    reach = 14 + half // 2
-    low = int(np.clip(guess[0] - half - reach, 0, max(picture.shape[1] - template.shape[1], 0)))
-    high = int(np.clip(guess[0] + half + reach + 1, low + template.shape[1], picture.shape[1]))
-    if high - low < template.shape[1]:
-        return guess
-    score = cv2.matchTemplate(np.ascontiguousarray(picture[:, low:high]), template, cv2.TM_CCOEFF_NORMED)
-    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-    return np.array([low + column + half, row - SEARCH_ACROSS_PX], dtype=float)
+    width, reach = template.shape[1], half + 14 + half // 2
+    for t, picture in enumerate(pictures):
+        guess = place[t]
+        low = int(np.clip(guess[0] - reach, 0, max(picture.shape[1] - width, 0)))
+        high = int(np.clip(guess[0] + reach + 1, low + width, picture.shape[1]))
+        if first and high - low >= width:  # whole-pixel place of the best normalised correlation
+            score = cv2.matchTemplate(np.ascontiguousarray(picture[:, low:high]), template, cv2.TM_CCOEFF_NORMED)
+            row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+            guess = np.array([low + column + half, row - SEARCH_ACROSS_PX], dtype=float)
+        out[t], error[t], match[t] = _register(picture, template, weight, slope_along, slope_across, guess, half)
+    return out, error, match
 
 
 def _register(

@@ -61,7 +61,17 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
         corners, ids = max((corners, ids), _detect_markers(grey, dictionary, enlarge=2), key=lambda pair: len(pair[1]))
     if not len(ids):
-        raise CornersError(_no_markers(grey, board.dictionary))
+        others = [name for name in OTHER_DICTIONARIES if name not in board.dictionary]
+        there = [(name, _detect_markers(grey, _dictionary(_largest(name)))[1].ravel()) for name in others]
+        name, numbers = max(there, key=lambda markers: len(markers[1]))
+        what = f"no marker of {board.dictionary} is seen"
+        if len(numbers) >= 3:
+            likely = _smallest(name, int(numbers.max()) + 1)
+            raise CornersError(f"{what}, but {len(numbers)} of {likely}; correct `dictionary`")
+        raise CornersError(
+            f"{what}; check `dictionary`, and that the board is in the picture, in focus, not mirrored and larger than "
+            "5 pixels a marker bit"
+        )
     share, marker_mm, layout = _best_layout(corners, ids, board, dictionary)
     if share < 0.8:
         raise CornersError(
@@ -221,22 +231,6 @@ def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floa
     )
 
 
-def _no_markers(grey: Grey, dictionary: str) -> str:
-    """Say that there are no markers, and name the dictionary whose markers are there, if any."""
-    best, numbers = "", np.empty(0, int)
-    for name in OTHER_DICTIONARIES:
-        ids = _detect_markers(grey, _dictionary(_largest(name)))[1].ravel()
-        if name not in dictionary and len(ids) > len(numbers):
-            best, numbers = name, ids
-    if len(numbers) >= 3:
-        likely = _smallest(best, int(numbers.max()) + 1)
-        return f"no marker of {dictionary} is seen, but {len(numbers)} of {likely}; correct `dictionary`"
-    return (
-        f"no marker of {dictionary} is seen; check `dictionary`, and that the board is in the picture, in focus, "
-        "not mirrored and larger than 5 pixels a marker bit"
-    )
-
-
 # ------------------------------------------------------------------------------
 # Recognise an unknown printed board in a picture: its kind, its squares and its dictionary.
 #
@@ -371,7 +365,15 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
     corners = [_half_diagonals(picture, size) for picture, _ in views]
     reach_m = max(float(np.ptp(board, axis=0).max()) for _, board in views)
     places = [board / reach_m for _, board in views]
-    start = [_first_homography(*view) for view in zip(corners, places, strict=True)]
+    start = []
+    for corner, place in zip(corners, places, strict=True):  # by the direct linear transform
+        homogeneous = np.column_stack([corner, np.ones(len(corner))])
+        zeros = np.zeros_like(homogeneous)
+        system = np.block(
+            [[homogeneous, zeros, -place[:, :1] * homogeneous], [zeros, homogeneous, -place[:, 1:] * homogeneous]]
+        )
+        homography = np.linalg.eigh(system.T @ system)[1][:, 0]
+        start.append(homography[:8] / homography[8])
     values = np.concatenate([*start, np.zeros(N_LENS)])
     unit_px = _half_diagonal_px(*size)
     noise_px = 0.1
@@ -418,18 +420,6 @@ def _undistorted(distorted: Floats, lens: Floats) -> Floats:
     return np.asarray(
         distorted * np.divide(radius, distorted_radius, out=np.ones_like(radius), where=distorted_radius > 0)
     )
-
-
-def _first_homography(picture: Floats, board: Floats) -> Floats:
-    """Homography from half-diagonals to the board by the direct linear transform; first eight entries, shape (8,)."""
-    homogeneous = np.column_stack([picture, np.ones(len(picture))])
-    zeros = np.zeros_like(homogeneous)
-    system = np.block(
-        [[homogeneous, zeros, -board[:, :1] * homogeneous], [zeros, homogeneous, -board[:, 1:] * homogeneous]]
-    )
-    _, directions = np.linalg.eigh(system.T @ system)
-    homography = directions[:, 0]
-    return np.asarray(homography[:8] / homography[8])
 
 
 def _residuals(values: Floats, corners: list[Floats], boards: list[Floats]) -> list[Floats]:
@@ -544,7 +534,17 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
         )
         rel_sigma = math.sqrt(2) * CLICK_SIGMA_PX / distance_px
         return PlaneCalibration("two_points", plane, math.nan, 2, 1, rel_sigma, whole, (note,))
-    pictures = _target_pictures(folder / settings.image, settings.image)
+    # Up to ten pictures, spread over the first 300 frames of a recording (chosen), while nothing hides the target yet
+    most_pictures, searched_frames = 10, 300
+    try:
+        recording = inspect_recording(folder / settings.image)
+        every = max(1, min(recording.declared_frames or searched_frames, searched_frames) // most_pictures)
+        frames = itertools.islice(iterate_frames(recording), 0, searched_frames + 1, every)
+        pictures = list(itertools.islice(frames, most_pictures))
+    except RecordingError as error:
+        raise CalibrationError(error.what, error.remedy) from error
+    if not pictures:
+        raise CalibrationError(f"{settings.image} holds no picture that can be read", "copy it from the camera again")
     sizes_seen = {(picture.shape[1], picture.shape[0]) for picture in pictures}
     if sizes_seen != {(width_px, height_px)}:
         sizes = " and ".join(f"{width} × {height}" for width, height in sorted(sizes_seen))
@@ -600,21 +600,6 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
     return PlaneCalibration(
         board.kind, maps[0], reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
     )
-
-
-def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
-    """Up to ten grey pictures, spread over the first 300 frames of a recording, while nothing hides the target yet."""
-    most_pictures, searched_frames = 10, 300  # chosen
-    try:
-        recording = inspect_recording(path)
-        every = max(1, min(recording.declared_frames or searched_frames, searched_frames) // most_pictures)
-        frames = itertools.islice(iterate_frames(recording), 0, searched_frames + 1, every)
-        pictures = list(itertools.islice(frames, most_pictures))
-    except RecordingError as error:
-        raise CalibrationError(error.what, error.remedy) from error
-    if not pictures:
-        raise CalibrationError(f"{name} holds no picture that can be read", "copy it from the camera again")
-    return pictures
 
 
 def _corners_by_place(view: tuple[Floats, Floats]) -> dict[tuple[float, float], Floats]:

@@ -287,8 +287,17 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | N
         return None
     size = small.shape[1], small.shape[0]
     try:
-        axis = axis_through((middle + 0.5) * small.factor - 0.5, band.width * small.factor)
-        axis = _extended(axis, (3 * band.width + 12) * small.factor, size)
+        middle_px = (middle + 0.5) * small.factor - 0.5
+        axis = axis_through(middle_px, band.width * small.factor)
+        # Continued straight at both ends, as far as the picture goes
+        knots, margin = [*middle_px], (3 * band.width + 12) * small.factor
+        for end, sign in ((0.0, -1.0), (axis.length_px, 1.0)):
+            extension = axis.points(end + sign * np.arange(1.0, margin + 1))
+            inside = ((extension >= 0) & (extension <= np.array(size) - 1)).all(axis=1)
+            count = len(extension) if inside.all() else int(np.argmin(inside))
+            if count > 6:
+                knots.insert(0 if sign < 0 else len(knots), extension[count - 1])
+        axis = axis_through(knots, axis.width_px)
     except RecordingError:
         return None
     if not isinstance(axis, CurvedAxis) or curve_problem(axis, axis.width_px / 2, size):
@@ -365,18 +374,3 @@ def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
     count = max(4, round(np.ptp(along[inner]) / spacing) + 1)
     knots = np.linspace(along[inner][0], along[inner][-1], count)
     return np.stack([spline(knots) for spline in splines], axis=1)
-
-
-def _extended(axis: Axis, margin: float, size_px: tuple[int, int]) -> Axis:
-    """The curve continued straight at both ends by `margin`, as far as the picture goes."""
-    if not isinstance(axis, CurvedAxis):
-        return axis
-    knots = list(axis.through_px)
-    for end, sign in ((0.0, -1.0), (axis.length_px, 1.0)):
-        extension = axis.points(end + sign * np.arange(1.0, margin + 1))
-        inside = ((extension >= 0) & (extension <= np.array(size_px) - 1)).all(axis=1)
-        count = len(extension) if inside.all() else int(np.argmin(inside))
-        if count > 6:
-            place = (float(extension[count - 1][0]), float(extension[count - 1][1]))
-            knots = [place, *knots] if sign < 0 else [*knots, place]
-    return axis_through(knots, axis.width_px)

@@ -264,7 +264,14 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     if len(exited) < fewest_rest_frames or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < film_range_px[0]:
         return none
     beside = BORDER_GAP_PX + BORDER_SIDE_PX
-    film_picture = _middle_picture(strip, exited, slice(near[0] - beside, later[-1] + beside))
+    # Median over up to 15 frames of the middle rows, free of flicker; the moving tail averages out.
+    # 0.6: part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
+    rows = strip.values.shape[1]
+    edge_rows, chosen = round((1 - 0.6) / 2 * rows), exited[np.unique(np.linspace(0, len(exited) - 1, 15).astype(int))]
+    columns = slice(near[0] - beside, later[-1] + beside)
+    values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
+    level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
+    film_picture = np.asarray(np.median(level, axis=0), dtype=np.float32)
     near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
     # Step of brightness across each column, by row; the first column is `beside`.
     sides = np.lib.stride_tricks.sliding_window_view(film_picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
@@ -338,19 +345,6 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < 0.75)
     guessed = near & (unlike_model | partly_hidden)
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
-
-
-def _middle_picture(strip: Strip, frames: Indices, columns: slice) -> NDArray[np.float32]:
-    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker, in some columns. The moving
-    tail averages out.
-    """
-    rows = strip.values.shape[1]
-    # 0.6: part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
-    edge_rows = round((1 - 0.6) / 2 * rows)
-    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, 15).astype(int))]
-    values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
-    level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
-    return np.asarray(np.median(level, axis=0), dtype=np.float32)
 
 
 def leap_error_px(edge: Floats, hidden: Bools) -> Floats:

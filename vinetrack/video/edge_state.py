@@ -87,7 +87,15 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     """Estimate the brightness of film and background at every pixel, given the edge."""
     ridge_weight = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)
     neighbour_decay = 0.93  # Factor by which the weight of neighbours falls per column (derived)
-    early, late = _passage_frames(state, strip.values.shape[2])
+    # First and last frame in which the edge is over each column. Near the start, film is counted only once the edge has
+    # cleared it: until then a door may stand or swing there.
+    frames, places = np.arange(len(state.edge), dtype=float), np.arange(strip.values.shape[2], dtype=float)
+    monotone = np.maximum.accumulate(state.edge) + 1e-6 * frames
+    begin, end = frames[moving_frames(state.edge)][[0, -1]]
+    passing_px = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
+    behind = np.maximum(places + passing_px + float(state.lag.max()), clear_of_start(state.edge))
+    early = np.clip(np.interp(places - passing_px, monotone, frames), begin, end)
+    late = np.clip(np.interp(behind, monotone, frames), begin, end)
     # 2.06: distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
     reach = 0.5 * state.lengths + 2.06 * state.blur
     sums = kernels.gather(
@@ -109,22 +117,6 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
         sums[1, :, :, film_all_along] = 0.0
         appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     return replace(state, appearance=appearance)
-
-
-def _passage_frames(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
-    """First and last frame in which the edge is over each column, shapes (n_along,). Near the start, film is counted
-    only once the edge has cleared it: until then a door may stand or swing there.
-    """
-    monotone = np.maximum.accumulate(state.edge) + 1e-6 * np.arange(len(state.edge))
-    frames = np.arange(len(monotone), dtype=float)
-    moving = np.flatnonzero(moving_frames(state.edge))
-    places = np.arange(columns, dtype=float)
-    reach = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
-    begin, end = frames[moving[0]], frames[moving[-1]]
-    behind = np.maximum(places + reach + float(state.lag.max()), clear_of_start(state.edge))
-    early = np.clip(np.interp(places - reach, monotone, frames), begin, end)
-    late = np.clip(np.interp(behind, monotone, frames), begin, end)
-    return early, late
 
 
 def clear_of_start(edge: Floats) -> float:

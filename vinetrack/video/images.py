@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Indices, Trial
+from vinetrack.core.records import Floats, Trial
 from vinetrack.core.tables import NOT_A_FILE, file_size, is_pipe_or_device
 from vinetrack.video.frames import (
     IMAGES,
@@ -95,7 +95,15 @@ def inspect_cine(path: Path) -> Recording:
             offsets = tuple(int(at) for at in np.frombuffer(header, "<i8", count, table))
             frames = _cine_frames(path, stream, header, (version, compression, bitmap, setup), offsets, size)
         setup_bytes = header[setup:]
-        rate, exposure_s, times_s, notes = _cine_clock(name, setup_bytes, _tagged_blocks(header[:table], setup), count)
+        blocks: dict[int, bytes] = {}  # content of the tagged blocks behind the settings, by type
+        at, more = setup + struct.unpack_from("<H", header, setup + MARK_AT + 2)[0], 1
+        while more and at + 8 <= table:
+            length, kind, more = struct.unpack_from("<IHH", header, at)
+            if length < 8 or at + length > table:
+                break
+            blocks[kind] = header[at + 8 : at + length]
+            at += length
+        rate, exposure_s, times_s, notes = _cine_clock(name, setup_bytes, blocks, count)
     except (struct.error, ValueError, OSError) as error:
         if isinstance(error, RecordingError):
             raise
@@ -147,21 +155,6 @@ def _cine_frames(
             raise RecordingError(f"a frame takes {taken} bytes where {wanted}", "it is not read", name)
         starts.append(at + annotation)
     return replace(frames, offsets=tuple(starts))
-
-
-def _tagged_blocks(header: bytes, setup: int) -> dict[int, bytes]:
-    """Content of the tagged blocks behind the settings, by type."""
-    blocks: dict[int, bytes] = {}
-    at = setup + struct.unpack_from("<H", header, setup + MARK_AT + 2)[0]
-    while at + 8 <= len(header):
-        length, kind, more = struct.unpack_from("<IHH", header, at)
-        if length < 8 or at + length > len(header):
-            break
-        blocks[kind] = header[at + 8 : at + length]
-        at += length
-        if not more:
-            break
-    return blocks
 
 
 def _cine_clock(
@@ -259,7 +252,12 @@ def read_side_file(path: Path) -> SideFile:
         values = {key.strip(): text.strip() for key, colon, text in reversed(lines) if colon}
 
     def value(key: str) -> float:
-        return _as_number(values.get(key, ""))
+        """The number at the beginning of a value, or a fraction such as 1/20000; 0 where there is none."""
+        match = re.match(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)(?:\s*/\s*([0-9.]+))?", values.get(key, ""))
+        try:
+            return float(match.group(1)) / float(match.group(2) or 1) if match else 0.0
+        except (ValueError, ZeroDivisionError):
+            return 0.0
 
     rate, exposure_s, notes = value("Record Rate(fps)"), value("Shutter Speed(s)"), []
     # A number above 1 is the denominator: 20000 for 1/20000 s.
@@ -294,9 +292,8 @@ def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count:
 
 def _siblings(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """Files of the same name with one of the suffixes, in upper or lower case."""
-    if not path.parent.is_dir():
-        return []
-    return sorted(at for at in path.parent.iterdir() if at.stem == path.stem and at.suffix.lower() in suffixes)
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    return sorted(at for at in beside if at.stem == path.stem and at.suffix.lower() in suffixes)
 
 
 def _cihx_values(name: str, data: bytes) -> dict[str, str]:
@@ -320,15 +317,6 @@ def _cihx_values(name: str, data: bytes) -> dict[str, str]:
     if root is None:
         raise RecordingError("its XML is damaged", "copy it from the camera again", name)
     return {key: (root.findtext(place) or "").strip() for key, place in places.items()}
-
-
-def _as_number(text: str) -> float:
-    """The number at the beginning of a value, or a fraction such as 1/20000; 0 where there is none."""
-    match = re.match(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)(?:\s*/\s*([0-9.]+))?", text)
-    try:
-        return float(match.group(1)) / float(match.group(2) or 1) if match else 0.0
-    except (ValueError, ZeroDivisionError):
-        return 0.0
 
 
 def inspect_images(path: Path) -> Recording:
@@ -389,10 +377,15 @@ def read_images(recording: Recording) -> Frames:
             f"{name}: damaged: {damaged.sum()} of {len(luma)} pictures are cut short or unreadable, first {first}"
         )
     slot = np.arange(len(luma))
-    if recording.numbers:
-        slot, missing = _capture_periods(np.array(recording.numbers))
-        if missing:
-            notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
+    if len(recording.numbers) > 2:  # of the files, which may count in any step
+        steps = np.diff(recording.numbers)
+        step = int(np.median(steps))
+        if step > 0 and not np.any(steps % step) and np.all(steps > 0):
+            periods = np.concatenate([[0], np.cumsum(steps // step)])
+            missing = int(periods[-1] - slot[-1])
+            if 0 < missing <= max(3, len(slot) // 10):
+                slot = periods
+                notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
     return Frames(recording, luma, slot, damaged, tuple(notes))
 
 
@@ -428,20 +421,6 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
     left_out = [f.name for f in images if f not in set(files)]
     what = f"{len(left_out)} images not numbered like the rest are left out"
     return files, numbers, (f"{folder.name}: {what}, first {left_out[0]}",) if left_out else ()
-
-
-def _capture_periods(numbers: Indices) -> tuple[Indices, int]:
-    """Capture periods from the numbers of the files, which may count in any step, and how many are missing."""
-    consecutive = np.arange(len(numbers))
-    if len(numbers) < 3:
-        return consecutive, 0
-    steps = np.diff(numbers)
-    step = int(np.median(steps))
-    if step <= 0 or np.any(steps % step) or np.any(steps <= 0):
-        return consecutive, 0
-    slot = np.concatenate([[0], np.cumsum(steps // step)])
-    missing = int(slot[-1] - consecutive[-1])
-    return (slot, missing) if missing <= max(3, len(numbers) // 10) else (consecutive, 0)
 
 
 def _read_or_none(file: Path) -> NDArray[Any] | None:

@@ -1,10 +1,10 @@
 """Initial paths of the front: monotone paths through the kymograph (frame by column), by dynamic programming.
 
-A path is found in two passes. The first (`first_path`) knows neither film nor background, only that a column changes
-once, when the front passes it: `path_by_change` maximises the change collected along the path; `path_by_appearance`
-separates columns that look as at the end of the recording from columns that look as at its start. The second pass
-(`edge`) knows film and background and compares every pixel with both; distances are clipped, so that a door, a payload
-flying ahead or a reflection cannot capture the path.
+A path is found in two passes. The first knows neither film nor background, only that a column changes once, when the
+front passes it: `path_by_change` maximises the change collected along the path; `path_by_appearance` separates columns
+that look as at the end of the recording from columns that look as at its start. The second (`edge`) knows both and
+compares every pixel with them; distances are clipped, so that a door, a payload flying ahead or a reflection cannot
+capture the path.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from vinetrack.video.edge_kernels import FASTMATH
 
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
-
 
 # ------------------------------------------------------------------------------
 # Compiled: the largest change of each pixel, and paths through pixels that change in order.

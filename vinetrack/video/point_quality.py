@@ -236,30 +236,24 @@ def ending_of(
     if whole and quality.last_moving >= followed[-1] and quality.left_picture is None:
         at_first = np.median(edge_px[followed][: max(quality.first_moving, 1)])
         truncated_px = float(edge_px[followed[-1]]) - float(at_first)
-    return Ending(grown_px, truncated_px, tuple(growth_end_notes(luma, quality, edge_px, name, number)), name, place)
-
-
-def growth_end_notes(
-    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: Indices
-) -> list[str]:
-    """Say why the edge stops before the recording does; arrays as in `ending_of`."""
-    n, last = len(edge_px), quality.last_moving
+    remark, n, last = "", len(edge_px), quality.last_moving
     # 4: fewest frames of standstill at the end that are reported (chosen)
-    if last < 0 or last >= n - 4 or quality.left_picture is not None:
-        return []
-    change = mean_changes(luma, 5)
-    before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
-    least = float(np.min(change)) if len(change) else 0.0
-    later = float(np.median(change[last + 1 :]))
-    resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
-    if not resting.size:
-        return [f"{name}: the leading edge is not seen after frame {number[last]}"]
-    where = f"{name}: the leading edge stops at {np.median(resting):.0f} px after frame {number[last]}"
-    # 0.3: change of the pictures after the stop, as a part of that in motion, above which the picture goes on
-    # changing (chosen)
-    if later - least > 0.3 * (before - least):
-        return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
-    return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
+    if 0 <= last < n - 4 and quality.left_picture is None:
+        change = mean_changes(luma, 5)
+        before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
+        least, later = float(np.min(change)), float(np.median(change[last + 1 :]))
+        resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
+        where = f"{name}: the leading edge stops at {np.median(resting) if resting.size else np.nan:.0f} px"
+        where = f"{where} after frame {number[last]}"
+        # 0.3: change of the pictures after the stop, as a part of that in motion, above which the picture goes on
+        # changing (chosen)
+        if not resting.size:
+            remark = f"{name}: the leading edge is not seen after frame {number[last]}"
+        elif later - least > 0.3 * (before - least):
+            remark = f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"
+        else:
+            remark = f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"
+    return Ending(grown_px, truncated_px, (remark,) if remark else (), name, place)
 
 
 def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:

@@ -108,7 +108,8 @@ def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
 
 def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | None = None) -> NDArray[Any]:
     """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along). An axis
-    along rows or columns of the picture is sliced without interpolation, after moving it by less than half a pixel.
+    along rows or columns of the picture is sliced without interpolation, after moving it by less than half a pixel;
+    beyond the picture its border is repeated.
     Given `shift_px`, every frame is interpolated at its own displacement. Shapes: luma (n_frames, height, width);
     rows_px (n_rows,); shift_px (n_frames, 2) → (n_frames, n_rows, n_along).
     """
@@ -118,7 +119,15 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | 
     along, across = axis.direction, axis.normal
     start = axis.points(np.array(0.0), float(rows_px[0]))
     if shift_px is None and not axis.bends and max(abs(along)) > 1 - 1e-9:
-        return _slice(luma, start, along, across, len(rows_px), n_along)
+        level = abs(along[0]) > 0.5
+        steps = (along[0], across[1]) if level else (across[0], along[1])
+        counts = (n_along, len(rows_px)) if level else (len(rows_px), n_along)
+        x, y = (
+            np.clip(np.rint(start[k] + np.arange(counts[k]) * steps[k]), 0, luma.shape[2 - k] - 1).astype(int)
+            for k in (0, 1)
+        )
+        part = luma[:, y][:, :, x]
+        return np.ascontiguousarray(part if level else part.transpose(0, 2, 1))
     out = np.empty((len(luma), len(rows_px), n_along), luma.dtype)
     shifts = np.zeros((len(luma), 2)) if shift_px is None else shift_px
     if axis.bends:
@@ -132,19 +141,6 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | 
         matrix = np.column_stack([along, across, start + shift])  # from (along, row, 1) to x and y in the picture
         cv2.warpAffine(frame, matrix, cut.shape[::-1], dst=cut, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return out
-
-
-def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_rows: int, n_along: int) -> NDArray[Any]:
-    """Slice whole pixels of an axis along rows or columns of the picture; beyond the picture its border is repeated."""
-    level = abs(along[0]) > 0.5
-    steps = (along[0], across[1]) if level else (across[0], along[1])
-    counts = (n_along, n_rows) if level else (n_rows, n_along)
-    x, y = (
-        np.clip(np.rint(start[k] + np.arange(counts[k]) * steps[k]), 0, luma.shape[2 - k] - 1).astype(int)
-        for k in (0, 1)
-    )
-    part = luma[:, y][:, :, x]
-    return np.ascontiguousarray(part if level else part.transpose(0, 2, 1))
 
 
 # ------------------------------------------------------------------------------

@@ -74,11 +74,17 @@ def measure_recording(
         raise RecordingError("no recording is named", "fill in the column video", trial.name)
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording)
-    calibration = calibration_of(trial, settings, folder, recording)
-    if calibration is None and not math.isfinite(trial.m_per_px):
-        raise RecordingError(
-            "there is no scale", "give `calibration` in experiment.yaml, or mm_per_px in the sheet", trial.name
-        )
+    calibration = None
+    if not math.isfinite(trial.m_per_px):
+        if settings.calibration is None:
+            remedy = "give `calibration` in experiment.yaml, or mm_per_px in the sheet"
+            raise RecordingError("there is no scale", remedy, trial.name)
+        image = folder / (getattr(settings.calibration, "image", None) or "")
+        state = image.stat().st_mtime_ns if image.is_file() else 0
+        try:
+            calibration = _calibrated(settings.calibration, folder, recording.width, recording.height, state)
+        except CalibrationError as error:
+            raise RecordingError(error.what, error.remedy, "calibration") from error
     m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
     axis = given_axis(trial, settings, m_per_px)
     diameter_px = math.nan if axis is None else trial.diameter_m / m_per_px  # an axis that is found has its width
@@ -100,20 +106,6 @@ def measure_recording(
         notes = (*tracking.track.notes, *calibration.notes)
         tracking = replace(tracking, track=replace(tracking.track, notes=notes))
     return Measurement(tracking, m_per_px, rel_sigma, calibration, capture_fps, recording)
-
-
-def calibration_of(
-    trial: Trial, settings: ExperimentSettings, folder: Path, recording: Recording
-) -> PlaneCalibration | None:
-    """The calibration of the experiment; None where the trial has its own scale or there is no calibration."""
-    if math.isfinite(trial.m_per_px) or settings.calibration is None:
-        return None
-    image = folder / (getattr(settings.calibration, "image", None) or "")
-    state = image.stat().st_mtime_ns if image.is_file() else 0
-    try:
-        return _calibrated(settings.calibration, folder, recording.width, recording.height, state)
-    except CalibrationError as error:
-        raise RecordingError(error.what, error.remedy, "calibration") from error
 
 
 @lru_cache(maxsize=8)

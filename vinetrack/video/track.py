@@ -249,7 +249,16 @@ def track_pixels(
         strip, followed, width_px = follow(luma, trial, axis, exposure_s * capture_fps, small)
     except RecordingError as error:
         raise RecordingError(error.what, error.remedy, name) from error
-    random_px, total_px = _edge_errors(strip, followed, trial)
+    # Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
+    # The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
+    # larger one counts.
+    edge_px = followed.edge_px
+    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
+    moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
+    use, is_body = moving & np.isfinite(edge_px), trial.travel_ratio == 1
+    random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
+    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
+    total_px = np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
     quality = assess_points(
         followed.edge_px, total_px, frames.slot[rows], number, unsure=followed.unsure,
         repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
@@ -309,20 +318,6 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
         first_odd = int(number[odd][0])
         notes.append(f"{name}: {int(odd.sum())} frames are unlike all others and rejected, first frame {first_odd}")
     return rows, notes
-
-
-def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Floats, Floats]:
-    """Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
-    The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
-    larger one counts.
-    """
-    edge_px = followed.edge_px
-    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
-    moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
-    use, is_body = moving & np.isfinite(edge_px), trial.travel_ratio == 1
-    random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
-    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
-    return random_px, np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
 
 
 def _notes(
