@@ -20,6 +20,7 @@ from vinetrack.kinematics.force import (
     flag_rest,
     known_pressure,
     steady_force,
+    why_not_in_fit,
 )
 from vinetrack.kinematics.velocity import estimate_kinematics
 
@@ -105,6 +106,11 @@ def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only() -> No
     found = known_pressure(moved(np.where(np.arange(200) % 2, 12e3 + np.arange(200), math.nan)), base_model())
     assert found is not None
     np.testing.assert_allclose(found[1:], 12e3 + np.arange(1, 200))
+
+
+def test_a_vine_with_a_payload_has_no_place_in_the_law() -> None:
+    assert why_not_in_fit(VINE) == ""
+    assert why_not_in_fit(replace(VINE, payload_kg=0.0356))
 
 
 # ---- release time and resting position ----

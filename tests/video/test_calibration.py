@@ -204,6 +204,12 @@ def test_picture_without_a_target(board):
     assert find_board(empty) is None
 
 
+def test_file_that_is_no_picture(tmp_path):
+    (tmp_path / "board.png").write_bytes(b"no picture")
+    with pytest.raises(CalibrationError):
+        calibrate(charuco(), tmp_path, 960, 320)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("squares", "name"), [((14, 5), "DICT_4X4_50"), ((7, 9), "DICT_5X5_50"), ((12, 9), "DICT_6X6_100"), ((9, 6), "")]
