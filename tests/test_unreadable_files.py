@@ -49,21 +49,15 @@ def vines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_check_names_what_is_no_file_and_no_recording_is_made_of_it(vines: Path) -> None:
+def test_what_is_no_file_is_named_and_not_watched_and_fails_alone(vines: Path, tmp_path: Path) -> None:
     for name, words in NO_FILES.items():
         (problem,) = [problem for problem in check_experiment(vines) if problem.trial == name]
         assert words in problem.reason
     for name in ("pipe", "zero", "shut"):
         with pytest.raises(RecordingError):
             inspect_recording(vines / name)
-
-
-def test_the_workflow_watches_readable_files_alone(vines: Path, tmp_path: Path) -> None:
     watched = [path.name for path in make_plan({"experiment": str(vines)}, tmp_path).inputs]
     assert watched == ["trials.csv", "good.csv", "folder"]
-
-
-def test_the_stage_of_tracks_fails_those_and_analyses_the_rest(vines: Path, tmp_path: Path) -> None:
     succeed("trials", vines, tmp_path)
     rows = {path.stem: json.loads(path.read_text())["row"] for path in (tmp_path / "analysed").iterdir()}
     assert rows.pop("good")["status"] in ("ok", "warning")

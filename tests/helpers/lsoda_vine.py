@@ -62,12 +62,7 @@ def ar1(count: int, rho: float, draw: np.random.Generator) -> np.ndarray:
 
 
 def filmed(
-    trial: Trial,
-    draw: np.random.Generator,
-    *,
-    damping: float = 1.0,
-    pressure: float = 1.0,
-    rho: float = 0.0,
+    trial: Trial, draw: np.random.Generator, *, damping: float = 1.0, pressure: float = 1.0, rho: float = 0.0
 ) -> tuple[Track, float, float]:
     """A track of a trial whose B and P are off by these factors, its release, s, and its origin, m."""
     release_s = (20 - draw.uniform()) / FPS

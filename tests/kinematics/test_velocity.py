@@ -19,30 +19,22 @@ TRIALS = [
 
 
 @pytest.mark.parametrize(("vine", "noise_m", "rho"), TRIALS)
-def test_as_good_as_the_best_single_window_with_the_truth_in_hand(vine, noise_m, rho):
-    ours, single = [], {width: [] for width in SINGLE_WINDOWS}
-    for seed in range(1000, 1006):
+def test_as_good_as_the_best_single_window_with_the_truth_in_hand_and_its_error_is_stated(vine, noise_m, rho):
+    """The stated error holds within a factor of two from four frames after release on."""
+    ours, single, pulls = [], {width: [] for width in SINGLE_WINDOWS}, []
+    for seed in range(1000, 1008):
         trial = record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=rho, rest_frames=60)
-        track, scored = trial.track, trial.track.time_s > trial.release_s - 0.01
-        kinematics = estimate_kinematics(track, travel_ratio=2)
-        ours.append(np.mean((kinematics.lead_velocity_m_s - trial.lead_velocity_m_s)[scored] ** 2))
+        track, since_s = trial.track, trial.track.time_s - trial.release_s
+        kinematics, scored = estimate_kinematics(track, travel_ratio=2), since_s > -0.01
+        error = kinematics.lead_velocity_m_s - trial.lead_velocity_m_s
+        pulls.append((error / kinematics.lead_velocity_sigma_m_s)[since_s > 4 / CAPTURE_FPS])
+        ours.append(np.mean(error[scored] ** 2))
         for width in [width for width in SINGLE_WINDOWS if width <= scored.size]:
             fits = fit_all_windows(track.time_s, track.lead_position_m, width, 3, 0.0)
             error = fits.velocities(track.time_s, 0.0)[1] - trial.lead_velocity_m_s
             single[width].append(np.mean(error[scored] ** 2))
-    best = min(np.mean(values) for values in single.values() if len(values) == 6)
+    best = min(np.mean(values) for values in single.values() if len(values) == 8)
     assert np.sqrt(np.mean(ours) / best) < 1.2
-
-
-@pytest.mark.parametrize(("vine", "noise_m", "rho"), TRIALS)
-def test_stated_error_holds_within_a_factor_of_two_from_four_frames_after_release(vine, noise_m, rho):
-    pulls = []
-    for seed in range(1000, 1010):
-        trial = record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=rho, rest_frames=60)
-        kinematics = estimate_kinematics(trial.track, travel_ratio=2)
-        late = trial.track.time_s > trial.release_s + 4 / CAPTURE_FPS
-        error = kinematics.lead_velocity_m_s - trial.lead_velocity_m_s
-        pulls.append((error / kinematics.lead_velocity_sigma_m_s)[late])
     pull = np.concatenate(pulls)
     assert 0.6 < np.sqrt(np.mean(pull**2)) < 2.0
     assert np.mean(np.abs(pull) > 3) < 0.1

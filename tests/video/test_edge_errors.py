@@ -8,18 +8,10 @@ import numpy as np
 import pictures
 import pytest
 from plain_scene import Plan, plain_scene
-from scipy.ndimage import gaussian_filter1d
 from scipy.special import ndtr
 
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge import (
-    BANDS,
-    BLUR_SIGMA_PART,
-    band_disagreement,
-    dwell_error_px,
-    leap_error_px,
-    shared_disagreement,
-)
+from vinetrack.video.edge import BANDS, band_disagreement, leap_error_px
 from vinetrack.video.edge_state import EdgeState
 from vinetrack.video.strip import Strip
 from vinetrack.video.track import Tracking
@@ -169,19 +161,6 @@ def test_an_edge_behind_a_sliding_door_is_lost(door_grey: int) -> None:
     assert np.abs(error[usable]).max() < 0.1
 
 
-@pytest.mark.parametrize("exposure", [0.9, 0.1])
-@pytest.mark.parametrize("stop", [-0.2, 0.0, 0.3])
-@pytest.mark.parametrize("sense", [1, -1])
-def test_the_error_of_dwell_is_the_mean_place_over_the_exposure(exposure: float, stop: float, sense: int) -> None:
-    """At 20 px a frame, stopping so many frames from the middle of frame 20's exposure; or setting off then."""
-    middle = np.arange(41.0)
-    instants = middle[:, None] + exposure * np.linspace(-0.5, 0.5, 2001)
-    place = 20.0 * np.minimum(sense * (instants - 20.0), sense * stop).mean(axis=1)
-    edge = 20.0 * np.minimum(sense * (middle - 20.0), sense * stop)
-    unsure_px = BLUR_SIGMA_PART * exposure / 4 * np.abs(np.diff(np.pad(edge, 1, mode="edge"), 2))
-    assert dwell_error_px(edge, exposure)[2:-2] == pytest.approx(np.hypot(edge - place, unsure_px)[2:-2], abs=0.01)
-
-
 # ---- the disagreement of bands against known jitter ----
 
 
@@ -213,22 +192,6 @@ def test_disagreement_is_the_error_of_the_mean(sd_px):
     else:
         assert found.max() < 0.1
         assert slow_px < 0.05
-
-
-# ---- slow errors against known ones ----
-
-
-def test_the_slow_error_of_the_mean_follows_from_the_bands() -> None:
-    """Errors of bands with a correlation time of about ten frames; noise of bands is none."""
-    rng = np.random.default_rng(1811)
-    told, of_noise = [], []
-    for _ in range(200):
-        smooth = gaussian_filter1d(rng.standard_normal((480, BANDS)), 8.0, axis=0)[40:-40]
-        lasting = 0.2 * smooth * np.sqrt(2 * np.sqrt(np.pi) * 8.0)
-        told.append(shared_disagreement(lasting + rng.normal(0, 0.1, (400, BANDS))))
-        of_noise.append(shared_disagreement(rng.normal(0, 0.2, (60, BANDS))))
-    assert np.sqrt(np.mean(np.square(told))) == pytest.approx(0.2 / np.sqrt(BANDS), rel=0.2)
-    assert np.median(of_noise) < 0.2 * 0.2 / np.sqrt(BANDS)
 
 
 # ---- hidden frames that do not lead up to the motion after them ----

@@ -14,7 +14,6 @@ from plain_scene import Plan, plain_scene
 
 from vinetrack.core import threads
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video.kymograph import largest_steps
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2
 RIM = 40 * np.exp(-0.5 * ((np.arange(65) - 32 + 4.0) / 2.0) ** 2)
@@ -45,35 +44,12 @@ def fitted(strip: np.ndarray, start: np.ndarray, pictures: np.ndarray, shading: 
     return kernels.fit_edges(strip, np.ones(16), np.zeros(16), start, *fixed, shading, np.arange(16), (0, 9))
 
 
-def test_the_edge_of_every_frame_is_found_in_noise() -> None:
-    strip, edge, pictures = stepping()
-    start = edge + 1.4
-    start[5] = np.nan
-    fit = fitted(strip, start, pictures, 0 * RIM)
-    assert np.isnan(fit[5]).all()
-    sound = np.arange(16) != 5
-    assert np.abs(fit[sound, 0] - edge[sound]).max() < 0.08
-    # 110 grey levels, variance 10.5: (9 · 110² / 10.5 / 2√π 0.4)^−½
-    assert np.median(fit[sound, 1]) == pytest.approx(0.0112, rel=0.15)
-
-
 @pytest.mark.parametrize("contrast", [110.0, -15.0, 0.0])
 def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_like_background(contrast: float) -> None:
     strip, edge, pictures = stepping(rim=True, contrast=contrast)
     known, ignored = (fitted(strip, edge - 1.4, pictures, shading)[:, 0] - edge for shading in (RIM, 0 * RIM))
     assert np.abs(known).max() < 0.15
     assert np.abs(ignored).max() > 2 * np.abs(known).max()
-
-
-def test_the_largest_step_is_where_means_differ_most():
-    rng = np.random.default_rng(4)
-    pictures = rng.normal(0, 1, (40, 700)).astype(np.float32)
-    begin = rng.integers(10, 30, 700)
-    pictures[np.arange(40)[:, None] >= begin] += 50
-    when, power = largest_steps(pictures, 6)
-    np.testing.assert_array_equal(when, begin)
-    # Of the means of six frames on either side: 6 * 6 / 12 * 50².
-    assert np.median(power) == pytest.approx(3 * 50**2, rel=0.05)
 
 
 FITS = "from test_kernels import *; s, e, p = stepping(); print(fitted(s, e + 1.4, p, RIM).tobytes().hex())"

@@ -195,11 +195,18 @@ def _fit(
         return _refusal("the speeds do not rise with the force, so there is no power law to fit", left_out)
     residual = data.log_force - log_B[data.vine] - n * data.log_speed
     scatter = math.sqrt(float(residual @ residual) / dof) if dof > 0 else math.nan
-    covariance = _covariance(data, n, speed_variance, force_variance, scatter, both_axes)
+    # Covariance of n and ln B, from the curvature of χ² at its minimum
+    design = np.column_stack([data.log_speed, data.member])
+    variance = force_variance + n**2 * speed_variance if both_axes else np.full(n_points, scatter**2)
+    covariance = np.asarray(np.linalg.pinv(design.T @ (design / variance[:, None])))
     draws = _resample(data, speed_variance, force_variance, resamples, seed, with_shared=False)
     total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
     estimate = np.concatenate([[n], log_B])
-    widening = _widening(data, dof)
+    # Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter needs
+    # Student's t instead of the normal distribution: percentile intervals are widened by as much.
+    sizes = np.array([n_points / (1 + n_vines), *np.bincount(data.vine)])
+    student = _student(dof) / 1.959964
+    widening = np.sqrt(sizes / np.maximum(sizes - 1, 0.5)) * student
     # 10: fewest points for bootstrap intervals (chosen)
     if n_points >= 10 and dof > 0:
         interval = "resampling whole trials"
@@ -246,6 +253,16 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
     """Variance of ln x_ss and of ln F for each point, shape (n_points,) each."""
     if not both_axes:
         return np.zeros_like(data.log_force), np.ones_like(data.log_force)
+    from scipy.optimize import brentq
+
+    def scatter_of(residual: Floats, stated: Floats) -> float:
+        """Variance s with Σ residual²/(stated + s) = dof, or nearly 0 where the stated variances suffice."""
+        squares, ends = residual**2, (1e-12, float(residual @ residual) / max(dof, 1) + 1e-12)
+        low, high = (float(np.sum(squares / (stated + s))) - max(dof, 1) for s in ends)
+        if not low > 0 > high:
+            return ends[0]
+        return float(brentq(lambda s: float(np.sum(squares / (stated + s))) - max(dof, 1), *ends))
+
     ones = np.ones((1, data.log_force.size))
     force_variance = data.force_error**2
     scatter, n = 1e-3, np.array([0.4])
@@ -257,31 +274,10 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
         residual = data.log_force - log_B[0][data.vine] - n[0] * data.log_speed
         # The scatter of ln F, beyond the stated errors, for which χ² equals its degrees of freedom.
         stated = force_variance + n[0] ** 2 * data.speed_error**2 + data.set_error**2
-        before, scatter = scatter, _unexplained(residual, stated, dof)
+        before, scatter = scatter, scatter_of(residual, stated)
         if abs(scatter - before) <= 1e-6 * (scatter + 1e-12):
             break
     return speed_variance, np.maximum(force_variance, 1e-14)
-
-
-def _unexplained(residual: Floats, stated: Floats, dof: int) -> float:
-    """Variance s with Σ residual²/(stated + s) = dof, or nearly 0 where the stated variances suffice."""
-    from scipy.optimize import brentq
-
-    def excess(s: float) -> float:
-        return float(np.sum(residual**2 / (stated + s))) - max(dof, 1)
-
-    largest = float(residual @ residual) / max(dof, 1) + 1e-12
-    floor = 1e-12
-    return float(brentq(excess, floor, largest)) if excess(floor) > 0 > excess(largest) else floor
-
-
-def _covariance(
-    data: Points, n: float, speed_variance: Floats, force_variance: Floats, scatter: float, both_axes: bool
-) -> Floats:
-    """Covariance of n and ln B, shape (1 + n_vines, 1 + n_vines), from the curvature of χ² at its minimum."""
-    design = np.column_stack([data.log_speed, data.member])
-    variance = force_variance + n**2 * speed_variance if both_axes else np.full(data.log_force.size, scatter**2)
-    return np.asarray(np.linalg.pinv(design.T @ (design / variance[:, None])))
 
 
 def _resample(
@@ -304,17 +300,6 @@ def _resample(
     n, log_B = slope(log_force, counts, data, speed_variance, force_variance)
     draws = np.column_stack([n, log_B])
     return draws[np.isfinite(draws).all(axis=1) & (n > 0)]
-
-
-def _widening(data: Points, dof: int) -> Floats:
-    """Factor by which percentile intervals must be widened, shape (1 + n_vines,). Resampling N points about p fitted
-    parameters reduces their variance by (N − p)/N, and an estimated scatter requires Student's t instead of the normal
-    distribution.
-    """
-    n_points = data.log_force.size
-    sizes = np.array([n_points / (1 + len(data.names)), *np.bincount(data.vine)])
-    student = _student(dof) / 1.959964
-    return np.sqrt(sizes / np.maximum(sizes - 1, 0.5)) * student
 
 
 def _percentiles(estimate: Floats, draws: Floats, widening: Floats) -> tuple[Floats, Floats]:
@@ -424,8 +409,7 @@ def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
     `x_ss_over_diameter_1_s`, their errors, `power` and `line` of both (see `scaling.regress`; those of the second in
     `over_diameter`), `monotonic`, and `refused`.
     """
-    speeds, efficiencies = _speed_families(conditions), _efficiency_families(conditions)
-    return {"steady_speed": speeds, "efficiency": efficiencies}
+    return {"steady_speed": _speed_families(conditions), "efficiency": _efficiency_families(conditions)}
 
 
 def alike(table: pd.DataFrame, within: Mapping[str, float]) -> list[pd.DataFrame]:
@@ -452,32 +436,33 @@ def _speed_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
         "pressure_kPa": SAME_SETTING_WITHIN,
         "growth_angle_deg": SAME_SETTING_WITHIN,
     }
-    return [_speed_family(group) for group in _of_several_sizes(bare, settings, ["diameter_mm"])]
+    columns = ("x_ss_m_s", "x_ss_sigma_m_s", "x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "n_steady")
+    families = []
+    for group in _of_several_sizes(bare, settings, ["diameter_mm"]):
+        sizes, speeds, relative = (
+            group[name].to_numpy(float) for name in ("diameter_mm", "x_ss_m_s", "x_ss_over_diameter_1_s")
+        )
+        families.append(
+            {
+                "along": "diameter_mm",
+                "pressure_kPa": float(group["pressure_kPa"].iloc[0]),
+                "wall_over_diameter": float(group["wall_over_diameter"].mean()),
+                "conditions": group["condition"].tolist(),
+                "vines": group["vine"].tolist(),
+                "sizes": sizes.tolist(),
+                **{name: group[name].tolist() for name in columns},
+                "monotonic": bool(np.all(np.diff(speeds) > 0)),
+                **_lines(sizes, speeds, np.unique(sizes).size),
+                "over_diameter": _lines(sizes, relative, np.unique(sizes).size),
+            }
+        )
+    return families
 
 
 def _of_several_sizes(table: pd.DataFrame, within: Mapping[str, float], sizes: list[str]) -> list[pd.DataFrame]:
     """Groups of rows that are alike but for their sizes, in the order of size; the largest group first."""
     groups = [group.sort_values(sizes) for group in alike(table, within)]
     return sorted((group for group in groups if len(group[sizes].drop_duplicates()) > 1), key=lambda group: -len(group))
-
-
-def _speed_family(group: pd.DataFrame) -> dict[str, Any]:
-    columns = ("x_ss_m_s", "x_ss_sigma_m_s", "x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "n_steady")
-    sizes, speeds, relative = (
-        group[name].to_numpy(float) for name in ("diameter_mm", "x_ss_m_s", "x_ss_over_diameter_1_s")
-    )
-    return {
-        "along": "diameter_mm",
-        "pressure_kPa": float(group["pressure_kPa"].iloc[0]),
-        "wall_over_diameter": float(group["wall_over_diameter"].mean()),
-        "conditions": group["condition"].tolist(),
-        "vines": group["vine"].tolist(),
-        "sizes": sizes.tolist(),
-        **{name: group[name].tolist() for name in columns},
-        "monotonic": bool(np.all(np.diff(speeds) > 0)),
-        **_lines(sizes, speeds, np.unique(sizes).size),
-        "over_diameter": _lines(sizes, relative, np.unique(sizes).size),
-    }
 
 
 def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
@@ -489,23 +474,23 @@ def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
         "efficiency_at_mm": 0.0,
         "growth_angle_deg": SAME_SETTING_WITHIN,
     }
-    several = _of_several_sizes(known, settings, ["diameter_mm", "thickness_um"])
-    return [_efficiency_family(group) for group in several]
-
-
-def _efficiency_family(group: pd.DataFrame) -> dict[str, Any]:
     efficiencies = ("efficiency", "efficiency_payload", "efficiency_with_weight")
     fixed = ("pressure_kPa", "payload_g", "length_mm", "efficiency_at_mm")
     each = ("diameter_mm", "thickness_um", "n_efficiency", "weight_share")
-    values = (name for key in efficiencies for name in (key, f"{key}_sigma"))
-    sizes = {name: group[name].to_numpy(float) for name in ("thickness_um", "diameter_mm")}
-    return {
-        **{name: float(group[name].iloc[0]) for name in fixed},
-        "conditions": group["condition"].tolist(),
-        "vines": group["vine"].tolist(),
-        **{name: group[name].tolist() for name in (*each, *values)},
-        "trend": {key: planes(sizes, group[key].to_numpy(float)) for key in efficiencies},
-    }
+    values = [name for key in efficiencies for name in (key, f"{key}_sigma")]
+    families = []
+    for group in _of_several_sizes(known, settings, ["diameter_mm", "thickness_um"]):
+        sizes = {name: group[name].to_numpy(float) for name in ("thickness_um", "diameter_mm")}
+        families.append(
+            {
+                **{name: float(group[name].iloc[0]) for name in fixed},
+                "conditions": group["condition"].tolist(),
+                "vines": group["vine"].tolist(),
+                **{name: group[name].tolist() for name in (*each, *values)},
+                "trend": {key: planes(sizes, group[key].to_numpy(float)) for key in efficiencies},
+            }
+        )
+    return families
 
 
 def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:

@@ -154,7 +154,11 @@ def steady_force(motion: TrialMotion, window: Window, model: Model) -> SteadyFor
     measured_Pa = np.empty(0) if trace_Pa is None else trace_Pa[(time_s >= window.from_s) & (time_s <= window.to_s)]
     measured_Pa = measured_Pa[np.isfinite(measured_Pa)]
     if measured_Pa.size:
-        pressure_Pa, sigma_Pa, source = float(measured_Pa.mean()), _mean_error(measured_Pa), "trace"
+        pressure_Pa, sigma_Pa, source = float(measured_Pa.mean()), 0.0, "trace"
+        if measured_Pa.size >= 4:  # error of the mean from the scatter about the linear trend, which is not an error
+            steps = np.arange(measured_Pa.size)
+            residual = measured_Pa - np.polyval(np.polyfit(steps, measured_Pa, 1), steps)
+            sigma_Pa = float(np.sqrt(np.sum(residual**2) / (measured_Pa.size - 2) / measured_Pa.size))
     else:
         pressure_Pa = float(np.mean(_modelled_pressure(motion, model)[inside]))
         sigma_Pa, source = trial.pressure_sigma_Pa, "set"
@@ -198,28 +202,10 @@ def _modelled_pressure(motion: TrialMotion, model: Model) -> Floats:
     return evaluate(model, motion.trial, since_s, travel_m, np.maximum(kinematics.lead_velocity_m_s, 0.0)).pressure_Pa
 
 
-def _mean_error(measured_Pa: Floats) -> float:
-    """Standard error of the mean of a trace, from the scatter about its linear trend, which is not an error."""
-    if measured_Pa.size < 4:
-        return 0.0
-    steps = np.arange(measured_Pa.size)
-    residual = measured_Pa - np.polyval(np.polyfit(steps, measured_Pa, 1), steps)
-    return float(np.sqrt(np.sum(residual**2) / (measured_Pa.size - 2) / measured_Pa.size))
-
-
 def why_not_in_fit(trial: Trial) -> str:
     """Return why a trial cannot enter the damping fit whatever its motion; blank if it can."""
     if trial.travel_ratio != 2:
         return "a body that moves as a whole has no eversion damping"
     if trial.payload_kg > 0:
         return f"carries a payload of {trial.payload_kg * 1e3:g} g"
-    return ""
-
-
-def why_not_force(force: SteadyForce | None) -> str:
-    """Return why a force cannot enter the damping fit; blank if it can."""
-    if force is None:
-        return "no steady window"
-    if not force.force_N > 0:
-        return f"the force in the window is {force.force_N:.3g} N: the pressure does not exceed the yield pressure"
     return ""

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.records import END_FRACTION, Floats, Indices, Kinematics, Track, Window, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
@@ -88,39 +87,38 @@ def _ar1_sd(weights: Floats, rho: float) -> float:
     return math.sqrt(max(float(weights @ correlated(weights, rho)), 0.0))
 
 
-class RangeExtremes:
-    """Largest value in any stretch of an array in constant time (sparse table: Bender and Farach-Colton 2000)."""
+def _range_maximum(values: Floats) -> Callable[[Indices, Indices], Floats]:
+    """A function for the largest value from `first` to `last`, shape (n_ranges,) each, in constant time (sparse table:
+    Bender and Farach-Colton 2000).
+    """
+    rows, span = [np.asarray(values, dtype=float)], 1
+    while 2 * span <= rows[0].size:
+        row = np.full_like(rows[0], -np.inf)
+        row[:-span] = np.maximum(rows[-1][:-span], rows[-1][span:])
+        rows.append(row)
+        span *= 2
+    table = np.array(rows)
 
-    def __init__(self, values: Floats) -> None:
-        rows = [np.asarray(values, dtype=float)]
-        span = 1
-        while 2 * span <= rows[0].size:
-            previous = rows[-1]
-            row = np.full_like(previous, -np.inf)
-            row[: previous.size - span] = np.maximum(previous[: previous.size - span], previous[span:])
-            rows.append(row)
-            span *= 2
-        self.table = np.array(rows)
-
-    def maximum(self, first: Indices, last: Indices) -> Floats:
-        """Return the maximum over ranges of points. Shapes: first, last (n_ranges,) → (n_ranges,)."""
+    def maximum(first: Indices, last: Indices) -> Floats:
         level = np.frexp((last - first + 1).astype(float))[1] - 1
-        return np.maximum(self.table[level, first], self.table[level, last - (1 << level) + 1])
+        return np.maximum(table[level, first], table[level, last - (1 << level) + 1])
+
+    return maximum
 
 
 def speed_bounds(low: Floats, high: Floats, span: int) -> Bounds:
     """Return a function for the highest lower and the lowest upper limit of the speeds in a window. Each speed takes
     `span` frames from its point on. Shapes: low, high (n − span,).
     """
-    highest_low, lowest_high = RangeExtremes(low), RangeExtremes(-high)
+    highest_low, lowest_high = _range_maximum(low), _range_maximum(-high)
 
     def bounds(first: Indices, last: Indices) -> tuple[Floats, Floats]:
         fits = last - first >= span
         stop = np.minimum(np.where(fits, last - span, first), low.size - 1)
         start = np.minimum(first, stop)
         return (
-            np.where(fits, highest_low.maximum(start, stop), -np.inf),
-            np.where(fits, -lowest_high.maximum(start, stop), np.inf),
+            np.where(fits, highest_low(start, stop), -np.inf),
+            np.where(fits, -lowest_high(start, stop), np.inf),
         )
 
     return bounds
@@ -159,7 +157,11 @@ def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -
     # Row k has the weights of the highest coefficient of a fit of order k: line, parabola, cubic.
     rows = [np.linalg.pinv(np.polynomial.legendre.legvander(u, k))[k] for k in range(1, order + 1)]
     residual = y - np.polynomial.legendre.legval(u, np.polynomial.legendre.legfit(u, y, order))
-    noise_m = _local_noise(residual, noise_m, rho, order + 1)
+    # The track's noise, or the scatter in this window where it is larger by more than three standard errors
+    effective = n * (1 - rho**2) / (1 + rho**2) - order - 1
+    variance = float(np.sum(residual**2)) / max(n - order - 1, 1)
+    if effective >= 2 and variance > noise_m**2 * (1 + 3 * math.sqrt(2 / effective)):
+        noise_m = math.sqrt(variance)
     slope, curve = float(rows[0] @ y), float(rows[1] @ y)
     errors = [noise_m * _ar1_sd(row, rho) for row in rows]
     bend, bend_sigma = (float(rows[2] @ y), errors[2]) if order == 3 else (0.0, 0.0)
@@ -172,16 +174,6 @@ def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -
         bend_m_s=bend / half,
         bend_sigma_m_s=bend_sigma / half,
     )
-
-
-def _local_noise(residual: Floats, noise_m: float, rho: float, terms: int) -> float:
-    """The track's noise, or the scatter in this window where it is larger by more than three standard errors."""
-    n = residual.size
-    effective = n * (1 - rho**2) / (1 + rho**2) - terms
-    if effective < 2:
-        return noise_m
-    scatter = float(np.sum(residual**2)) / (n - terms)
-    return math.sqrt(scatter) if scatter > noise_m**2 * (1 + 3 * math.sqrt(2 / effective)) else noise_m
 
 
 def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
@@ -379,7 +371,7 @@ class _Search:
             best = better or best
         return best, ""
 
-    def _best(self, starts: NDArray[np.int_], ends: NDArray[np.int_]) -> tuple[tuple[int, int] | None, str]:
+    def _best(self, starts: Indices, ends: Indices) -> tuple[tuple[int, int] | None, str]:
         first, last = (grid.ravel() for grid in np.meshgrid(starts, ends, indexing="ij"))
         long_enough = (last - first + 1 >= 3) & (last <= self.latest)
         first, last = first[long_enough], last[long_enough]
@@ -407,9 +399,7 @@ class _Search:
         winner = index[np.lexsort((worst[index], -points[index]))[0]]
         return (int(first[winner]), int(last[winner])), ""
 
-    def _nearest(
-        self, first: NDArray[np.int_], last: NDArray[np.int_], mean: Floats, drift: Floats, sigma: Floats
-    ) -> str:
+    def _nearest(self, first: Indices, last: Indices, mean: Floats, drift: Floats, sigma: Floats) -> str:
         worst = np.where(mean > 0, np.abs(drift) + 1.96 * sigma, np.inf)
         near = int(np.argmin(worst))
         count, change, error = last[near] - first[near] + 1, 100 * drift[near], 196 * sigma[near]
@@ -440,43 +430,36 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
     if time_s.size < min_points + 2:
         return Window("paper", False, f"{time_s.size} points are too few for {min_points} central differences")
     velocity = (position_m[2:] - position_m[:-2]) / (time_s[2:] - time_s[:-2])
-    run = _longest_run(velocity, cv_limit, min_points)
-    if run is None:
-        return Window("paper", False, f"no {min_points} consecutive velocities vary by less than {cv_limit:.0%}")
-    start, stop = run
-    chosen = velocity[start : stop + 1] * travel_ratio
-    mean, sd = float(chosen.mean()), float(chosen.std(ddof=1))
-    drift = float(np.polyfit(np.linspace(-0.5, 0.5, chosen.size), chosen, 1)[0]) / mean
-    cv = sd / abs(mean)
-    return Window(
-        rule="paper",
-        accepted=True,
-        reason=f"longest run with a coefficient of variation below {cv_limit:.0%}: {chosen.size} velocities, {cv:.2%}",
-        from_s=float(time_s[start + 1]),
-        to_s=float(time_s[stop + 1]),
-        n_points=chosen.size,
-        x_ss_m_s=mean,
-        x_ss_sigma_m_s=sd / math.sqrt(chosen.size),
-        drift=drift,
-        cv=cv,
-    )
-
-
-def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[int, int] | None:
-    """First and last index of the longest run with coefficient of variation below the limit; the lowest of ties."""
     level = float(np.median(velocity))
     zero = 1e-9 * float(np.max(np.abs(velocity)))  # a mean below this is a rounding error of 0
     total = np.concatenate([[0.0], np.cumsum(velocity - level)])
     square = np.concatenate([[0.0], np.cumsum((velocity - level) ** 2)])
-    for length in range(velocity.size, min_points - 1, -1):
+    for length in range(velocity.size, min_points - 1, -1):  # the longest; of several the one that varies least
         sums = total[length:] - total[:-length]
         spread = np.maximum(square[length:] - square[:-length] - sums**2 / length, 0.0) / (length - 1)
         mean = sums / length + level
         good = np.flatnonzero((spread < (cv_limit * mean) ** 2) & (np.abs(mean) > zero))
         if good.size:
             start = int(good[np.argmin(spread[good] / mean[good] ** 2)])
-            return start, start + length - 1
-    return None
+            break
+    else:
+        return Window("paper", False, f"no {min_points} consecutive velocities vary by less than {cv_limit:.0%}")
+    chosen = velocity[start : start + length] * travel_ratio
+    x_ss, sd = float(chosen.mean()), float(chosen.std(ddof=1))
+    drift = float(np.polyfit(np.linspace(-0.5, 0.5, chosen.size), chosen, 1)[0]) / x_ss
+    cv = sd / abs(x_ss)
+    return Window(
+        rule="paper",
+        accepted=True,
+        reason=f"longest run with a coefficient of variation below {cv_limit:.0%}: {chosen.size} velocities, {cv:.2%}",
+        from_s=float(time_s[start + 1]),
+        to_s=float(time_s[start + length]),
+        n_points=chosen.size,
+        x_ss_m_s=x_ss,
+        x_ss_sigma_m_s=sd / math.sqrt(chosen.size),
+        drift=drift,
+        cv=cv,
+    )
 
 
 # ------------------------------------------------------------------------------

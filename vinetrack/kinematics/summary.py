@@ -18,7 +18,7 @@ from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError
-from vinetrack.experiment.settings import RunSettings, SteadySettings
+from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.damping import LEAST_STEADY_SHARE, fit_laws, mark_left_out
 from vinetrack.kinematics.force import (
     Release,
@@ -29,7 +29,6 @@ from vinetrack.kinematics.force import (
     known_pressure,
     paper_force_N,
     steady_force,
-    why_not_force,
     why_not_in_fit,
 )
 from vinetrack.kinematics.steady import gated_window, paper_window, quasi_steady_window, user_window
@@ -80,6 +79,9 @@ def _row(trial: Trial, group: pd.DataFrame, final_at_fraction: float, efficiency
     if n_steady < LEAST_STEADY_SHARE * len(group):
         speed = speed_sigma = math.nan
     final, final_sigma, n_final = mean_with_error(group["final_lead_velocity_m_s"].to_numpy(float))
+    mean, sigma, count = mean_with_error(group["efficiency"].to_numpy(float))
+    payload, weight = efficiency_shares(trial, efficiency_at_mm / 1e3)
+    shares = (("", 1.0), ("_payload", payload), ("_with_weight", 1 / (1 + weight)))
     return {
         "condition": trial.condition,
         "vine": trial.vine,
@@ -99,18 +101,12 @@ def _row(trial: Trial, group: pd.DataFrame, final_at_fraction: float, efficiency
         "final_at_mm": 1e3 * final_at_fraction * trial.length_m,
         "final_lead_velocity_m_s": final,
         "final_lead_velocity_sigma_m_s": final_sigma,
-        **_efficiencies(trial, group["efficiency"].to_numpy(float), efficiency_at_mm),
+        "n_efficiency": count,
+        "efficiency_at_mm": efficiency_at_mm if count else math.nan,
+        **{f"efficiency{name}": mean * factor for name, factor in shares},
+        **{f"efficiency{name}_sigma": sigma * factor for name, factor in shares},
+        "weight_share": weight if count else math.nan,
     }
-
-
-def _efficiencies(trial: Trial, values: Floats, at_mm: float) -> dict[str, object]:
-    mean, sigma, count = mean_with_error(values)
-    payload, weight = efficiency_shares(trial, at_mm / 1e3)
-    row: dict[str, object] = {"n_efficiency": count, "efficiency_at_mm": at_mm if count else math.nan}
-    for name, factor in (("", 1.0), ("_payload", payload), ("_with_weight", 1 / (1 + weight))):
-        row[f"efficiency{name}"] = mean * factor
-        row[f"efficiency{name}_sigma"] = sigma * factor
-    return row | {"weight_share": weight if count else math.nan}
 
 
 def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float, float, int]:
@@ -160,16 +156,13 @@ def efficiency_shares(trial: Trial, lead_travel_m: float) -> tuple[float, float]
     """
     mass_kg = float(trial.moving_mass_kg(lead_travel_m))
     gas_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
-    weight_J = GRAVITY_M_S2 * math.cos(trial.growth_angle_rad) * _mass_along(trial, trial.travel_ratio * lead_travel_m)
-    return trial.payload_kg / mass_kg if mass_kg > 0 else math.nan, weight_J / gas_J if gas_J > 0 else math.nan
-
-
-def _mass_along(trial: Trial, tail_travel_m: float) -> float:
-    """∫ m(x) dx from the release, kg·m: the mass of film decreases linearly until none is left."""
+    # ∫ m(x) dx from the release, kg·m: the mass of film decreases linearly until none is left.
     film_kg = trial.linear_density_kg_m * (trial.length_m if math.isfinite(trial.length_m) else 0.0)
-    loss_kg_m = trial.mass_loss_kg_m
-    until_m = min(tail_travel_m, film_kg / loss_kg_m) if loss_kg_m > 0 else tail_travel_m
-    return trial.payload_kg * tail_travel_m + film_kg * until_m - 0.5 * loss_kg_m * until_m**2
+    loss_kg_m, tail_m = trial.mass_loss_kg_m, trial.travel_ratio * lead_travel_m
+    until_m = min(tail_m, film_kg / loss_kg_m) if loss_kg_m > 0 else tail_m
+    mass_kg_m = trial.payload_kg * tail_m + film_kg * until_m - 0.5 * loss_kg_m * until_m**2
+    weight_J = GRAVITY_M_S2 * math.cos(trial.growth_angle_rad) * mass_kg_m
+    return trial.payload_kg / mass_kg if mass_kg > 0 else math.nan, weight_J / gas_J if gas_J > 0 else math.nan
 
 
 FEWEST_POINTS = 5  # Fewest usable points of a track (derived)
@@ -218,7 +211,14 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
     )
     release = find_release(track, kinematics)
     track = flag_rest(track, release)
-    return TrialMotion(trial, track, kinematics, release, _windows(trial, track, kinematics, settings.steady))
+    limits, ratio = settings.steady, trial.travel_ratio
+    windows = {
+        "gated": gated_window(track, kinematics, limits, length_m=trial.length_m),
+        "paper": paper_window(track, travel_ratio=ratio, cv_limit=limits.paper_cv, min_points=limits.paper_points),
+    }
+    if trial.steady_window_s is not None:
+        windows["user"] = user_window(track, kinematics, trial.steady_window_s, limits, trial.length_m)
+    return TrialMotion(trial, track, kinematics, release, windows)
 
 
 def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
@@ -243,7 +243,17 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         raise TrialError(str(error)) from error
     track, kinematics, windows, window = motion.track, motion.kinematics, steady.windows, steady.window
     moved_m = track.lead_position_m[track.usable]
-    warnings = _warnings(track, motion.release, windows)
+    # Speed at the set fraction of the length, and efficiency at the set growth; NaN where growth did not get there
+    travel_m, at_m = kinematics.lead_position_m - motion.release.lead_position_m, settings.efficiency_at_mm / 1e3
+    final = float(kinematics.lead_velocity_m_s[-1])
+    if math.isfinite(trial.length_m):
+        final_m = settings.final_at_fraction * trial.length_m
+        final = lead_velocity_at(travel_m, kinematics.lead_velocity_m_s, final_m)
+    warnings = list(track.notes)
+    if motion.release.moving_from_start or not math.isfinite(motion.release.time_s):
+        warnings.append(motion.release.reason)
+    if "user" in windows and (windows["user"].doubtful or not windows["user"].accepted):
+        warnings.append(windows["user"].reason)
     notes = [*warnings, *([] if steady.chosen else [f"no steady window: {windows['gated'].reason}"])]
     row = {
         "trial": trial.name,
@@ -263,23 +273,12 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         "x_ss_paper_m_s": windows["paper"].x_ss_m_s,
         "cv": window.cv,
         "force_N": steady.force.force_N if steady.force else math.nan,
-        **_end_columns(trial, kinematics, motion.release, settings),
+        "final_lead_velocity_m_s": final,
+        "efficiency": energy_efficiency(trial, at_m, lead_velocity_at(travel_m, kinematics.lead_velocity_m_s, at_m)),
         "tube_width_mm": math.nan,
         "growth_mm": 1e3 * float(moved_m.max() - motion.release.lead_position_m) if moved_m.size else math.nan,
     }
     return TrialResult(track, kinematics, motion.release, windows, row, damping_point(trial, steady))
-
-
-def _windows(trial: Trial, track: Track, kinematics: Kinematics, limits: SteadySettings) -> dict[str, Window]:
-    windows = {
-        "gated": gated_window(track, kinematics, limits, length_m=trial.length_m),
-        "paper": paper_window(
-            track, travel_ratio=trial.travel_ratio, cv_limit=limits.paper_cv, min_points=limits.paper_points
-        ),
-    }
-    if trial.steady_window_s is not None:
-        windows["user"] = user_window(track, kinematics, trial.steady_window_s, limits, trial.length_m)
-    return windows
 
 
 def _chosen(windows: Mapping[str, Window]) -> Window | None:
@@ -291,32 +290,14 @@ def _chosen(windows: Mapping[str, Window]) -> Window | None:
     return None
 
 
-def _warnings(track: Track, release: Release, windows: Mapping[str, Window]) -> list[str]:
-    warnings = list(track.notes)
-    if release.moving_from_start or not math.isfinite(release.time_s):
-        warnings.append(release.reason)
-    if "user" in windows and (windows["user"].doubtful or not windows["user"].accepted):
-        warnings.append(windows["user"].reason)
-    return warnings
-
-
-def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, settings: RunSettings) -> dict[str, object]:
-    """Speed at the set fraction of the length, and efficiency at the set growth; NaN where growth did not get there."""
-    travel_m = kinematics.lead_position_m - release.lead_position_m
-    velocity_m_s = kinematics.lead_velocity_m_s
-    if math.isfinite(trial.length_m):
-        final = lead_velocity_at(travel_m, velocity_m_s, settings.final_at_fraction * trial.length_m)
-    else:
-        final = float(velocity_m_s[-1])
-    at_m = settings.efficiency_at_mm / 1e3
-    efficiency = energy_efficiency(trial, at_m, lead_velocity_at(travel_m, velocity_m_s, at_m))
-    return {"final_lead_velocity_m_s": final, "efficiency": efficiency}
-
-
 def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
     """Return the row of a trial in the damping fit, with `used` and the `reason` if not."""
     window, force = steady.window, steady.force
-    reason, nan = why_not_in_fit(trial) or why_not_force(force), math.nan
+    reason, nan = why_not_in_fit(trial), math.nan
+    if force is None:
+        reason = reason or "no steady window"
+    elif not reason and not force.force_N > 0:
+        reason = f"the force in the window is {force.force_N:.3g} N: the pressure does not exceed the yield pressure"
     return {
         "trial": trial.name,
         "vine": trial.vine,

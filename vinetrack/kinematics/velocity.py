@@ -46,7 +46,12 @@ class WindowFits:
         """
         half = self.half_s[window]
         u = (time_s - self.middle_s[window]) / half
-        value, slope, curve = _rows(u, self.coefficients.shape[0])
+        # Powers of u and their first and second derivatives, each (terms, k)
+        k = np.arange(self.coefficients.shape[0])[:, None]
+        value = u**k
+        slope, curve = np.zeros_like(value), np.zeros_like(value)
+        slope[1:] = k[1:] * value[:-1]
+        curve[2:] = k[2:] * (k[2:] - 1) * value[:-2]
         c = self.coefficients[:, window]
         values = np.array([(c * value).sum(axis=0), (c * slope).sum(axis=0) / half, (c * curve).sum(axis=0) / half**2])
         variance = np.einsum("ik,ij,jk->k", slope, self.even_covariance, slope)
@@ -72,7 +77,10 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
     weights, covariance, terms = _scaled(*_even_design(width, order), order, rho)
     results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
-    odd = _uneven_windows(time_s, width)
+    # Odd windows contain a spacing different from the median, by more than 1 % (chosen).
+    spacing = np.diff(time_s)
+    uneven = np.concatenate([[0], np.cumsum(np.abs(spacing / np.median(spacing) - 1) > 0.01)])
+    odd = uneven[width - 1 :] > uneven[: uneven.size - width + 1]
     odd_covariance = None
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
@@ -83,26 +91,6 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
         odd_covariance[:, :, odd] = uneven_covariance.transpose(1, 2, 0)
     misfit = np.sum(results[order + 1 :] ** 2, axis=0)
     return WindowFits(width, results[: order + 1], middle, half, covariance[0], odd, odd_covariance, misfit, terms)
-
-
-def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
-    """Powers of u and their first and second derivatives, each (terms, k)."""
-    k = np.arange(terms)[:, None]
-    value = u**k
-    slope: Floats = np.zeros_like(value)
-    curve: Floats = np.zeros_like(value)
-    slope[1:] = k[1:] * value[:-1]
-    curve[2:] = k[2:] * (k[2:] - 1) * value[:-2]
-    return value, slope, curve
-
-
-def _uneven_windows(time_s: Floats, width: int) -> Bools:
-    """Mask of windows that contain a spacing different from the median, shape (n − width + 1,)."""
-    spacing = np.diff(time_s)
-    # 0.01: spacings within this fraction of their median count as even (chosen)
-    is_uneven = np.abs(spacing / np.median(spacing) - 1) > 0.01
-    count = np.concatenate([[0], np.cumsum(is_uneven)])
-    return count[width - 1 :] > count[: count.size - width + 1]
 
 
 def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:
@@ -146,10 +134,6 @@ def correlated(weights: Floats, rho: float) -> Floats:
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)
 
 
-# Window, velocity and error for unit noise at every point, of centred windows of one width
-Centred = tuple[Indices, Floats, Floats]
-
-
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
     """Estimate position, velocity and acceleration of the leading edge at the usable points of a track."""
     usable = track.usable
@@ -190,7 +174,16 @@ def smooth(
     limits = (np.inf, 12.0, 15.3, 18.0, 20.5)
     fits_points = [fit.misfit <= noise_m**2 * limits[fit.misfit_terms] for fit in fits]
     centred = [fit.velocities(time_s, 0.0) for fit in fits]
-    low, high, centred_error = _agreement(centred, fits_points, noise_m, kappa)
+    # Range of velocities on which the centred windows agree, from the narrowest up, and the least error; unbounded
+    # where not even the narrowest window fits its points: then one-sided windows decide.
+    low, high, centred_error = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n)
+    all_agree = np.ones(n, dtype=bool)
+    for (window, velocity, gain), good in zip(centred, fits_points, strict=True):
+        half_width = kappa * noise_m * gain
+        lower, upper = np.maximum(low, velocity - half_width), np.minimum(high, velocity + half_width)
+        all_agree &= good[window] & (lower <= upper)
+        low, high = np.where(all_agree, lower, low), np.where(all_agree, upper, high)
+        centred_error = np.where(all_agree, noise_m * gain, centred_error)
     # The narrowest window is used where no wider one is; its error is that of the noise, or of its misfit if larger.
     window_used, _, gain = centred[0]
     window_used, good = window_used.copy(), fits_points[0][window_used]
@@ -215,22 +208,3 @@ def smooth(
         values[:, points] = fit.at(time_s[points], window_used[points])[0]
     # 0.5: least standard error of a one-sided window, relative to that of the centred ones (chosen)
     return values, np.maximum(sigma, 0.5 * centred_error), np.array(widths)[fit_used]
-
-
-def _agreement(
-    centred: list[Centred], fits_points: list[Bools], noise_m: float, kappa: float
-) -> tuple[Floats, Floats, Floats]:
-    """Range of velocities on which the centred windows agree, from the narrowest up, and the least error; (n,) each.
-    Unbounded where not even the narrowest window fits its points: then one-sided windows decide.
-    """
-    n = centred[0][0].size
-    low, high = np.full(n, -np.inf), np.full(n, np.inf)
-    least_error = np.zeros(n)
-    all_agree = np.ones(n, dtype=bool)
-    for (window, velocity, gain), good in zip(centred, fits_points, strict=True):
-        half_width = kappa * noise_m * gain
-        lower, upper = np.maximum(low, velocity - half_width), np.minimum(high, velocity + half_width)
-        all_agree &= good[window] & (lower <= upper)
-        low, high = np.where(all_agree, lower, low), np.where(all_agree, upper, high)
-        least_error = np.where(all_agree, noise_m * gain, least_error)
-    return low, high, least_error

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, join_flags, with_flag
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
@@ -70,7 +69,12 @@ def _correct_timing(track: Track) -> Track:
     # Spacings must be whole numbers of frames to within 5 %.
     if np.any(np.abs(frames - np.rint(frames)) > 0.05 * np.maximum(np.rint(frames), 1.0)):
         return track
-    out = _flag_visible_gaps(track, np.rint(frames).astype(int))
+    out = track
+    # `gap` on the first row after each spacing of two frames or more that nothing has marked yet
+    for before in np.flatnonzero((np.rint(frames) > 1) & ~with_flag(track.flag[1:], "gap")):
+        missing = frames_are(int(np.rint(frames[before])) - 1)
+        note = f"{missing} missing before {track.time_s[before + 1]:.5g} s, as the times say"
+        out = _mark(out, int(before) + 1, "gap", note)
     noise_m, rho = _noise(out)
     out = _retime_known_copies(out, step_s, noise_m, rho)
     checked_to = 0
@@ -131,16 +135,6 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: floa
     return track
 
 
-def _flag_visible_gaps(track: Track, frames: NDArray[np.int_]) -> Track:
-    """Flag `gap` on the first row after each spacing of two frames or more that nothing has marked yet."""
-    out = track
-    for before in np.flatnonzero((frames > 1) & ~with_flag(track.flag[1:], "gap")):
-        missing = int(frames[before]) - 1
-        note = f"{frames_are(missing)} missing before {track.time_s[before + 1]:.5g} s, as the times say"
-        out = _mark(out, int(before) + 1, "gap", note)
-    return out
-
-
 def frames_are(frames: int) -> str:
     """A number of frames as the beginning of a sentence, with its verb."""
     return "1 frame is" if frames == 1 else f"{frames} frames are"
@@ -148,6 +142,8 @@ def frames_are(frames: int) -> str:
 
 def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> _Fault | None:
     """The first fault on a row beyond `after`."""
+    import pandas as pd
+
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
         return None
@@ -156,7 +152,15 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     speed = np.diff(y) / np.diff(frame)
     stated = track.lead_position_sigma_m[rows]
     noise_m = noise_m[rows]
-    for i in _suspect_steps(speed, np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))):
+    # Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening. A
+    # point with a large stated error, such as one that a door half hides, makes no step conclusive about frames.
+    # The neighbours are medians of the three steps before and the three after, NaN where there are none.
+    earlier, later = (
+        pd.Series(one_way).shift(1).rolling(3, min_periods=1).median().to_numpy() for one_way in (speed, speed[::-1])
+    )
+    smaller, larger = np.fmin(np.abs(earlier), np.abs(later[::-1])), np.fmax(earlier, later[::-1])
+    clear = larger > CLEAR_STEP_SIGMAS * np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))
+    for i in np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * larger))).tolist():
         if rows[i + 1] <= after:
             continue
         around = frame, y, i, noise_m[i], rho, rows
@@ -166,26 +170,7 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     return None
 
 
-def _suspect_steps(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
-    """Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening.
-    A point with a large stated error, such as one that a door half hides, makes no step that is conclusive about
-    frames.
-    """
-    import pandas as pd
-
-    # Medians of the three steps before and the three after each step, NaN where there are none.
-    before, after = (
-        pd.Series(one_way).shift(1).rolling(3, min_periods=1).median().to_numpy() for one_way in (speed, speed[::-1])
-    )
-    after = after[::-1]
-    smaller = np.fmin(np.abs(before), np.abs(after))
-    clear = np.fmax(before, after) > CLEAR_STEP_SIGMAS * noise_m
-    return np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * np.fmax(before, after))))
-
-
-def _dropped_frames(
-    frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: NDArray[np.int_]
-) -> _Fault | None:
+def _dropped_frames(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
     """The fault where frames are missing between points i and i + 1, or None."""
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
@@ -206,9 +191,7 @@ def _dropped_frames(
     return _Fault("dropped", int(rows[i + 1]), missing)
 
 
-def _repeated_frame(
-    frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: NDArray[np.int_]
-) -> _Fault | None:
+def _repeated_frame(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: Indices) -> _Fault | None:
     """The fault where point i + 1 repeats point i, whether it replaced a frame or was inserted, or None."""
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 2, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
@@ -245,9 +228,26 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
         sides = (frame[left][-points:], y[left][-points:]), (frame[right][:points], y[right][:points])
         if min(t.size for t, _ in sides) < SIDE_POINTS[-1]:
             return None
-        jump = _parabola_with_step(sides, noise_m, rho)
-        if jump is not None:
-            return jump
+        (t_left, y_left), (t_right, y_right) = sides
+        near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
+        near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
+        slower, faster = min(near_left, near_right), max(near_left, near_right)
+        # Both sides must move by three quarters of a clear step, and a larger ratio of speeds may be acceleration.
+        if slower < 0.75 * CLEAR_STEP_SIGMAS * noise_m or slower <= 0 or faster > 1.8 * slower:
+            continue
+        both, t = np.concatenate([y_left, y_right]), np.concatenate([t_left, t_right]) - (t_left[-1] + t_right[0]) / 2
+        basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
+        weights = np.linalg.pinv(basis)
+        fit = weights @ both
+        misfit_m = math.sqrt(float(np.sum((both - basis @ fit) ** 2)) / (t.size - 4))
+        step = float(fit[1])
+        # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
+        if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
+            continue
+        lag = np.abs(np.subtract.outer(t, t))
+        correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
+        sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
+        return _Jump(float(fit[3]), sigma, step, sides)
     return None
 
 
@@ -260,8 +260,12 @@ def _outlier_explains(sides: _Sides, noise_m: float) -> bool:
     t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
     t = t - (t_left[-1] + t_right[0]) / 2
     smooth = np.column_stack([np.ones(t.size), t, t**2])
-    with_jump = _residual_squares(np.column_stack([smooth, t > 0]), y)
-    with_outlier = min(_residual_squares(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
+
+    def squares(basis: Floats, y: Floats) -> float:
+        return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
+
+    with_jump = squares(np.column_stack([smooth, t > 0]), y)
+    with_outlier = min(squares(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
     # A single outlier must leave this many times the sum of squares that a jump leaves.
     return with_outlier < max(3.0 * with_jump, with_jump + (4.0 * noise_m) ** 2)
 
@@ -281,38 +285,6 @@ def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) 
     fit = np.linalg.pinv(basis) @ points
     misfit_m = math.sqrt(float(np.sum((points - basis @ fit) ** 2)) / (t.size - 5))
     return float(fit[4]) if misfit_m < 2.5 * noise_m else sign * math.inf
-
-
-def _residual_squares(basis: Floats, y: Floats) -> float:
-    """Sum of squares that least squares leave."""
-    return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
-
-
-def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> _Jump | None:
-    """Fit a parabola with a step, if both sides follow it at a clear and similar speed."""
-    (t_left, y_left), (t_right, y_right) = sides
-    near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
-    near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
-    # Both sides must move by three quarters of a clear step.
-    if min(near_left, near_right) < 0.75 * CLEAR_STEP_SIGMAS * noise_m or min(near_left, near_right) <= 0:
-        return None
-    # A larger ratio of the speeds before and after may be acceleration.
-    if max(near_left, near_right) > 1.8 * min(near_left, near_right):
-        return None
-    t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
-    t = t - (t_left[-1] + t_right[0]) / 2
-    basis = np.column_stack([np.ones(t.size), t, t**2, t > 0])
-    weights = np.linalg.pinv(basis)
-    fit = weights @ y
-    misfit_m = math.sqrt(float(np.sum((y - basis @ fit) ** 2)) / (t.size - 4))
-    step = float(fit[1])
-    # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
-    if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
-        return None
-    lag = np.abs(np.subtract.outer(t, t))
-    correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
-    sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
-    return _Jump(float(fit[3]), sigma, step, sides)
 
 
 def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:

@@ -98,8 +98,14 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     """Times of evenly spaced frames before they were rounded, and a sentence that says so. Returns time_s (unchanged
     where they are not rounded, or not evenly spaced), note (blank where nothing was done). Shapes: time_s (n,) → (n,).
     """
-    digit_s = _last_digit_s(time_s) if time_s.size >= 8 else 0.0
-    if digit_s == 0:
+    if time_s.size < 8 or not np.isfinite(time_s).all():
+        return time_s, ""
+    for digits in range(7):  # with more decimals a time does not count as rounded
+        scaled = time_s * 10.0**digits
+        if np.max(np.abs(scaled - np.round(scaled))) < 1e-6 * max(1.0, float(np.max(np.abs(scaled))) * 1e-6):
+            digit_s = float(10.0**-digits)
+            break
+    else:
         return time_s, ""
     place = np.arange(time_s.size, dtype=float)
     step_s, first_s = np.polyfit(place, time_s, 1)
@@ -110,18 +116,6 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
         return time_s, ""
     rounded, spacing = f"{1e3 * digit_s:g} ms", f"{1e3 * step_s:.3g} ms"
     return even_s, f"Times are rounded to {rounded}; evenly spaced ones, {spacing} apart, are used instead."
-
-
-def _last_digit_s(time_s: Floats) -> float:
-    """Decimal to which all times are rounded, s; 0 where they are not, or have more decimals."""
-    if not np.isfinite(time_s).all():
-        return 0.0
-    # Decimals from which a time does not count as rounded.
-    for digits in range(7):
-        scaled = time_s * 10.0**digits
-        if np.max(np.abs(scaled - np.round(scaled))) < 1e-6 * max(1.0, float(np.max(np.abs(scaled))) * 1e-6):
-            return float(10.0**-digits)
-    return 0.0
 
 
 # ------------------------------------------------------------------------------
@@ -143,14 +137,22 @@ def _tdms_trace(path: Path) -> tuple[Floats, Floats]:
         data = path.read_bytes()
     except OSError as error:
         raise TrackError("cannot be read", f"{error.strerror}") from None
-    _require_whole(data)
+    # Of a file that is cut short npTDMS reads the rest: the lengths that its segments state are followed.
+    place, damaged = 0, "export it from LabVIEW again, or as CSV"
+    while place < len(data):
+        length = data[place + 12 : place + 20]
+        if data[place : place + 4] != b"TDSm" or len(length) < 8:
+            raise TrackError("is no whole TDMS file", damaged)
+        place += 28 + int.from_bytes(length, "big" if data[place + 4] & 1 << 6 else "little")
+    if place > len(data):
+        raise TrackError("is cut short", damaged)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             groups = TdmsFile.read(io.BytesIO(data)).groups()
             found = [(channel.name, channel.properties, channel[:]) for group in groups for channel in group.channels()]
     except Exception as error:  # Damaged files end in errors of many kinds.
-        raise TrackError(f"is no whole TDMS file ({error})", "export it from LabVIEW again, or as CSV") from None
+        raise TrackError(f"is no whole TDMS file ({error})", damaged) from None
     named = {}
     for name, properties, values in found:
         unit = str(properties.get("unit_string", ""))
@@ -183,18 +185,6 @@ def _in_unit(name: str, values: np.ndarray, wanted: str) -> Floats:
         raise TrackError(f"channel {name}: {error}") from None
 
 
-def _require_whole(data: bytes) -> None:
-    """Refuse a file that is cut short, of which npTDMS reads the rest: follow the lengths that its segments state."""
-    place = 0
-    while place < len(data):
-        length = data[place + 12 : place + 20]
-        if data[place : place + 4] != b"TDSm" or len(length) < 8:
-            raise TrackError("is no whole TDMS file", "export it from LabVIEW again, or as CSV")
-        place += 28 + int.from_bytes(length, "big" if data[place + 4] & 1 << 6 else "little")
-    if place > len(data):
-        raise TrackError("is cut short", "export it from LabVIEW again, or as CSV")
-
-
 # ------------------------------------------------------------------------------
 # Read files of Physics Tracker (OSP): its project (`.trk`, XML) and its text export.
 #
@@ -208,7 +198,18 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
     `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
     """
-    panel = _parse_panel(text)
+    from xml.etree import ElementTree
+
+    # Documents that define entities are refused: they can expand without end.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise TrackError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
+    try:
+        root = ElementTree.fromstring(text.lstrip("\ufeff \n"))
+    except (ElementTree.ParseError, ValueError, RecursionError):
+        raise TrackError("is not a Tracker project", "unpack a .trz, or save as .trk in Tracker") from None
+    panel = next((node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")), None)
+    if panel is None:
+        raise TrackError("holds no Tracker panel", "save the project as .trk in Tracker")
     name, marks, others = _choose_mass(panel, point_mass)
     first, last = frames_used or (0, max(marks))
     marks = {frame: place for frame, place in marks.items() if first <= frame <= last}
@@ -223,7 +224,13 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     unit = _text(panel, "length_unit").strip()
     if not unit:
         notes.append("The project names no unit of length; metres are assumed.")
-    world_m = _to_world(frames, pixels, _axes(panel)) * _factor(unit or "m", "m")
+    axes = _axes(panel)
+    which = np.clip(np.searchsorted(sorted(axes), frames, side="right") - 1, 0, None)
+    valid = np.array([axes[start] for start in sorted(axes)])[which]
+    angle = np.array([math.radians(degrees) for degrees in valid[:, 2]])
+    right, up = ((pixels - valid[:, :2]) / valid[:, 3:]).T * np.array([[1.0], [-1.0]])
+    world = [np.cos(angle) * right + np.sin(angle) * up, np.cos(angle) * up - np.sin(angle) * right]
+    world_m = np.column_stack(world) * _factor(unit or "m", "m")
     position_m, note = _project_on_axis(world_m)
     edge_px, _ = _project_on_axis(pixels)
     missing = int(frames[-1] - frames[0]) + 1 - len(frames)
@@ -231,22 +238,6 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
         notes.append(f"{missing} frames between the first and the last point have none.")
     time_s = start_s + (frames - start_frame) * frame_s
     return new_track(time_s, position_m, edge_px=edge_px, notes=[*notes, note])
-
-
-def _parse_panel(text: str) -> Element:
-    """The element of Tracker's panel. Documents that define entities are refused: they can expand without end."""
-    from xml.etree import ElementTree
-
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise TrackError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
-    try:
-        root = ElementTree.fromstring(text.lstrip("\ufeff \n"))
-    except (ElementTree.ParseError, ValueError, RecursionError):
-        raise TrackError("is not a Tracker project", "unpack a .trz, or save as .trk in Tracker") from None
-    panels = [node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")]
-    if not panels:
-        raise TrackError("holds no Tracker panel", "save the project as .trk in Tracker")
-    return panels[0]
 
 
 def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:
@@ -298,16 +289,6 @@ def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
     return values
 
 
-def _to_world(frames: np.ndarray, pixels: Floats, axes: dict[int, tuple[float, ...]]) -> Floats:
-    """World coordinates, in units of length, of points in px; shape (n, 2)."""
-    starts = sorted(axes)
-    which = np.clip(np.searchsorted(starts, frames, side="right") - 1, 0, None)
-    valid = np.array([axes[start] for start in starts])[which]
-    angle = np.array([math.radians(degrees) for degrees in valid[:, 2]])
-    right, up = ((pixels - valid[:, :2]) / valid[:, 3:]).T * np.array([[1.0], [-1.0]])
-    return np.column_stack([np.cos(angle) * right + np.sin(angle) * up, np.cos(angle) * up - np.sin(angle) * right])
-
-
 def _clock(panel: Element) -> tuple[float, float, int]:
     """Seconds per frame, and time and number of the start frame."""
     clip, control = _object(panel, "videoclip"), _object(panel, "clipcontrol")
@@ -339,12 +320,6 @@ def _number(node: Element, name: str) -> float:
     except ValueError:
         return math.nan
     return value if abs(value) <= LARGEST_NUMBER else math.nan
-
-
-def is_export_header(line: str) -> bool:
-    """Whether a line names the columns of a text export: t, and x or y."""
-    names = {name for cell in re.split(r"[\t;,]", line) if (name := _physics_tracker_column(cell)[0])}
-    return "t" in names and bool(names & {"x", "y"})
 
 
 def _physics_tracker_column(cell: str) -> tuple[str, str]:
@@ -429,7 +404,10 @@ def flag_end_of_motion(trial: Trial, track: Track) -> Track:
     if rows.size <= FEWEST_POINTS or trial.frames_used is not None:
         return track
     noise_m, is_vine, what = rough_noise(y), trial.travel_ratio != 1, "turns back"
-    end = None if is_vine else _turns_back(y, noise_m)
+    # A body has turned back when it is 8 standard deviations, and 2 % of its travel, behind its furthest place.
+    is_back = np.maximum.accumulate(y) - y > max(8.0 * noise_m, 0.02 * float(np.ptp(y)))
+    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
+    end = int(np.argmax(y[: turned[0] + 1])) if turned.size and not is_vine else None
     if end is None:
         end, what = _stops_dead(y, noise_m), "stops"
     if end is not None and is_vine:
@@ -442,14 +420,6 @@ def flag_end_of_motion(trial: Trial, track: Track) -> Track:
     who, end_s = "vine" if is_vine else "body", track.time_s[rows[end]]
     note = f"the {who} {what} after {end_s:.5g} s: the end of its motion; later points are not used"
     return replace(track, flag=flag, notes=(*track.notes, note))
-
-
-def _turns_back(y: Floats, noise_m: float) -> int | None:
-    """Furthest point before the body comes back; None where it does not."""
-    # A body has turned back when it is 8 standard deviations, and 2 % of its travel, behind its furthest place.
-    is_back = np.maximum.accumulate(y) - y > max(8.0 * noise_m, 0.02 * float(np.ptp(y)))
-    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
-    return int(np.argmax(y[: turned[0] + 1])) if turned.size else None
 
 
 def _stops_dead(y: Floats, noise_m: float) -> int | None:
@@ -498,25 +468,20 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
         if point_mass:
             raise TrackError("has no point masses to choose from", "leave point_mass blank, or name a .trk file")
         lines = text.split("\n")[:20]  # title and remarks stand above the header of a text export (chosen)
-        skip = next((i for i, line in enumerate(lines) if is_export_header(line)), None)
+        named = [{_physics_tracker_column(cell)[0] for cell in re.split(r"[\t;,]", line)} for line in lines]
+        skip = next((i for i, names in enumerate(named) if "t" in names and names & {"x", "y"}), None)
         table = parse_table(text, skip or 0)
-        if skip is not None and "position_m" not in table.columns:
-            return _only_frames(read_export(table), frames_used)
-        return _only_frames(_read_positions(table), frames_used)
+        is_export = skip is not None and "position_m" not in table.columns
+        track = read_export(table) if is_export else _read_positions(table)
     except TableError as error:
         raise TrackError(error.message, error.remedy) from None
-
-
-def _only_frames(track: Track, frames_used: tuple[int, int] | None) -> Track:
-    """Flag the rows before and after those used."""
     if frames_used is None:
         return track
     rows = np.arange(track.time_s.size)
     before, after = rows < frames_used[0], rows > frames_used[1]
     if np.count_nonzero(~before & ~after) < FEWEST_POINTS:
         raise TrackError(f"has fewer than {FEWEST_POINTS} of its {rows.size} rows in frames_used", "widen it")
-    flag = track.flag.astype("<U64")
-    flag = np.where(before, "rejected", np.where(after, "after_end", flag))
+    flag = np.where(before, "rejected", np.where(after, "after_end", track.flag.astype("<U64")))
     return replace(track, flag=flag)
 
 

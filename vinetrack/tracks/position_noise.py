@@ -13,9 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track, Trial, hand_corrected, join_flags
+from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, hand_corrected, join_flags
 
 # ------------------------------------------------------------------------------
 # Detect positions that were smoothed before they were handed in, by the frequencies that their noise lacks.
@@ -200,7 +199,11 @@ def rounding_noise(position_m: Floats) -> float:
         return 0.0
     moving_m = position_m[_frames_at_rest(position_m) :]
     moving_m = moving_m if moving_m.size >= SHORTEST_MOTION else position_m
-    return floor_m if _shows_rounding(moving_m, floor_m) else 0.0
+    # Exact positions at one speed are multiples of their step too, but smooth: third differences are zero except a
+    # few at a corner.
+    uneven = np.count_nonzero(np.abs(np.diff(moving_m, 3)) > floor_m)
+    allowed = 5 if moving_m.size >= SHORTEST_MOTION else 0
+    return floor_m if uneven > max(allowed, 0.05 * moving_m.size) else 0.0
 
 
 def common_rounding_noise(tracks: Sequence[Floats]) -> float:
@@ -217,15 +220,6 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     # 0.01: relative difference within which two rounding steps are the same (chosen)
     n_same = sum(typical * (1 - 0.01) <= noise <= typical * (1 + 0.01) for noise in noises)
     return typical if 2 * n_same > len(noises) else 0.0
-
-
-def _shows_rounding(position_m: Floats, floor_m: float) -> bool:
-    """Whether positions that are all multiples of a step are so from rounding. Exact positions at one speed are
-    multiples of their step too, but smooth: their third differences are zero except a few at a corner.
-    """
-    uneven = np.count_nonzero(np.abs(np.diff(position_m, 3)) > floor_m)
-    allowed = 5 if position_m.size >= SHORTEST_MOTION else 0
-    return bool(uneven > max(allowed, 0.05 * position_m.size))
 
 
 def _rounding_step(position_m: Floats) -> float:
@@ -280,18 +274,12 @@ def rest_points(position_m: Floats) -> int:
         level = float(np.median(position_m[: max(left, 3)]))
     if left == n:
         return n
-    return _corner(position_m[: min(n, left + 3)])
-
-
-def _corner(position_m: Floats) -> int:
-    """Number of points before the corner of the best flat-then-straight line through all points given."""
-    n = position_m.size
-    index = np.arange(n, dtype=float)
-    y = position_m - position_m[0]
-    corners = np.arange(0, n - 1) if n <= 400 else np.arange(n - 400, n - 1)
-    ramps = np.maximum(index[None, :] - corners[:, None], 0.0)
-    mean_ramp, mean_y = ramps.mean(axis=1), float(y.mean())
-    centred = ramps - mean_ramp[:, None]
+    # Points before the corner of the best flat-then-straight line through those up to there
+    y = position_m[: min(n, left + 3)] - position_m[0]
+    corners = np.arange(max(y.size - 400, 0), y.size - 1)
+    ramps = np.maximum(np.arange(y.size, dtype=float)[None, :] - corners[:, None], 0.0)
+    centred = ramps - ramps.mean(axis=1)[:, None]
+    mean_y = float(y.mean())
     slope = centred @ (y - mean_y) / np.sum(centred**2, axis=1)
     cost = np.sum((y - mean_y) ** 2) - slope**2 * np.sum(centred**2, axis=1)
     best = int(corners[int(np.argmin(cost))])
@@ -390,7 +378,7 @@ class LocalFit:
     gain: Floats
     spread_m: Floats
     share: Floats
-    near: NDArray[np.int_]
+    near: Indices
     speed_m_s: Floats
 
 
@@ -447,7 +435,7 @@ def local_noise(distance_m: Floats, half_width: int = 20) -> Floats:
     return np.asarray(view[middle])
 
 
-def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = False) -> NDArray[np.bool_]:
+def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = False) -> Bools:
     """Mark the points that lie far off the motion around them. The largest deviations are rejected first, others only
     if they remain without those: an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) →
     (n_points,).
@@ -504,7 +492,7 @@ def rejected_points_note(tracks: Mapping[str, Track]) -> str:
     return f"{points} far off the motion around, so left out: {', '.join(places[:most_named])}{more}."
 
 
-def _places(track: Track, outlying: NDArray[np.int_]) -> list[str]:
+def _places(track: Track, outlying: Indices) -> list[str]:
     """Time of every rejected point and its distance from the line between its usable neighbours, in words."""
     usable_rows = np.flatnonzero(track.usable)
     distance_m = track.lead_position_m[outlying] - np.interp(
@@ -517,7 +505,7 @@ def _places(track: Track, outlying: NDArray[np.int_]) -> list[str]:
     ]
 
 
-def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> NDArray[np.bool_]:
+def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> Bools:
     """Points beyond the limit whose neighbours follow one cubic without them."""
     noise_m, _ = position_noise(time_s, position_m, robust=True)
     fit = local_fit(time_s, position_m, noise_m)

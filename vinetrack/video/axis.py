@@ -13,9 +13,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Trial
+from vinetrack.core.records import Bools, Floats, Trial
 from vinetrack.experiment.schema import SHORTEST_AXIS_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import collecting_path, monotone_path_sums
@@ -96,7 +95,16 @@ def find_axis(small: SmallPictures, grows: bool = True) -> Axis:
         best = _line_of_beginning(small, best, grows)
     if best.collected <= 0:
         raise RecordingError("nothing moves in the picture")
-    return _to_picture(best, small.factor, small.shape)
+    # In full pixels, with a margin behind the line, and extended ahead to the border of the picture
+    along, factor, (height, width) = np.array([np.cos(best.angle), np.sin(best.angle)]), small.factor, small.shape
+    centre = (best.middle + 0.5) * factor - 0.5
+    low, high = (best.ends[0] - (6.0 * best.half + 12.0)) * factor, np.inf
+    for origin, unit, size in ((centre[0], along[0], width), (centre[1], along[1], height)):
+        if abs(unit) > 1e-6:
+            a, b = sorted([(0.0 - origin) / unit, (size - 1.0 - origin) / unit])
+            low, high = max(low, a), min(high, b)
+    first, last = centre + low * along, centre + high * along
+    return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * best.half * factor)
 
 
 def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line:
@@ -106,11 +114,10 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
     # Fractions of a recording, from its start, that may be orderly where the whole is not (chosen)
     for fraction in (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):
         count = max(3, int(fraction * len(small.frames)))
-        pixels = small.grown if use_lasting else changed_pixels(small.frames, count)
         if use_lasting:  # those that change within this fraction
-            x, y, time, weight, n_times = pixels
-            early = time < fraction * n_times
-            pixels = x[early], y[early], time[early], weight[early], n_times
+            pixels = small.grown.where(small.grown.time < fraction * small.grown.n_times)
+        else:
+            pixels = changed_pixels(small.frames[:count])
         line = _line_through(small, pixels, early_first=True)
         in_order = line.front_share * line.collected
         if line.front_share >= LEAST_FRONT_SHARE and (
@@ -125,24 +132,23 @@ def front_share(small: SmallPictures, axis: Axis) -> float:
     (`SmallPictures.grown`); if hardly any of it lasts (MIN_GROWN_PART), all that change count.
     """
     band = float(np.clip(0.6 * axis.width_px / small.factor, 2.0, 0.2 * np.hypot(*small.frames.shape[1:])))
-    near, near_lasting = (_within(small, pixels, axis, band) for pixels in (small.changed, small.grown))
-    if len(near[0]) < 12:
+    along = (along_axis(small, pixels, axis) for pixels in (small.changed, small.grown))
+    near, near_lasting = (pixels.where(np.abs(pixels.y) < band) for pixels in along)
+    if len(near.x) < 12:
         raise RecordingError("nothing moves along the axis")
-    if len(near_lasting[0]) >= max(12, MIN_GROWN_PART * len(near[0])):
-        near = near_lasting
-    weight = near[3]
-    return float(weight[pixels_on_front(*near, small.changed[-1], band)].sum() / weight.sum())
+    lasts = len(near_lasting.x) >= max(12, MIN_GROWN_PART * len(near.x))
+    return share_on_front(near_lasting if lasts else near, band)
 
 
-def _within(small: SmallPictures, pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Places along and across an axis, time and weight of the pixels nearer to it than `band`, all of the small
-    pictures.
-    """
-    x, y, time, weight, _ = pixels
-    along, across = axis.along_and_across((np.column_stack([x, y]) + 0.5) * small.factor - 0.5)
-    along, across = along / small.factor, across / small.factor
-    inside = np.abs(across) < band
-    return along[inside], across[inside], time[inside], weight[inside]
+def along_axis(small: SmallPictures, pixels: Pixels, axis: Axis) -> Pixels:
+    """The pixels by their places along and across an axis, all of the small pictures."""
+    along, across = axis.along_and_across((np.column_stack([pixels.x, pixels.y]) + 0.5) * small.factor - 0.5)
+    return pixels._replace(x=along / small.factor, y=across / small.factor)
+
+
+def share_on_front(along: Pixels, band: float) -> float:
+    """Share of their change that is on a front passing once along a line, of pixels by their places along it."""
+    return float(along.weight[_on_front(along, band)].sum() / along.weight.sum())
 
 
 def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
@@ -153,17 +159,24 @@ def centred_on_motion(small: SmallPictures, given: Axis) -> Axis:
     factor = small.factor
     start, stop = (((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5) for x, y in (given.from_px, given.to_px))
     scaled = Axis(start, stop, given.width_px / factor)
-    x, y, time, weight, n_times = small.changed
     reach = max(0.5 * scaled.width_px, 3.0)
-    from_start = np.column_stack([x, y]) - scaled.from_px
+    from_start = np.column_stack([small.changed.x, small.changed.y]) - scaled.from_px
     across = from_start @ scaled.normal
     from_middle = from_start @ scaled.direction - scaled.length_px / 2
     inside = (np.abs(across) < reach) & (np.abs(from_middle) < 0.6 * scaled.length_px)
     if inside.sum() < 12:
         raise RecordingError("nothing moves along the axis")
-    pixels = x[inside], y[inside], time[inside], weight[inside], n_times
-    line = _line_near(*pixels, scaled, reach)
-    if line is None:
+    # The line near the given one along which most change is collected in order; those off its middle count less.
+    pixels, band = small.changed.where(inside), float(np.clip(0.25 * reach, 2.0, 6.0))
+    start_rad = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
+    angles = start_rad + np.radians(np.arange(-MOST_TURN_DEG, MOST_TURN_DEG + 0.5, 2.0))
+    half_length, middle = (int(2 * scaled.length_px) + 4) / 2, np.asarray(scaled.points(np.array(scaled.length_px / 2)))
+    angle, point, value = _best_line(pixels, angles, middle, (half_length, reach), band, centred=True)
+    if value <= 0:
+        return given
+    try:
+        line = _refined_line(pixels, angle, point, 2 * band, reach)
+    except RecordingError:
         return given
     turned = np.array([np.cos(line.angle), np.sin(line.angle)])
     slope = float(turned @ scaled.normal) / max(float(turned @ scaled.direction), 0.5)
@@ -191,15 +204,16 @@ _NO_LINE = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
 
 def _line_through(small: SmallPictures, changed: Pixels, early_first: bool = False, insist: bool = False) -> _Line:
     """The best line through pixels that change; without one an empty line, or an error where `insist`."""
-    x, y, time, weight, n_times = changed
-    if len(x) < 12:
+    if len(changed.x) < 12:
         return _NO_LINE
     diagonal = float(np.hypot(*small.frames.shape[1:]))
     band = max(3.0, 0.03 * diagonal)
     # Of a vine that bends and sweeps, early change counts most; elsewhere a door, which swings first, would too.
-    discounted = weight * (1 - 0.8 * time / n_times) if early_first else weight
+    discount = 1 - 0.8 * changed.time / changed.n_times if early_first else 1.0
+    middle = np.array([changed.x.mean(), changed.y.mean()])
     try:
-        angle, middle = _best_line(x, y, time, discounted, n_times, band, diagonal)
+        angles, reach = np.radians(np.arange(0, 360, 6.0)), (diagonal, diagonal)
+        angle, middle, _ = _best_line(changed._replace(weight=changed.weight * discount), angles, middle, reach, band)
         return _refined_line(changed, angle, middle, band, 0.2 * diagonal)
     except RecordingError:
         if insist:
@@ -207,99 +221,71 @@ def _line_through(small: SmallPictures, changed: Pixels, early_first: bool = Fal
         return _NO_LINE
 
 
-def _line_near(
-    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, given: Axis, half_width: float
-) -> _Line | None:
-    """Refine the line near a given one along which most change is collected in order; None where there is none. All in
-    the small pictures. Lines that leave the middle of the given width count less, down to a half at its border.
+def _best_line(
+    pixels: Pixels, angles: Floats, middle: Floats, reach: tuple[float, float], band: float, centred: bool = False
+) -> tuple[float, Floats, float]:
+    """Direction (rad, from x towards y) and a point of the line along which most change is collected in order, and how
+    much. Lines are tried in some directions, within a `reach` along and across them from `middle`; where `centred` they
+    count less the further from it, a half at its border.
     """
-    band = float(np.clip(0.25 * half_width, 2.0, 6.0))
-    start = float(np.arctan2(given.direction[1], given.direction[0]))
-    middle = np.asarray(given.points(np.array(given.length_px / 2)))
-    length = int(2 * given.length_px) + 4
-    bins = int(np.ceil(2 * half_width / band)) + 3
-    best_value, angle, point = 0.0, start, middle
-    for turn in np.radians(np.arange(-MOST_TURN_DEG, MOST_TURN_DEG + 0.5, 2.0)):
-        unit = np.array([np.cos(start + turn), np.sin(start + turn)])
+    half_length, half_width = reach
+    length, bins = math.ceil(2 * half_length) + 2 * (not centred), int(np.ceil(2 * half_width / band)) + 3
+    best_value, best_angle, best_point = 0.0, float(angles[0]), middle
+    from_middle = np.column_stack([pixels.x, pixels.y]) - middle
+    for angle in angles.tolist():
+        unit = np.array([np.cos(angle), np.sin(angle)])
         side = np.array([-unit[1], unit[0]])
-        relative = np.column_stack([x, y]) - middle
-        along, across = relative @ unit + length / 2, (relative @ side + half_width) / band
+        along, across = from_middle @ unit + half_length, (from_middle @ side + half_width) / band
         inside = (across >= 0) & (across < bins) & (along >= 0) & (along < length)
-        gains = monotone_path_sums(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
-        offset = (np.arange(gains.size) + 1) * band - half_width
-        value = gains * (1 - 0.5 * np.clip(offset / half_width, -1, 1) ** 2)
+        near = pixels.where(inside)
+        value = monotone_path_sums(along[inside], across[inside], near.time, near.weight, bins, length, near.n_times)
+        offset = (np.arange(value.size) + 1) * band - half_width
+        if centred:
+            value = value * (1 - 0.5 * np.clip(offset / half_width, -1, 1) ** 2)
         i = int(np.argmax(value))
         if value[i] > best_value:
-            best_value, angle, point = float(value[i]), start + float(turn), middle + offset[i] * side
-    if best_value <= 0:
-        return None
-    try:
-        return _refined_line((x, y, time, weight, n_times), angle, point, 2 * band, half_width)
-    except RecordingError:
-        return None
+            best_value, best_angle, best_point = float(value[i]), angle, middle + offset[i] * side
+    return best_angle, best_point, best_value
 
 
-def _best_line(
-    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, band: float, diagonal: float
-) -> tuple[float, Floats]:
-    """Direction (rad, from x towards y) and a point of the line along which most change is collected in order."""
-    middle = np.array([x.mean(), y.mean()])
-    bins = int(np.ceil(2 * diagonal / band)) + 3
-    best_gain, best_line = -1.0, (0.0, middle)
-    for angle in np.radians(np.arange(0, 360, 6.0)):
-        along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
-        across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
-        gains = monotone_path_sums(
-            along + diagonal, (across + diagonal) / band, time, weight, bins, int(2 * diagonal) + 2, n_times
-        )
-        i = int(np.argmax(gains))
-        if gains[i] > best_gain:
-            offset = (i + 1) * band - diagonal
-            best_gain = float(gains[i])
-            best_line = (float(angle), middle + offset * np.array([-np.sin(angle), np.cos(angle)]))
-    return best_line
-
-
-def pixels_on_front(
-    along: Floats, across: Floats, time: Floats, weight: Floats, n_times: int, band: float
-) -> NDArray[np.bool_]:
+def _on_front(along: Pixels, band: float) -> Bools:
     """Mark the pixels that change when the best monotone path along a line passes them, by their places along and
-    across it, px. Shapes: along, across, time, weight (n_pixels,) → (n_pixels,).
+    across it, px. Shape (n_pixels,).
     """
-    bin_index = ((along - float(along.min())) / 2).astype(int)
-    inside = np.abs(across) < band
-    table = np.zeros((n_times, int(bin_index.max()) + 1))
-    np.add.at(table, (time[inside].astype(int), bin_index[inside]), weight[inside])
+    bin_index = ((along.x - float(along.x.min())) / 2).astype(int)
+    inside = np.abs(along.y) < band
+    table = np.zeros((along.n_times, int(bin_index.max()) + 1))
+    np.add.at(table, (along.time[inside].astype(int), bin_index[inside]), along.weight[inside])
     path = collecting_path(table)
     passing_time = np.searchsorted(path, np.arange(table.shape[1]) + 0.5)
-    passed = (passing_time > 0) & (passing_time < n_times)
-    return inside & passed[bin_index] & (np.abs(time - passing_time[bin_index]) <= order_tolerance(n_times))
+    passed = (passing_time > 0) & (passing_time < along.n_times)
+    on_time = np.abs(along.time - passing_time[bin_index]) <= order_tolerance(along.n_times)
+    return inside & passed[bin_index] & on_time
 
 
 def _refined_line(pixels: Pixels, angle: float, middle: Floats, band: float, most_band: float) -> _Line:
     """Refine a line until its band no longer widens; the band reaches at most `most_band` to either side."""
     # 3, 20: fewest and most times that a line is refined on the pixels that agree with it (chosen)
     for round_ in range(1, 20 + 1):
-        angle, middle, half, ends, collected = _refine_once(*pixels, angle, middle, band)
+        angle, middle, half, ends, collected = _refine_once(pixels, angle, middle, band)
         narrower, band = band, float(np.clip(1.2 * half, 2.0, most_band))
         # 1.05: growth of that band in one refinement above which another follows (chosen)
         if round_ >= 3 and band < 1.05 * narrower:
             break
-    return _Line(angle, middle, half, ends, collected, collected / float(pixels[3].sum()))
+    return _Line(angle, middle, half, ends, collected, collected / float(pixels.weight.sum()))
 
 
 def _refine_once(
-    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
+    pixels: Pixels, angle: float, middle: Floats, band: float
 ) -> tuple[float, Floats, float, tuple[float, float], float]:
     """Principal axis of the pixels on the front: direction, point, half width, ends along it, their total weight."""
     along_unit = np.array([np.cos(angle), np.sin(angle)])
-    from_middle = np.column_stack([x, y]) - middle
-    along, across = from_middle @ along_unit, from_middle @ np.array([-along_unit[1], along_unit[0]])
-    on_front = pixels_on_front(along, across, time, weight, n_times, band)
+    places = np.column_stack([pixels.x, pixels.y])
+    along, across = (places - middle) @ along_unit, (places - middle) @ np.array([-along_unit[1], along_unit[0]])
+    on_front = _on_front(pixels._replace(x=along, y=across), band)
     if on_front.sum() < 8:
         raise RecordingError("what moves in the picture follows no line", "give the axis in the settings")
-    on_front_weight = weight[on_front]
-    points = np.column_stack([x, y])[on_front]
+    on_front_weight, points = pixels.weight[on_front], places[on_front]
     centre = np.average(points, axis=0, weights=on_front_weight)
     covariance = np.cov((points - centre).T, aweights=on_front_weight)
     values, vectors = np.linalg.eigh(covariance)
@@ -314,22 +300,6 @@ def _refine_once(
     ends = float(np.quantile(along, 0.002)), float(np.quantile(along, 0.998))
     direction = float(np.arctan2(principal[1], principal[0]))
     return direction, centre + shift * side, half, ends, float(on_front_weight.sum())
-
-
-def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
-    """Convert a line to full pixels, with a margin behind it, and extended ahead to the border of the picture."""
-    along, (height, width) = np.array([np.cos(line.angle), np.sin(line.angle)]), shape
-    margin = 6.0 * line.half + 12.0
-    centre = (line.middle + 0.5) * factor - 0.5
-    start, stop = (line.ends[0] - margin) * factor, np.inf
-    low, high = -np.inf, np.inf
-    for origin, unit, size in ((centre[0], along[0], width), (centre[1], along[1], height)):
-        if abs(unit) > 1e-6:
-            a, b = sorted([(0.0 - origin) / unit, (size - 1.0 - origin) / unit])
-            low, high = max(low, a), min(high, b)
-    start, stop = max(start, low), min(stop, high)
-    first, last = centre + start * along, centre + stop * along
-    return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * line.half * factor)
 
 
 # ------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.strip import SLOW_PX, Positions, Strip
 
@@ -32,17 +32,21 @@ def track_body(strip: Strip) -> Positions:
         half = max(half, round(0.75 * strip.axis.width_px))
     if np.ptp(path) < 3:
         raise RecordingError("nothing moves along the axis")
-    template_frame = _template_frame(path, half, pictures.shape[2])
+    # Cut near the middle of the frames in which the whole body is inside and moving
+    whole = np.flatnonzero((path > 1.3 * half) & (path < pictures.shape[2] - 1 - 1.3 * half))
+    moving = [i for i in whole if 0 < i < len(path) - 1 and path[i + 1] > path[i - 1]]
+    chosen = moving or whole.tolist() or [*range(len(path))]
+    template_frame = int(chosen[len(chosen) // 2])
     template = _patch(pictures[template_frame], path[template_frame], 0.0, half)
     body_rows = _row_weights(template.shape[0], strip.axis.width_px)
     weight = np.ones_like(template) * body_rows
     place = np.column_stack([path, np.zeros(len(path))])
     # 3: times that the template is replaced by the median of the patches found (chosen)
-    for turn in range(3):
+    for turn in range(3 + 1):
         place, error, match = _register_all(pictures, template, weight, place, half, first=turn == 0)
-        template, weight = _median_template(pictures, place, match, half, strip.noise)
-        weight = weight * body_rows
-    place, error, match = _register_all(pictures, template, weight, place, half, first=False)
+        if turn < 3:
+            template, weight = _median_template(pictures, place, match, half, strip.noise)
+            weight = weight * body_rows
     inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
     off_axis = np.abs(place[:, 1]) > SEARCH_ACROSS_PX - 0.5
     # 0.4: correlation below which the patch found is not the body (chosen)
@@ -63,7 +67,7 @@ def track_body(strip: Strip) -> Positions:
     )  # fmt: skip
 
 
-def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
+def hops_between_bodies(along: Floats, seen: Bools) -> bool:
     """Whether places scatter about any smooth motion by as much as they advance. Fourth differences cancel a cubic
     motion, and have 70 times the variance of single places. Shapes: along, seen (n_frames,).
     """
@@ -84,7 +88,7 @@ def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
 def _is_absent(
     pictures: NDArray[np.float32], background: NDArray[np.float32], template: NDArray[np.float32],
     weight: NDArray[np.float32], place: Floats, half: int,
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> Bools:  # fmt: skip
     """Frames in which the background alone explains the patch better than the body does."""
     absent = np.zeros(len(pictures), dtype=bool)
     share = weight / float(weight.sum())
@@ -111,7 +115,7 @@ def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
     return (1 / (1 + (np.clip(outside, 0, None) / 2.0) ** 2)).astype(np.float32)[:, None]
 
 
-def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> tuple[int, bool] | None:
+def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: Bools) -> tuple[int, bool] | None:
     """Last frame of the body's motion along the strip, and whether it turns back there (a bounce) or is not recognised
     again (it tips over, or is gone); None where the recording ends first.
     """
@@ -146,21 +150,18 @@ def _coarse_path(
     )
     background = np.median(pictures[sampled], axis=0)
     foreground = (rows * np.clip(np.abs(pictures - background) - 3 * noise, 0, 60)).sum(axis=1)
-    half = _half_length(foreground)
+    # Half the length of what differs from the background, from the width of its autocorrelation along the axis
+    clearest = foreground[np.argsort(foreground.sum(axis=1))[n // 2 :]]
+    clearest = clearest - clearest.mean(axis=1, keepdims=True)
+    columns = foreground.shape[1]
+    spectrum = np.abs(np.fft.rfft(clearest, n=2 * columns, axis=1)) ** 2
+    correlation = np.fft.irfft(spectrum.mean(axis=0))[: columns // 3]
+    below = np.flatnonzero(correlation < 0.35 * correlation[0])
+    width = int(below[0]) if len(below) else columns // 6
+    half = int(np.clip(0.8 * width, 6, columns // 5))
     box = np.ones(2 * half + 1)
     score = np.stack([np.convolve(row, box, mode="same") for row in foreground])
     return _forward_path(score / (float(np.quantile(score, 0.98)) + 1e-9)), half, background
-
-
-def _half_length(foreground: NDArray[np.float32]) -> int:
-    """Half the length of what differs from the background, from the width of its autocorrelation along the axis."""
-    rows = foreground[np.argsort(foreground.sum(axis=1))[len(foreground) // 2 :]]
-    rows = rows - rows.mean(axis=1, keepdims=True)
-    spectrum = np.abs(np.fft.rfft(rows, n=2 * rows.shape[1], axis=1)) ** 2
-    correlation = np.fft.irfft(spectrum.mean(axis=0))[: rows.shape[1] // 3]
-    below = np.flatnonzero(correlation < 0.35 * correlation[0])
-    width = int(below[0]) if len(below) else rows.shape[1] // 6
-    return int(np.clip(0.8 * width, 6, rows.shape[1] // 5))
 
 
 def _forward_path(score: Floats) -> Floats:
@@ -185,31 +186,22 @@ def _forward_path(score: Floats) -> Floats:
     return path
 
 
-def _running_maximum(values: Floats) -> tuple[Floats, NDArray[np.int_]]:
+def _running_maximum(values: Floats) -> tuple[Floats, Indices]:
     """Largest value up to each place, and its index."""
     running = np.maximum.accumulate(values)
     is_new = np.concatenate([[True], values[1:] > running[:-1]])
     return running, np.maximum.accumulate(np.where(is_new, np.arange(values.size), 0))
 
 
-def _template_frame(path: Floats, half: int, columns: int) -> int:
-    """A frame in which the whole body is inside and moving, near the middle of those."""
-    whole = np.flatnonzero((path > 1.3 * half) & (path < columns - 1 - 1.3 * half))
-    moving = [i for i in whole if 0 < i < len(path) - 1 and path[i + 1] > path[i - 1]]
-    chosen = np.array(moving) if len(moving) else whole
-    return int(chosen[len(chosen) // 2]) if len(chosen) else len(path) // 2
-
-
 def _patch(picture: NDArray[np.float32], along: float, across: float, half: int) -> NDArray[np.float32]:
     """Patch of 2 half + 1 columns about (along, across), all rows but SEARCH_ACROSS_PX on each side, bicubic."""
     import cv2
 
-    rows = picture.shape[0] - 2 * SEARCH_ACROSS_PX
-    length = 2 * half + 1
-    centre = (float(along), (picture.shape[0] - 1) / 2 + float(across))
-    matrix = np.array([[1.0, 0.0, centre[0] - half], [0.0, 1.0, centre[1] - (rows - 1) / 2]])
+    rows, middle = picture.shape[0] - 2 * SEARCH_ACROSS_PX, (picture.shape[0] - 1) / 2 + float(across)
+    matrix = np.array([[1.0, 0.0, float(along) - half], [0.0, 1.0, middle - (rows - 1) / 2]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(picture, matrix, (length, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+    patch = cv2.warpAffine(picture, matrix, (2 * half + 1, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(patch)
 
 
 def _register_all(
@@ -217,29 +209,22 @@ def _register_all(
     first: bool,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Place (n, 2) along and across, its error along (n,) and correlation (n,) in every frame."""
-    out, error, match = place.copy(), np.full(len(place), np.nan), np.zeros(len(place))
-    slope_across, slope_along = np.gradient(template, axis=0), np.gradient(template, axis=1)
-    for t, picture in enumerate(pictures):
-        guess = place[t]
-        if first:
-            guess = _by_correlation(picture, template, place[t], half)
-        out[t], error[t], match[t] = _register(picture, template, weight, slope_along, slope_across, guess, half)
-    return out, error, match
-
-
-def _by_correlation(picture: NDArray[np.float32], template: NDArray[np.float32], guess: Floats, half: int) -> Floats:
-    """Whole-pixel place of the best normalised correlation about `guess`."""
     import cv2
 
+    out, error, match = place.copy(), np.full(len(place), np.nan), np.zeros(len(place))
+    slope_across, slope_along = np.gradient(template, axis=0), np.gradient(template, axis=1)
     # 14: distance along the axis searched about the expected place (chosen)
-    reach = 14 + half // 2
-    low = int(np.clip(guess[0] - half - reach, 0, max(picture.shape[1] - template.shape[1], 0)))
-    high = int(np.clip(guess[0] + half + reach + 1, low + template.shape[1], picture.shape[1]))
-    if high - low < template.shape[1]:
-        return guess
-    score = cv2.matchTemplate(np.ascontiguousarray(picture[:, low:high]), template, cv2.TM_CCOEFF_NORMED)
-    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-    return np.array([low + column + half, row - SEARCH_ACROSS_PX], dtype=float)
+    width, reach = template.shape[1], half + 14 + half // 2
+    for t, picture in enumerate(pictures):
+        guess = place[t]
+        low = int(np.clip(guess[0] - reach, 0, max(picture.shape[1] - width, 0)))
+        high = int(np.clip(guess[0] + reach + 1, low + width, picture.shape[1]))
+        if first and high - low >= width:  # whole-pixel place of the best normalised correlation
+            score = cv2.matchTemplate(np.ascontiguousarray(picture[:, low:high]), template, cv2.TM_CCOEFF_NORMED)
+            row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+            guess = np.array([low + column + half, row - SEARCH_ACROSS_PX], dtype=float)
+        out[t], error[t], match[t] = _register(picture, template, weight, slope_along, slope_across, guess, half)
+    return out, error, match
 
 
 def _register(
@@ -252,7 +237,6 @@ def _register(
     place = guess.astype(float).copy()
     design = np.stack([slope_along, slope_across, template, np.ones_like(template)]).reshape(4, -1).astype(float)
     flat = weight.ravel().astype(float)
-    sigma, correlation = np.nan, 0.0
     robust = flat
     # 8: most Gauss-Newton steps of a registration (chosen)
     for _ in range(8):

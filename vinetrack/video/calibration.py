@@ -61,7 +61,17 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
         corners, ids = max((corners, ids), _detect_markers(grey, dictionary, enlarge=2), key=lambda pair: len(pair[1]))
     if not len(ids):
-        raise CornersError(_no_markers(grey, board.dictionary))
+        others = [name for name in OTHER_DICTIONARIES if name not in board.dictionary]
+        there = [(name, _detect_markers(grey, _dictionary(_largest(name)))[1].ravel()) for name in others]
+        name, numbers = max(there, key=lambda markers: len(markers[1]))
+        what = f"no marker of {board.dictionary} is seen"
+        if len(numbers) >= 3:
+            likely = _smallest(name, int(numbers.max()) + 1)
+            raise CornersError(f"{what}, but {len(numbers)} of {likely}; correct `dictionary`")
+        raise CornersError(
+            f"{what}; check `dictionary`, and that the board is in the picture, in focus, not mirrored and larger than "
+            "5 pixels a marker bit"
+        )
     share, marker_mm, layout = _best_layout(corners, ids, board, dictionary)
     if share < 0.8:
         raise CornersError(
@@ -87,16 +97,30 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
     """Find the inner corners of a checkerboard in the picture (px), all of which must be there, and on the board (m),
     both of shape (n, 2).
     """
-    grey = eight_bits(picture)
-    across, down = board.squares
+    import cv2
+
+    grey, (across, down) = eight_bits(picture), board.squares
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     for enlarge in (1, 2):
         for columns, rows in dict.fromkeys([(across, down), (down, across)]):
-            found_px = _sector_corners(grey, columns - 1, rows - 1, enlarge)
-            if found_px is None:
+            # The sector-based detector (Duda & Frese 2018)
+            shape = (columns - 1, rows - 1)
+            seen, found_px = cv2.findChessboardCornersSB(_enlarged(grey, enlarge), shape, flags=flags)
+            if not seen:
                 continue
+            found_px = _in_original(found_px.reshape(-1, 2), enlarge)
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
             return _enough(found_px, grid.astype(float) * (board.square_mm / 1000), "all are seen")
-    raise CornersError(_no_checkerboard(grey, across, down))
+    what = f"no checkerboard of {across} × {down} squares is seen"
+    if (squares := checkerboard_squares(grey)) is not None:
+        raise CornersError(
+            f"{what}, but {squares[0]} × {squares[1]} squares are; correct `squares` (squares, not inner corners), or "
+            "show the whole board"
+        )
+    raise CornersError(
+        f"{what}; the whole board with a white border must be in the picture, in focus and evenly lit, and `squares` "
+        "counts squares, not inner corners"
+    )
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
@@ -107,9 +131,12 @@ def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
 
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
     seen, corners, shape = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
-    if seen and _is_a_grid(corners.reshape(*shape.shape, 2)):
-        return shape.shape[1] + 1, shape.shape[0] + 1
-    return None
+    if not seen:
+        return None
+    grid = corners.reshape(*shape.shape, 2)  # evenly spaced where second differences are below a tenth of a square
+    step = np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2))
+    bends = [np.linalg.norm(np.diff(grid, 2, axis=axis), axis=2).max() for axis in (0, 1)]
+    return (grid.shape[1] + 1, grid.shape[0] + 1) if max(bends) < 0.1 * step else None
 
 
 def _enlarged(grey: Grey, times: int) -> Grey:
@@ -192,15 +219,6 @@ def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], b
     return float(inside.sum()) / len(ids), size_mm
 
 
-def _sector_corners(grey: Grey, columns: int, rows: int, enlarge: int = 1) -> Floats | None:
-    """Inner corners by the sector-based detector (Duda & Frese 2018), (columns · rows, 2), px; None where not found."""
-    import cv2
-
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    seen, corners = cv2.findChessboardCornersSB(_enlarged(grey, enlarge), (columns, rows), flags=flags)
-    return _in_original(corners.reshape(-1, 2), enlarge) if seen else None
-
-
 def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floats]:
     """Corners and their places on the board, both of shape (n, 2), unless they are too few or on one line."""
     if len(grid_m) >= FEWEST_CORNERS:
@@ -210,43 +228,6 @@ def _enough(corners_px: Floats, grid_m: Floats, seen: str) -> tuple[Floats, Floa
     raise CornersError(
         f"only {len(grid_m)} corners of the board can be read ({seen}; at least {FEWEST_CORNERS}, not on one line, are "
         "needed); show more of it, larger, in focus, evenly lit and not mirrored"
-    )
-
-
-def _is_a_grid(corners_px: NDArray[Any]) -> bool:
-    """Whether corners, shape (rows, columns, 2), are evenly spaced: second differences below a tenth of a square."""
-    steps = np.linalg.norm(np.diff(corners_px, axis=1), axis=2)
-    bends = [np.linalg.norm(np.diff(corners_px, 2, axis=axis), axis=2).max() for axis in (0, 1)]
-    return bool(max(bends) < 0.1 * np.median(steps))
-
-
-def _no_markers(grey: Grey, dictionary: str) -> str:
-    """Say that there are no markers, and name the dictionary whose markers are there, if any."""
-    best, numbers = "", np.empty(0, int)
-    for name in OTHER_DICTIONARIES:
-        ids = _detect_markers(grey, _dictionary(_largest(name)))[1].ravel()
-        if name not in dictionary and len(ids) > len(numbers):
-            best, numbers = name, ids
-    if len(numbers) >= 3:
-        likely = _smallest(best, int(numbers.max()) + 1)
-        return f"no marker of {dictionary} is seen, but {len(numbers)} of {likely}; correct `dictionary`"
-    return (
-        f"no marker of {dictionary} is seen; check `dictionary`, and that the board is in the picture, in focus, "
-        "not mirrored and larger than 5 pixels a marker bit"
-    )
-
-
-def _no_checkerboard(grey: Grey, across: int, down: int) -> str:
-    """Say that there is no such checkerboard, and name the size of the one that is there, if any."""
-    squares = checkerboard_squares(grey)
-    if squares is not None:
-        return (
-            f"no checkerboard of {across} × {down} squares is seen, but {squares[0]} × {squares[1]} squares are; "
-            "correct `squares` (squares, not inner corners), or show the whole board"
-        )
-    return (
-        f"no checkerboard of {across} × {down} squares is seen; the whole board with a white border must be in the "
-        "picture, in focus and evenly lit, and `squares` counts squares, not inner corners"
     )
 
 
@@ -271,30 +252,23 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     grey = eight_bits(picture)
     seen = [(*_detect_markers(grey, _dictionary(_largest(family))), family) for family in OTHER_DICTIONARIES]
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
-    # 6: fewest markers that distinguish a board from chance (chosen)
-    board = _charuco(corners, ids, family) if len(ids) >= 6 else None
-    if board is not None:
-        return board
-    squares = checkerboard_squares(grey)
-    return None if squares is None else BoardSeen("checkerboard", squares)
-
-
-def _charuco(corners: Any, ids: NDArray[np.int32], family: str) -> BoardSeen | None:
-    """The layout on which most markers lie in place; None where no layout has enough of them."""
-    best_share, best_board, n_markers = 0.0, None, int(ids.max()) + 1
+    best_share, best_board, n_markers = 0.0, None, int(ids.max(initial=0)) + 1
     # Squares across and down, at most 40, of the boards with this many markers, of which two may be hidden (chosen)
     for across, down in itertools.product(range(2, 41), repeat=2):
-        squares = across, down
-        if not n_markers <= across * down // 2 <= n_markers + 2:
+        layout, count = (across, down), across * down // 2
+        # 6: fewest markers that distinguish a board from chance (chosen)
+        if len(ids) < 6 or not n_markers <= count <= n_markers + 2:
             continue
         # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
-        board = Charuco(kind="charuco", image="", squares=squares, square_mm=1.0, marker_mm=0.7, dictionary=family)
+        board = Charuco(kind="charuco", image="", squares=layout, square_mm=1.0, marker_mm=0.7, dictionary=family)
         share, marker, _ = _best_layout(corners, ids, board, _dictionary(_largest(family)))
         if share > best_share:
-            dictionary = _smallest(family, across * down // 2)
-            best_share, best_board = share, BoardSeen("charuco", squares, dictionary, marker)
+            best_share, best_board = share, BoardSeen("charuco", layout, _smallest(family, count), marker)
     # 0.8: least share of the markers that must lie where a board has them (chosen)
-    return best_board if best_share >= 0.8 else None
+    if best_share >= 0.8:
+        return best_board
+    squares = checkerboard_squares(grey)
+    return None if squares is None else BoardSeen("checkerboard", squares)
 
 
 def _largest(family: str) -> str:
@@ -389,18 +363,32 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
 
     size = (width_px, height_px)
     corners = [_half_diagonals(picture, size) for picture, _ in views]
-    boards = [board for _, board in views]
-    reach_m = max(float(np.ptp(board, axis=0).max()) for board in boards)
-    start = [_first_homography(view, board / reach_m) for view, board in zip(corners, boards, strict=True)]
+    reach_m = max(float(np.ptp(board, axis=0).max()) for _, board in views)
+    places = [board / reach_m for _, board in views]
+    start = []
+    for corner, place in zip(corners, places, strict=True):  # by the direct linear transform
+        homogeneous = np.column_stack([corner, np.ones(len(corner))])
+        zeros = np.zeros_like(homogeneous)
+        system = np.block(
+            [[homogeneous, zeros, -place[:, :1] * homogeneous], [zeros, homogeneous, -place[:, 1:] * homogeneous]]
+        )
+        homography = np.linalg.eigh(system.T @ system)[1][:, 0]
+        start.append(homography[:8] / homography[8])
     values = np.concatenate([*start, np.zeros(N_LENS)])
     unit_px = _half_diagonal_px(*size)
     noise_px = 0.1
+
+    def misfit(values: Floats) -> Floats:
+        """Residuals over the noise, followed by the parameters with priors over their prior standard deviations."""
+        fits = np.concatenate([view.ravel() for view in _residuals(values, corners, places)]) / (noise_px / unit_px)
+        tilts = values[: len(views) * N_PLANE].reshape(-1, N_PLANE)[:, 6:] / PRIOR_SIGMA[:2]
+        return np.concatenate([fits, tilts.ravel(), values[len(views) * N_PLANE :] / np.array(PRIOR_SIGMA[2:])])
+
     # 3: iterations of fit and noise estimate (chosen)
     for _ in range(3):
-        arguments = (corners, [board / reach_m for board in boards], noise_px / unit_px)
-        fit = least_squares(_misfit, values, args=arguments, method="lm", xtol=1e-12, ftol=1e-12)
+        fit = least_squares(misfit, values, method="lm", xtol=1e-12, ftol=1e-12)
         values = fit.x
-        residuals = _residuals(values, *arguments[:2])
+        residuals = _residuals(values, corners, places)
         n_degrees = 2 * sum(len(view) for view in corners) - N_PLANE * len(views) - N_LENS
         sum_of_squares = sum(float((view**2).sum()) for view in residuals)
         # 0.01: chosen: no corner is located better
@@ -434,18 +422,6 @@ def _undistorted(distorted: Floats, lens: Floats) -> Floats:
     )
 
 
-def _first_homography(picture: Floats, board: Floats) -> Floats:
-    """Homography from half-diagonals to the board by the direct linear transform; first eight entries, shape (8,)."""
-    homogeneous = np.column_stack([picture, np.ones(len(picture))])
-    zeros = np.zeros_like(homogeneous)
-    system = np.block(
-        [[homogeneous, zeros, -board[:, :1] * homogeneous], [zeros, homogeneous, -board[:, 1:] * homogeneous]]
-    )
-    _, directions = np.linalg.eigh(system.T @ system)
-    homography = directions[:, 0]
-    return np.asarray(homography[:8] / homography[8])
-
-
 def _residuals(values: Floats, corners: list[Floats], boards: list[Floats]) -> list[Floats]:
     """Corners minus their predicted positions, half-diagonals, one array per view."""
     lens = values[N_PLANE * len(corners) :]
@@ -457,16 +433,6 @@ def _residuals(values: Floats, corners: list[Floats], boards: list[Floats]) -> l
         radius2 = (ideal**2).sum(axis=-1, keepdims=True)
         residuals.append(corner - ideal * (1 + lens[0] * radius2 + lens[1] * radius2**2))
     return residuals
-
-
-def _misfit(values: Floats, corners: list[Floats], boards: list[Floats], noise: float) -> Floats:
-    """Residuals over the noise, followed by the parameters with priors over their prior standard deviations."""
-    n_views = len(corners)
-    fits = np.concatenate([view.ravel() for view in _residuals(values, corners, boards)]) / noise
-    tilts = np.concatenate([values[k * N_PLANE + 6 : k * N_PLANE + 8] for k in range(n_views)])
-    lens = values[N_PLANE * n_views :]
-    priors = np.concatenate([tilts / np.tile(PRIOR_SIGMA[:2], n_views), lens / np.array(PRIOR_SIGMA[2:])])
-    return np.concatenate([fits, priors])
 
 
 CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
@@ -568,7 +534,17 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
         )
         rel_sigma = math.sqrt(2) * CLICK_SIGMA_PX / distance_px
         return PlaneCalibration("two_points", plane, math.nan, 2, 1, rel_sigma, whole, (note,))
-    pictures = _target_pictures(folder / settings.image, settings.image)
+    # Up to ten pictures, spread over the first 300 frames of a recording (chosen), while nothing hides the target yet
+    most_pictures, searched_frames = 10, 300
+    try:
+        recording = inspect_recording(folder / settings.image)
+        every = max(1, min(recording.declared_frames or searched_frames, searched_frames) // most_pictures)
+        frames = itertools.islice(iterate_frames(recording), 0, searched_frames + 1, every)
+        pictures = list(itertools.islice(frames, most_pictures))
+    except RecordingError as error:
+        raise CalibrationError(error.what, error.remedy) from error
+    if not pictures:
+        raise CalibrationError(f"{settings.image} holds no picture that can be read", "copy it from the camera again")
     sizes_seen = {(picture.shape[1], picture.shape[0]) for picture in pictures}
     if sizes_seen != {(width_px, height_px)}:
         sizes = " and ".join(f"{width} × {height}" for width, height in sorted(sizes_seen))
@@ -612,28 +588,18 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
             board.image,
         )
     corners_px = _median_corners(views)[0] if stationary else views[0][0]
-    notes += _coverage_note(corners_px, width, height, board.image)
+    # Beyond a target that spans less than half of the picture, scale and distortion are extrapolated.
+    share = float(np.ptp(corners_px[:, 0 if width >= height else 1])) / max(width, height)
+    if share < 0.5:
+        notes.append(
+            f"{board.image}: the target spans only {share:.0%} of the picture; fill it to know the scale everywhere"
+        )
     # 0.05: bias that the corners at one end of a target may share, px: the error of one (measured)
     bias_rel = 0.05 * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
     covered = (*corners_px.min(axis=0), *corners_px.max(axis=0))
     return PlaneCalibration(
         board.kind, maps[0], reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
     )
-
-
-def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
-    """Up to ten grey pictures, spread over the first 300 frames of a recording, while nothing hides the target yet."""
-    most_pictures, searched_frames = 10, 300  # chosen
-    try:
-        recording = inspect_recording(path)
-        every = max(1, min(recording.declared_frames or searched_frames, searched_frames) // most_pictures)
-        frames = itertools.islice(iterate_frames(recording), 0, searched_frames + 1, every)
-        pictures = list(itertools.islice(frames, most_pictures))
-    except RecordingError as error:
-        raise CalibrationError(error.what, error.remedy) from error
-    if not pictures:
-        raise CalibrationError(f"{name} holds no picture that can be read", "copy it from the camera again")
-    return pictures
 
 
 def _corners_by_place(view: tuple[Floats, Floats]) -> dict[tuple[float, float], Floats]:
@@ -665,15 +631,6 @@ def _median_corners(views: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Flo
     return corners, np.array(list(gathered)) * 1e-6
 
 
-def _coverage_note(corners_px: Floats, width: int, height: int, name: str) -> list[str]:
-    """Warn where the target spans less than half of the picture: beyond it scale and distortion are extrapolated."""
-    longer = 0 if width >= height else 1
-    share = float(np.ptp(corners_px[:, longer])) / max(width, height)
-    if share >= 0.5:
-        return []
-    return [f"{name}: the target spans only {share:.0%} of the picture; fill it to know the scale everywhere"]
-
-
 # ------------------------------------------------------------------------------
 # Apply corrections by hand to a track: points moved, dropped or confirmed, each flagged `corrected`.
 
@@ -684,8 +641,8 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
     """
     if not corrections:
         return track
-    edge, sigma = track.edge_px.copy(), track.lead_position_sigma_m.copy()
-    slow = None if track.lead_position_systematic_m is None else track.lead_position_systematic_m.copy()
+    edge, sigma, slow = track.edge_px.copy(), track.lead_position_sigma_m.copy(), track.lead_position_systematic_m
+    slow = None if slow is None else slow.copy()
     flag = track.flag.astype("<U80")
     settled = {"doubtful", "lost", "rejected", "after_end"}  # once a person has placed or confirmed a point
     past_tense = {"move": "moved", "drop": "dropped", "confirm": "confirmed"}

@@ -13,11 +13,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Bools, Floats
 from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, front_share, pixels_on_front
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, along_axis, find_axis, front_share, share_on_front
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 
@@ -210,7 +209,16 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
     """
     # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
-    offsets = _local_lines(sides.places_px, sides.middles_px, knots)
+    # Middle of the tube at the knots, by Gaussian-weighted local lines; level beyond the outermost stretches
+    places, middles, offsets = sides.places_px, sides.middles_px, np.empty(len(knots))
+    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
+    for k, place in enumerate(np.clip(knots, places[0], places[-1])):
+        # 1.0: standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
+        away = (places - place) / (1.0 * spacing)
+        weight = np.exp(-0.5 * away**2)
+        design = np.column_stack([np.ones(len(places)), away])
+        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
+        offsets[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
     through = axis.points(knots, offsets)
     separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
     try:
@@ -220,21 +228,6 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
     if not isinstance(curve, CurvedAxis) or sides.half_px > curve.largest_half_px:
         return axis, 0.0
     return curve, float(np.abs(offsets).max())
-
-
-def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
-    """Middle of the tube at places along it, by Gaussian-weighted local lines; level beyond the outermost stretches."""
-    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
-    queries = np.clip(queries, places[0], places[-1])
-    out = np.empty(len(queries))
-    for k, place in enumerate(queries):
-        # 1.0: standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
-        offset = (places - place) / (1.0 * spacing)
-        weight = np.exp(-0.5 * offset**2)
-        design = np.column_stack([np.ones(len(places)), offset])
-        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
-        out[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
-    return out
 
 
 # ------------------------------------------------------------------------------
@@ -271,15 +264,10 @@ def find_growth_axis(small: SmallPictures) -> Axis:
 
 def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
     """Share of all growth in the picture that is a front passing once along an axis, straight or curved."""
-    x, y, time, weight, n_times = small.grown
-    if len(x) < 12:
+    if len(small.grown.x) < 12:
         return 0.0
-    along, across = axis.along_and_across((np.column_stack([x, y]) + 0.5) * small.factor - 0.5)
-    band = max(0.6 * axis.width_px / small.factor, 2.0)
-    if not (np.abs(across) < band * small.factor).any():
-        return 0.0
-    on_front = pixels_on_front(along / small.factor, across / small.factor, time, weight, n_times, band)
-    return float(weight[on_front].sum() / weight.sum())
+    along, band = along_axis(small, small.grown, axis), max(0.6 * axis.width_px / small.factor, 2.0)
+    return share_on_front(along, band) if (np.abs(along.y) < band).any() else 0.0
 
 
 def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | None:
@@ -289,14 +277,27 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | N
     # 3.0: least length of the band, in its widths, that has a path (chosen)
     if band is None or path is None or len(path) < 3.0 * band.width:
         return None
+    # Turned round where its pixels changed from its end to its beginning
+    times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
+    finite = np.flatnonzero(np.isfinite(times))
+    trend = np.sum((finite - finite.mean()) * (times[finite] - times[finite].mean())) if finite.size else 0.0
     # 1.5: distance of the curve's knots in widths of the band (chosen)
-    middle = _smoothed_knots(_in_order_of_time(path, band), max(1.5 * band.width, 6.0))
+    middle = _smoothed_knots(path if trend >= 0 else path[::-1], max(1.5 * band.width, 6.0))
     if middle is None:
         return None
     size = small.shape[1], small.shape[0]
     try:
-        axis = axis_through((middle + 0.5) * small.factor - 0.5, band.width * small.factor)
-        axis = _extended(axis, (3 * band.width + 12) * small.factor, size)
+        middle_px = (middle + 0.5) * small.factor - 0.5
+        axis = axis_through(middle_px, band.width * small.factor)
+        # Continued straight at both ends, as far as the picture goes
+        knots, margin = [*middle_px], (3 * band.width + 12) * small.factor
+        for end, sign in ((0.0, -1.0), (axis.length_px, 1.0)):
+            extension = axis.points(end + sign * np.arange(1.0, margin + 1))
+            inside = ((extension >= 0) & (extension <= np.array(size) - 1)).all(axis=1)
+            count = len(extension) if inside.all() else int(np.argmin(inside))
+            if count > 6:
+                knots.insert(0 if sign < 0 else len(knots), extension[count - 1])
+        axis = axis_through(knots, axis.width_px)
     except RecordingError:
         return None
     if not isinstance(axis, CurvedAxis) or curve_problem(axis, axis.width_px / 2, size):
@@ -311,7 +312,7 @@ class Band:
     `width` is the width along most of its length.
     """
 
-    region: NDArray[np.bool_]
+    region: Bools
     depth: Floats
     when: Floats
     width: float
@@ -319,29 +320,21 @@ class Band:
 
 def _changed_band(small: SmallPictures) -> Band | None:
     """The largest connected region that changed; None where hardly anything does."""
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, distance_transform_edt, label
 
-    x, y, time, _, _ = small.grown
-    if len(x) < 12:
+    if len(small.grown.x) < 12:
         return None
     when = np.full(small.frames.shape[1:], np.nan)
-    when[y.astype(int), x.astype(int)] = time
-    region = _largest_region(np.isfinite(when))
+    when[small.grown.y.astype(int), small.grown.x.astype(int)] = small.grown.time
+    # With gaps closed and threads removed
+    region = np.isfinite(when)
+    closed = binary_closing(np.pad(region, 3), iterations=2)[3:-3, 3:-3]
+    parts, count = label(binary_opening(binary_fill_holes(closed), iterations=1), np.ones((3, 3)))
+    if count:
+        region = np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
     depth = np.asarray(distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1])
     half = float(np.quantile(depth[region], 0.9))
     return Band(region, depth, when, 2 * half + 1)
-
-
-def _largest_region(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The largest connected region, with gaps closed and threads removed."""
-    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, label
-
-    closed = binary_closing(np.pad(changed, 3), iterations=2)[3:-3, 3:-3]
-    opened = binary_opening(binary_fill_holes(closed), iterations=1)
-    parts, count = label(opened, np.ones((3, 3)))
-    if count == 0:
-        return changed
-    return np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
 
 
 def _centreline(band: Band) -> Floats | None:
@@ -364,14 +357,6 @@ def _centreline(band: Band) -> Floats | None:
     return np.array(paths.traceback(end), dtype=float)[:, ::-1]
 
 
-def _in_order_of_time(path: Floats, band: Band) -> Floats:
-    """The path, turned round where its pixels changed from its end to its beginning."""
-    times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
-    finite = np.flatnonzero(np.isfinite(times))
-    trend = np.sum((finite - finite.mean()) * (times[finite] - times[finite].mean())) if finite.size else 0.0
-    return path if trend >= 0 else path[::-1]
-
-
 def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
     """Knots `spacing` from each other of a penalised spline through a path of whole pixels, shape (n, 2), n ≥ 4. The
     ends of the path run into the corners of the band: half a knot distance at each is left out. None where fewer than
@@ -389,18 +374,3 @@ def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
     count = max(4, round(np.ptp(along[inner]) / spacing) + 1)
     knots = np.linspace(along[inner][0], along[inner][-1], count)
     return np.stack([spline(knots) for spline in splines], axis=1)
-
-
-def _extended(axis: Axis, margin: float, size_px: tuple[int, int]) -> Axis:
-    """The curve continued straight at both ends by `margin`, as far as the picture goes."""
-    if not isinstance(axis, CurvedAxis):
-        return axis
-    knots = list(axis.through_px)
-    for end, sign in ((0.0, -1.0), (axis.length_px, 1.0)):
-        extension = axis.points(end + sign * np.arange(1.0, margin + 1))
-        inside = ((extension >= 0) & (extension <= np.array(size_px) - 1)).all(axis=1)
-        count = len(extension) if inside.all() else int(np.argmin(inside))
-        if count > 6:
-            place = (float(extension[count - 1][0]), float(extension[count - 1][1]))
-            knots = [place, *knots] if sign < 0 else [*knots, place]
-    return axis_through(knots, axis.width_px)

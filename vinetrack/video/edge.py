@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools, Floats
+from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
@@ -61,69 +61,12 @@ from vinetrack.video.strip import SLOW_PX, Positions, Strip
 # camera was stabilised the slow part of the shake stays.
 
 
-def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats:
-    """Slow error of each frame's edge, one standard deviation. Shapes: edge_px (n_frames,); contrast (n_along,) →
-    (n_frames,).
-    """
-    from scipy.ndimage import median_filter
-
-    everywhere_px = float(np.hypot(SLOW_PX, shared_px))
-    finite = np.isfinite(contrast)
-    if not finite.any():
-        return np.full(len(edge_px), everywhere_px)
-    columns = np.arange(len(contrast))
-    # 21: columns over which the contrast at an edge is taken, px (chosen)
-    smooth_contrast = median_filter(np.interp(columns, columns[finite], np.abs(contrast[finite])), 21, mode="nearest")
-    local_contrast = np.interp(np.nan_to_num(edge_px), columns, smooth_contrast)
-    # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
-    # 1.0: least contrast, in grey levels (chosen)
-    return np.asarray(np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0)))
-
-
-def shared_disagreement(lead_px: Floats) -> float:
-    """Slow error of the mean of bands, from the part of their disagreement that lasts over several frames. Bands that
-    mirror each other about the axis are averaged first, since a tip that tilts moves one ahead and the other behind and
-    leaves the mean unchanged. What all frames share is the shape of the tip and is removed. Shapes: lead_px (n_frames,
-    n_bands).
-    """
-    lags = (1, 2)  # Lags, in frames, at which bands that still disagree alike share a cause (chosen)
-    frames, bands = lead_px.shape
-    if bands < 4 or frames < max(lags):
-        return 0.0
-    deviation = lead_px - lead_px.mean(axis=1, keepdims=True)
-    deviation = deviation - np.median(deviation, axis=0)
-    pairs = (deviation + deviation[:, ::-1])[:, : bands // 2] / 2
-    pairs = pairs - pairs.mean(axis=1, keepdims=True)
-    # 4: fewest pairs of frames at a lag (chosen)
-    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in lags if frames - lag >= 4]
-    if not products:
-        return 0.0
-    # The mean of a pair has half the variance of a band.
-    band_variance = 2 * float(np.mean(products)) / (bands // 2 - 1)
-    return float(np.sqrt(max(band_variance, 0.0) / bands))
-
-
-def noise_and_slow(bands_px: Floats, seen_px: Floats, apart_px: Floats) -> tuple[Floats, Floats]:
-    """Split what is added to the error of an edge into a random part and a slow part. Random errors are independent
-    between frames; slow ones are shared by neighbouring frames. Returns random and slow error, each of shape
-    (n_frames,), px; their sum in quadrature is `apart_px`. Shapes: bands_px, seen_px, apart_px (n_frames,).
-    """
-    # Part of the error near the start, and of an edge that is a guess, since a door or the mouth hides it, that differs
-    # from frame to frame (measured, chosen)
-    start_part, guess_part = 0.4, math.sqrt(0.5)
-    near = np.sqrt(np.maximum(seen_px**2 - bands_px**2, 0.0))
-    guess = np.sqrt(np.maximum(apart_px**2 - seen_px**2, 0.0))
-    noise = np.sqrt(bands_px**2 + (start_part * near) ** 2 + (guess_part * guess) ** 2)
-    slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
-    return noise, slow
-
-
 ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
 # Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
 LEAST_FITTED_AMPLITUDE = 0.5
 
 
-def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
+def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> Floats:
     """Replace fits that break the motion or hardly fit by the best ones where the motion leads. Goes from the middle of
     the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
     more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
@@ -136,7 +79,10 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
     out = fit.copy()
     bad_misfit = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
     decentrality = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
-    anchor = int(moving[np.argmin(decentrality + _is_rough(fit[moving, 0]) + (fit[moving, 2] > bad_misfit))])
+    # Rough are points further from the mean of their neighbours than a pixel and 0.15 of the step.
+    at, rough = fit[moving, 0], np.ones(len(moving), dtype=bool)
+    rough[1:-1] = np.abs(at[1:-1] - 0.5 * (at[2:] + at[:-2])) > 1.0 + 0.15 * np.abs(at[2:] - at[:-2]) / 2
+    anchor = int(moving[np.argmin(decentrality + rough + (fit[moving, 2] > bad_misfit))])
     first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
     edge = out[:, 0].tolist()
     for sense in (-1, 1):
@@ -154,11 +100,12 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
                 continue
             replacement = _best_between(strip, state, t, low, high, 1 if resting > long_rest_frames else 9)
             is_better = out[t, 2] <= bad_misfit and (replacement is None or replacement[2] > out[t, 2])
+            ratio = abs(edge[t] - previous) / max(step, 1e-6)
             if inside:
                 if replacement is not None and (faint or replacement[2] < out[t, 2]):
                     out[t] = replacement
-            elif not faint and _spans_missing_frames(edge[t] - previous, step) and is_better:
-                continue
+            elif not faint and is_better and step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25:
+                continue  # two to four whole steps: frames are missing, and the point is right
             elif replacement is None:
                 expected = previous if math.isnan(edge[t]) else edge[t]
                 out[t] = (min(max(expected, low), high), ASTRAY_PX, 4 * bad_misfit, 0, 0, 0)
@@ -168,7 +115,7 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
     return _repair_strays(strip, state, out, moving, bad_misfit)
 
 
-def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[np.int_], bad_misfit: float) -> Floats:
+def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: Indices, bad_misfit: float) -> Floats:
     """Replace bad fits that stray from the parabola through two neighbours on each side by the best fit near it. A good
     fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
     """
@@ -188,20 +135,6 @@ def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[
     return out
 
 
-def _spans_missing_frames(stride: float, step: float) -> bool:
-    """Whether a stride is two to four whole steps: frames are missing, and the point is right."""
-    ratio = abs(stride) / max(step, 1e-6)
-    return step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25
-
-
-def _is_rough(edge: Floats) -> NDArray[np.bool_]:
-    """Points further from the mean of their neighbours than a pixel and 0.15 of the step, (n,)."""
-    rough = np.ones(len(edge), dtype=bool)
-    step = np.abs(edge[2:] - edge[:-2]) / 2
-    rough[1:-1] = np.abs(edge[1:-1] - 0.5 * (edge[2:] + edge[:-2])) > 1.0 + 0.15 * step
-    return rough
-
-
 def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int) -> Floats | None:
     """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
     places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]
@@ -214,19 +147,48 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
 BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
 
 
-def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
+def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: Bools) -> tuple[Floats, float]:
     """Error of the edge from the disagreement of its bands, (n_frames,), px, zeros where there is one band only; and
-    the slow part of it (`shared_disagreement`). The weighted mean of K independent bands has the variance
-    Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by for long in the `core` frames is the shape of the tip,
-    not an error.
+    the slow part of it. The weighted mean of K independent bands has the variance Σ w (y − ȳ)² / ((K − 1) Σ w). What a
+    band leads or lags by for long in the `core` frames is the shape of the tip, not an error.
     """
     neighbours = 2  # Frames on each side over which the median disagreement is taken (chosen)
-    edges, sigmas = band_fits(strip, state, edge)
-    if edges.shape[1] < 2:
+    # The bands share the rows that are informative about the edge evenly, each of four rows or more (chosen).
+    contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)
+    contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
+    cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
+    limits = pairwise([0, *cuts.tolist(), strip.values.shape[1]])
+    placed = replace(state, edge=edge)
+    fits = [fit_edges(strip, placed, rows=(low, high)) for low, high in limits if high - low >= 4]
+    if len(fits) < 2:
         return np.zeros(len(edge)), 0.0
+    edges, sigmas = (np.stack([fit[:, k] for fit in fits], axis=1) for k in (0, 1))
     lead_px = np.nan_to_num(edges - edge[:, None])
-    slow = shared_disagreement(lead_px[core])
-    lead_px = lead_px - _band_offsets(lead_px, edge, np.flatnonzero(core))
+    # Slow error of the mean of bands, from the part of their disagreement that lasts over several frames: bands that
+    # disagree alike at lags of one and two frames (chosen) share a cause. Bands that mirror each other about the axis
+    # are averaged first, since a tip that tilts moves one ahead and the other behind and leaves the mean unchanged.
+    # What all frames share is the shape of the tip and is removed.
+    core_px = lead_px[core]
+    n_frames, n_bands = core_px.shape
+    away = core_px - core_px.mean(axis=1, keepdims=True)
+    away = away - np.median(away, axis=0)
+    pairs = (away + away[:, ::-1])[:, : n_bands // 2] / 2
+    pairs = pairs - pairs.mean(axis=1, keepdims=True)
+    # 4: fewest pairs of frames at a lag (chosen)
+    products = [np.sum(pairs[:-lag] * pairs[lag:], axis=1).mean() for lag in (1, 2) if n_frames - lag >= 4]
+    slow = 0.0
+    if n_bands >= 4 and products:  # the mean of a pair has half the variance of a band
+        slow = float(np.sqrt(max(2 * float(np.mean(products)) / (n_bands // 2 - 1), 0.0) / n_bands))
+    # 7, 50.0: fewest core frames nearby over which a median lead is taken, and the growth over which it is, px (chosen)
+    fewest, core_edge = min(7, int(core.sum())), edge[core]
+    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
+    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
+    offsets = np.empty((len(places), lead_px.shape[1]))
+    for i, place in enumerate(places):
+        distance = np.abs(core_edge - place)
+        near = distance <= max(50.0, float(np.partition(distance, fewest - 1)[fewest - 1]))
+        offsets[i] = np.median(lead_px[core][near], axis=0)
+    lead_px = lead_px - offsets[frame_places]
     weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
     median_lead = np.median(lead_px, axis=1, keepdims=True)
     # 2.0: deviation of a band, in median absolute deviations of those of its frame, at which it is clipped (chosen)
@@ -241,10 +203,6 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
     return np.asarray(np.sqrt(1.27 * running_median)), slow
 
 
-# Part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
-BLUR_SIGMA_PART = 0.25
-
-
 def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
     """Standard error of an edge that stops or starts within an exposure or next to it. The model's blur is that of
     uniform motion at the mean of the speeds before and after. Where these differ by Δv, either may be the speed during
@@ -257,42 +215,8 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
     from_middle = (steps[1:-2] + steps[2:-1]) / np.maximum(speed, 1e-9) - 1
     within = np.maximum(exposure_frames / 2 - np.abs(from_middle), 0.0)
     behind = speed * within**2 / (2 * exposure_frames)
-    return np.asarray(np.hypot(behind, BLUR_SIGMA_PART * exposure_frames / 4 * np.abs(steps[2:-1] - steps[1:-2])))
-
-
-def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Floats]:
-    """Fit the edge of each band of rows alone; NaN where a band shows none. The bands share the rows that are
-    informative about the edge evenly. Returns edge and its standard error, each of shape (n_frames, n_bands), px.
-    Shapes: edge (n_frames,).
-    """
-    rows = strip.values.shape[1]
-    contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)
-    contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
-    cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
-    limits = np.concatenate([[0], cuts, [rows]])
-    edges, sigmas = [], []
-    for low, high in pairwise(limits):
-        # 4: fewest rows of a band (chosen)
-        if high - low < 4:
-            continue
-        fit = fit_edges(strip, replace(state, edge=edge), rows=(int(low), int(high)))
-        edges.append(fit[:, 0])
-        sigmas.append(fit[:, 1])
-    return np.stack(edges, axis=1), np.stack(sigmas, axis=1)
-
-
-def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
-    """Median lead of each band over the core frames nearby, (n_frames, n_bands)."""
-    # 7, 50.0: fewest frames from which that offset is taken, and the growth over which it is, px (chosen)
-    fewest = min(7, len(core))
-    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
-    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
-    out = np.empty((len(places), lead_px.shape[1]))
-    for i, place in enumerate(places):
-        distance = np.abs(edge[core] - place)
-        near = distance <= max(50.0, float(np.partition(distance, fewest - 1)[fewest - 1]))
-        out[i] = np.median(lead_px[core[near]], axis=0)
-    return out[frame_places]
+    # 0.25: part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
+    return np.asarray(np.hypot(behind, 0.25 * exposure_frames / 4 * np.abs(steps[2:-1] - steps[1:-2])))
 
 
 # ------------------------------------------------------------------------------
@@ -340,9 +264,18 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     if len(exited) < fewest_rest_frames or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < film_range_px[0]:
         return none
     beside = BORDER_GAP_PX + BORDER_SIDE_PX
-    film_picture = _middle_picture(strip, exited, slice(near[0] - beside, later[-1] + beside))
+    # Median over up to 15 frames of the middle rows, free of flicker; the moving tail averages out.
+    # 0.6: part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
+    rows = strip.values.shape[1]
+    edge_rows, chosen = round((1 - 0.6) / 2 * rows), exited[np.unique(np.linspace(0, len(exited) - 1, 15).astype(int))]
+    columns = slice(near[0] - beside, later[-1] + beside)
+    values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
+    level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
+    film_picture = np.asarray(np.median(level, axis=0), dtype=np.float32)
     near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
-    borders = _borders(film_picture)
+    # Step of brightness across each column, by row; the first column is `beside`.
+    sides = np.lib.stride_tricks.sliding_window_view(film_picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
+    borders = sides[:, beside + BORDER_GAP_PX :] - sides[:, : -beside - BORDER_GAP_PX]
     border_steps = borders[:, near - beside].T
     border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
     border_step = float(np.median(border))
@@ -357,7 +290,14 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Bools, boo
     clear_px = rest_px + 3 * state.blur + 1
     exit_frame = first + int(np.argmax(edge[first:] > clear_px))
     after_exit = edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT]
-    return np.arange(len(edge)) < exit_frame, _moved_behind(after_exit, rest_px)
+    at_mouth = np.arange(len(edge)) < exit_frame
+    if len(after_exit) < FRAMES_AFTER_EXIT:
+        return at_mouth, False
+    # From rest under its present acceleration a the tip would have come v²/2a, with v its present speed; this is
+    # compared with the way from the resting place. As much again, and 5 px, are allowed for an acceleration that falls.
+    half_acceleration, speed, start_px = np.polyfit(np.arange(FRAMES_AFTER_EXIT), after_exit, 2)
+    run_up_px = speed**2 / (4 * half_acceleration) if half_acceleration > 0 else np.inf
+    return at_mouth, bool(run_up_px > 2 * (start_px - rest_px) + 5)
 
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
@@ -405,40 +345,6 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < 0.75)
     guessed = near & (unlike_model | partly_hidden)
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
-
-
-def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> NDArray[np.float32]:
-    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker, in some columns. The moving
-    tail averages out.
-    """
-    rows = strip.values.shape[1]
-    # 0.6: part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
-    edge_rows = round((1 - 0.6) / 2 * rows)
-    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, 15).astype(int))]
-    values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
-    level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
-    return np.asarray(np.median(level, axis=0), dtype=np.float32)
-
-
-def _borders(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Step of brightness across each column, by row; the first column is BORDER_GAP_PX + BORDER_SIDE_PX. Shape (n_rows,
-    n_columns).
-    """
-    sides = np.lib.stride_tricks.sliding_window_view(picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
-    apart = 2 * BORDER_GAP_PX + BORDER_SIDE_PX
-    return np.asarray(sides[:, apart:] - sides[:, :-apart], dtype=np.float32)
-
-
-def _moved_behind(edge: Floats, rest_px: float) -> bool:
-    """Whether a tip first seen at `edge` started further back than at `rest_px`. From rest under its present
-    acceleration a it would have come v²/2a, with v its present speed; this is compared with the distance from
-    `rest_px`. As much again, and 5 px, are allowed for an acceleration that falls.
-    """
-    if len(edge) < FRAMES_AFTER_EXIT:
-        return False
-    half_acceleration, speed, start_px = np.polyfit(np.arange(FRAMES_AFTER_EXIT), edge, 2)
-    run_up_px = speed**2 / (4 * half_acceleration) if half_acceleration > 0 else np.inf
-    return bool(run_up_px > 2 * (start_px - rest_px) + 5)
 
 
 def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
@@ -503,7 +409,7 @@ def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
 
 def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> float:
     """Residual sum of a path over some columns, with the film and background that follow from it."""
-    pictures = appearance_about_path(strip, path, columns)
+    pictures = ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns)
 
     def residuals_of(first: int, last: int) -> Floats:
         part = slice(first, last)
@@ -512,13 +418,6 @@ def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> f
         )
 
     return float(np.concatenate(in_parts(residuals_of, len(strip.values), FEWEST_PICTURES)).sum())
-
-
-def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:
-    """Average each pixel over the 12 frames (derived) after (film) and before (background) the front passes it. Shapes:
-    path (n_frames,) → (2, n_across, n_columns).
-    """
-    return ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns, 12)
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -538,26 +437,22 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[i
     passed = max(int(changed_columns[0]), ky.column_after_leap(path)), int(changed_columns[-1]) + 1
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
-    return _run_up(np.clip(path, *passed)), passed
-
-
-def _run_up(path: Floats) -> Floats:
-    """Replace the beginning of a path by steps that decrease going back in time, as from rest. An object such as a door
-    may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
-    columns in between turn out to be film from the start, and the second path corrects this.
-    """
+    # A run-up: the beginning is replaced by steps that decrease going back in time, as from rest. An object such as a
+    # door may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
+    # columns in between turn out to be film from the start, and the second path corrects this.
+    path = np.clip(path, *passed)
     steps = np.diff(path)
     onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0
     later = path[onset + 1 :]
     if onset < 2 or len(later) < 5:
-        return path
+        return path, passed
     # 0.1, 0.2: minimum decrease from step to step of the run-up, going back in time (chosen)
     fall = max(float(np.median(np.diff(later[:5], 2))), 0.1 * float(later[1] - later[0]), 0.2)
-    out, step = path.copy(), float(np.median(np.diff(later[:4])))
+    step = float(np.median(np.diff(later[:4])))
     for t in range(onset, -1, -1):
         step = max(step - fall, 0.0)
-        out[t] = max(out[t + 1] - step, 0.0)
-    return out
+        path[t] = max(path[t + 1] - step, 0.0)
+    return path, passed
 
 
 START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
@@ -603,20 +498,6 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
     return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
 
 
-def _unsure(fit: Floats, sigma_px: Floats, extra_px: Floats, hidden: Bools) -> Bools:
-    """Frames in which the fit is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain. Shapes: fit
-    (n_frames, 6), all others (n_frames,).
-    """
-    # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
-    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
-    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
-    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
-    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
-    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
-    uncertain = (extra_px > 1.0) | (sigma_px > np.maximum(1.0, 5.0 * np.nanmedian(sigma_px)))
-    return np.asarray(odd | uncertain | hidden)
-
-
 @dataclass(frozen=True)
 class Outline:
     """Outline of the tube that the front leaves behind: its centreline and width, px. `shift_px` and `slope` (px per
@@ -640,7 +521,7 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     degrees off and would cut the tube obliquely.
     """
     path, passed = initial_front_path(strip)
-    film, background = appearance_about_path(strip, path, passed)
+    film, background = ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *passed)
     power = (film - background).astype(float) ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
@@ -655,7 +536,9 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     typical = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
     typical |= ~typical.any()  # two widths, equally frequent: neither is typical, so all are used
     place, centre = place[typical], side[typical].mean(axis=1)
-    slope, intercept = _robust_line(place, centre)
+    i, j = np.triu_indices(len(place), 1)  # a line by the median of pairwise slopes (Theil-Sen)
+    slope = float(np.median((centre[j] - centre[i]) / (place[j] - place[i]))) if len(i) else 0.0
+    intercept = float(np.median(centre - slope * place))
     median_width = float(np.median(width))
     width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
     # 25.0, 0.15: contrast, in grey levels, below which the sides of a tube fade into the background (measured)
@@ -686,13 +569,6 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
     return float(row + outwards * excess[row] / (excess[row] - min(excess[row + outwards], 0.0)))
 
 
-def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
-    """Fit a line by the median of pairwise slopes (Theil-Sen); return slope and intercept."""
-    i, j = np.triu_indices(len(x), 1)
-    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i]))) if len(i) else 0.0
-    return slope, float(np.median(y - slope * x))
-
-
 def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
     """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
     # Distance, in standard deviations, at which the difference of a pixel from film or background is clipped
@@ -709,17 +585,12 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
 
     evidence = np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
-    path = ky.dividing_path(evidence * _frame_weights(change, state.edge)[:, None])
+    # Each frame counts by how much it differs from the one before it, 0.05 (chosen) to 1: while the tip rests behind a
+    # closed door that looks like film, a hundred frames carry no more information than one.
+    usual, floor = float(np.median(change[moving_frames(state.edge)])), float(np.quantile(change, 0.05))
+    frame_weights = np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
+    path = ky.dividing_path(evidence * frame_weights[:, None])
     return np.clip(path - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
-
-
-def _frame_weights(change: Floats, edge: Floats) -> NDArray[np.float32]:
-    """Weight each frame by how much it differs from the one before it, 0.05 (chosen) to 1, shape (n_frames,). While the
-    tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
-    """
-    usual = float(np.median(change[moving_frames(edge)]))
-    floor = float(np.quantile(change, 0.05))
-    return np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
 
 
 def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
@@ -738,6 +609,8 @@ def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) 
 
 def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> Positions:
     """Add to a converged fit the errors of bands, start, doors and leaps, and refer the edge to mid-exposure."""
+    from scipy.ndimage import median_filter
+
     core = core_frames(state, fit)
     # Where a frame departs from the model (a door, a glint), the error exceeds that from the curvature of ln L.
     # 100.0: upper limit of a frame's misfit relative to the median (chosen)
@@ -768,10 +641,36 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
     # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_ERROR_PX) | in_mouth
     extra = np.maximum(extra, leap_error_px(edge_now, hidden))
-    bands, slow_bands = noise_and_slow(bands, visible_error, extra)
-    slow = np.hypot(slow_bands, slow_error_px(edge_now, contrast, shared))
+    # Unsure is a poor fit: odd contrast, large misfit, disagreeing bands, hidden, uncertain.
+    # 6.0, 0.3: misfit over the median one, taken as at least so much, above which a frame is doubtful (chosen)
+    misfit, largest_misfit = fit[:, 2], 6.0 * max(float(np.nanmedian(fit[:, 2])), 0.3)
+    # 1.5: amplitude (relative contrast) above which something adds to the edge (chosen)
+    odd = (fit[:, 3] < LEAST_AMPLITUDE - 1) | (fit[:, 3] > 1.5 - 1) | (misfit > largest_misfit)
+    # 1.0: disagreement of bands above which some band follows something other than the edge (chosen)
+    # 1.0, 5.0: A point with a larger standard error, and one this many times the median, is doubtful (chosen)
+    uncertain = (extra > 1.0) | (sigma > np.maximum(1.0, 5.0 * np.nanmedian(sigma)))
+    # What is added is split into a part that differs from frame to frame and one that neighbours share. Here the parts
+    # of the error near the start, and of an edge that is a guess, since a door or the mouth hides it, that differ from
+    # frame to frame (measured, chosen):
+    start_part, guess_part = 0.4, math.sqrt(0.5)
+    near = np.sqrt(np.maximum(visible_error**2 - bands**2, 0.0))
+    guess = np.sqrt(np.maximum(extra**2 - visible_error**2, 0.0))
+    bands = np.sqrt(bands**2 + (start_part * near) ** 2 + (guess_part * guess) ** 2)
+    slow = np.hypot(math.sqrt(1 - start_part**2) * near, math.sqrt(1 - guess_part**2) * guess)
+    # Slow error of any edge, and where film or background differ from their pictures: about 1/contrast
+    everywhere_px, finite = float(np.hypot(SLOW_PX, shared)), np.isfinite(contrast)
+    slow_px: Floats | float = everywhere_px
+    if finite.any():
+        columns = np.arange(len(contrast))
+        # 21: columns over which the contrast at an edge is taken, px (chosen)
+        level = np.interp(columns, columns[finite], np.abs(contrast[finite]))
+        local_contrast = np.interp(np.nan_to_num(edge_now), columns, median_filter(level, 21, mode="nearest"))
+        # 1.0: error of the pictures of film and background, in grey levels of 255 (measured)
+        # 1.0: least contrast, in grey levels (chosen)
+        slow_px = np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0))
+    slow = np.hypot(slow, slow_px)
     return Positions(
-        edge_px=edge, sigma_px=sigma, unsure=_unsure(fit, sigma, extra, hidden), blur_px=state.blur,
+        edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden), blur_px=state.blur,
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
         bands_sigma_px=bands,
     )  # fmt: skip

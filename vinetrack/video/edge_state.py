@@ -1,7 +1,4 @@
-"""State of the edge tracker and the steps of its alternation: estimate film and background, then fit the edge.
-
-The shape of the tip, the optical blur and the exposure are estimated in `vinetrack.video.edge_state`.
-"""
+"""State of the edge tracker and the steps of its alternation: estimate film and background, then fit the edge."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.core.threads import in_parts
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.edge_kernels import coverage_reach
@@ -57,7 +54,7 @@ def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
     return np.clip(smooth, 0, None) * exposure_frames
 
 
-def moving_frames(edge: Floats) -> NDArray[np.bool_]:
+def moving_frames(edge: Floats) -> Bools:
     """Return the frames in which the edge moves; all frames if fewer than five do. Shapes: edge (n_frames,) →
     (n_frames,).
     """
@@ -69,7 +66,7 @@ def moving_frames(edge: Floats) -> NDArray[np.bool_]:
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
 
-def informative_frames(edge: Floats) -> NDArray[np.bool_]:
+def informative_frames(edge: Floats) -> Bools:
     """Return the frames that determine film, background and tip shape. They are the frames in motion, and MEMORY_CUTOFF
     memories before and after. Shapes: edge (n_frames,) → (n_frames,).
     """
@@ -78,7 +75,7 @@ def informative_frames(edge: Floats) -> NDArray[np.bool_]:
     return np.asarray((frames >= moving[0] - reach) & (frames <= moving[-1] + reach))
 
 
-def hold_at_rest(edge: Floats, informative: NDArray[np.bool_]) -> Floats:
+def hold_at_rest(edge: Floats, informative: Bools) -> Floats:
     """Set the edge outside the informative frames to its value at the first and last of them. Shapes: edge, informative
     (n_frames,) → (n_frames,).
     """
@@ -90,7 +87,15 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     """Estimate the brightness of film and background at every pixel, given the edge."""
     ridge_weight = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)
     neighbour_decay = 0.93  # Factor by which the weight of neighbours falls per column (derived)
-    early, late = _passage_frames(state, strip.values.shape[2])
+    # First and last frame in which the edge is over each column. Near the start, film is counted only once the edge has
+    # cleared it: until then a door may stand or swing there.
+    frames, places = np.arange(len(state.edge), dtype=float), np.arange(strip.values.shape[2], dtype=float)
+    monotone = np.maximum.accumulate(state.edge) + 1e-6 * frames
+    begin, end = frames[moving_frames(state.edge)][[0, -1]]
+    passing_px = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
+    behind = np.maximum(places + passing_px + float(state.lag.max()), clear_of_start(state.edge))
+    early = np.clip(np.interp(places - passing_px, monotone, frames), begin, end)
+    late = np.clip(np.interp(behind, monotone, frames), begin, end)
     # 2.06: distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
     reach = 0.5 * state.lengths + 2.06 * state.blur
     sums = kernels.gather(
@@ -100,41 +105,18 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
     appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
-    film_all_along = _film_at_start(state, appearance)
+    # Columns near the start whose background looks like their film were film all along. If the initial edge is placed
+    # too far back, film serves as its own background; without contrast nothing corrects it.
+    contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
+    columns, clear = np.arange(len(contrast)), clear_of_start(state.edge)
+    near = (columns > state.edge[0] - 5) & (columns < clear)
+    later = (columns >= clear) & (columns < state.edge.max() - 5)
+    # 0.4: part of the typical contrast below which film and background are the same material (chosen)
+    film_all_along = near & (contrast < 0.4 * float(np.median(contrast[later]))) if later.sum() >= 10 else near & False
     if film_all_along.any():
         sums[1, :, :, film_all_along] = 0.0
         appearance = kernels.solve(sums, ridge_weight, neighbour_decay, middle, strip.noise, TEXTURE_SD)
     return replace(state, appearance=appearance)
-
-
-def _film_at_start(state: EdgeState, appearance: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mark columns near the start whose background looks like their film: they were film all along. Shape (n_along,).
-    If the initial edge is placed too far back, film serves as its own background; without contrast nothing corrects it.
-    """
-    contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
-    columns = np.arange(len(contrast))
-    near = (columns > state.edge[0] - 5) & (columns < clear_of_start(state.edge))
-    later = (columns >= clear_of_start(state.edge)) & (columns < state.edge.max() - 5)
-    if later.sum() < 10:
-        return np.zeros(len(contrast), dtype=bool)
-    # 0.4: part of the typical contrast below which film and background are the same material (chosen)
-    return near & (contrast < 0.4 * float(np.median(contrast[later])))
-
-
-def _passage_frames(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
-    """First and last frame in which the edge is over each column, shapes (n_along,). Near the start, film is counted
-    only once the edge has cleared it: until then a door may stand or swing there.
-    """
-    monotone = np.maximum.accumulate(state.edge) + 1e-6 * np.arange(len(state.edge))
-    frames = np.arange(len(monotone), dtype=float)
-    moving = np.flatnonzero(moving_frames(state.edge))
-    places = np.arange(columns, dtype=float)
-    reach = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
-    begin, end = frames[moving[0]], frames[moving[-1]]
-    behind = np.maximum(places + reach + float(state.lag.max()), clear_of_start(state.edge))
-    early = np.clip(np.interp(places - reach, monotone, frames), begin, end)
-    late = np.clip(np.interp(behind, monotone, frames), begin, end)
-    return early, late
 
 
 def clear_of_start(edge: Floats) -> float:
@@ -144,7 +126,7 @@ def clear_of_start(edge: Floats) -> float:
     return float(edge[0] + min(START_CLEARANCE_PX, 0.2 * (edge.max() - edge[0])))
 
 
-def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
+def core_frames(state: EdgeState, fit: Floats) -> Bools:
     """Select the frames that determine the shape of the tip. They are in motion, clear of the start, and fit no worse
     than most. Shapes: fit (n_frames, 6) → (n_frames,).
     """
@@ -159,7 +141,7 @@ def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
 
 
 def fit_edges(
-    strip: Strip, state: EdgeState, chosen: NDArray[np.bool_] | bool = True, rounds: int = FIT_ROUNDS,
+    strip: Strip, state: EdgeState, chosen: Bools | bool = True, rounds: int = FIT_ROUNDS,
     rows: tuple[int, int] | None = None,
 ) -> Floats:  # fmt: skip
     """Fit the edge of the chosen frames by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 6), NaN
@@ -172,7 +154,7 @@ def fit_edges(
 
 
 def search_edges(
-    strip: Strip, state: EdgeState, frames: NDArray[np.int_], starts: Floats, rounds: int = FIT_ROUNDS,
+    strip: Strip, state: EdgeState, frames: Indices, starts: Floats, rounds: int = FIT_ROUNDS,
     rows: tuple[int, int] | None = None,
 ) -> Floats:  # fmt: skip
     """Fit the edge from each of several starts, in any frames; see `edge_kernels.fit_edges`. Shapes: frames, starts
@@ -211,9 +193,7 @@ class Residuals(NamedTuple):
     misfit: Floats
 
 
-def residuals(
-    strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX
-) -> Residuals:
+def residuals(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX) -> Residuals:
     """Sum what a fit leaves over the frames of `use`. Shapes: fit (n_frames, 6); use (n_frames,)."""
     filled, frames, shading = np.nan_to_num(fit), np.flatnonzero(use), _padded_shading(state, margin_px)
     filled[:, 0] = state.edge
@@ -228,19 +208,16 @@ def residuals(
     return Residuals(*(np.concatenate(part).sum(axis=0) for part in zip(*parts, strict=True)))
 
 
-def misfit(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX) -> float:
+def misfit(strip: Strip, state: EdgeState, fit: Floats, use: Bools, margin_px: float = MARGIN_PX) -> float:
     """Return the robust misfit of a fit."""
     total, count = residuals(strip, state, fit, use, margin_px).misfit
     return float(total / max(count, 1))
 
 
 def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
-    """Estimate film and background from an initial path of the front, with a straight tip and a typical blur. Shapes:
-    path (n_frames,).
-    """
-    rows, columns = strip.values.shape[1:]
-    blank = np.zeros((4, rows, columns), np.float32)
-    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
+    """Estimate film and background from an initial path of the front, with a straight tip and a typical blur."""
+    blank = np.zeros((4, *strip.values.shape[1:]), np.float32)
+    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(blank.shape[1]), 2.0, blank, np.ones(3))
     return estimate_appearance(strip, state, 0.0)
 
 
@@ -273,10 +250,13 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
     candidates = candidates if everywhere else state.blur * candidates
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
-    misfits = [
-        _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - coverage_reach(0.0, blur))
-        for blur in candidates.tolist()
-    ]
+    misfits = []
+    for blur in candidates.tolist():  # each with a new fit: a blur must not be judged by edges fitted with another
+        blurred = replace(state, blur=blur)
+        fit = fit_edges(strip, blurred, np.isin(np.arange(len(state.edge)), sampled), EARLY_FIT_ROUNDS)
+        use = np.isfinite(fit[:, 0])
+        blurred = replace(blurred, edge=np.where(use, fit[:, 0], state.edge))
+        misfits.append(misfit(strip, blurred, fit, use, widest - coverage_reach(0.0, blur)))
     return replace(state, blur=float(np.clip(_least_misfit(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
 
 
@@ -296,53 +276,41 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     return state
 
 
-def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], margin_px: float) -> float:
-    """Misfit of some frames after a new fit of their edges: a blur must not be judged by edges fitted with another."""
-    fit = fit_edges(strip, state, np.isin(np.arange(len(state.edge)), frames), EARLY_FIT_ROUNDS)
-    use = np.isfinite(fit[:, 0])
-    return misfit(strip, replace(state, edge=np.where(use, fit[:, 0], state.edge)), fit, use, margin_px)
-
-
 def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
     """Exposure, in frame periods, that explains the blur of the faster frames best. It is ASSUMED_EXPOSURE where no
     frame moves 2 px. Shapes: fit (n_frames, 6).
     """
-    speed, fast = _fast_frames(state, fit)
-    if not fast.any():
-        return ASSUMED_EXPOSURE
-    return _least_misfit(EXPOSURES, _misfits_of_exposures(strip, state, fit, speed, fast, EXPOSURES))
+    _, fast, misfits = _misfits_of_exposures(strip, state, fit, EXPOSURES)
+    return _least_misfit(EXPOSURES, misfits) if fast.any() else ASSUMED_EXPOSURE
 
 
 def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
     """Find the exposure that the blur shows where it contradicts the stated one. Returns exposure over frame period,
     NaN where the stated one explains the blur as well; and the median speed of the frames used, px a frame.
     """
-    speed, fast = _fast_frames(state, fit)
+    speed, fast, misfits = _misfits_of_exposures(strip, state, fit, np.append(EXPOSURES, stated_frames))
     # 6: fewest frames from which a blur is told from the shape of the tip (chosen)
     if fast.sum() < 6:
         return np.nan, np.nan
-    misfits = _misfits_of_exposures(strip, state, fit, speed, fast, np.append(EXPOSURES, stated_frames))
     # 1.01: ratio to the least misfit of any exposure above which the stated one is contradicted (measured)
     contradicted = misfits[-1] > 1.01 * misfits.min()
     seen = _least_misfit(EXPOSURES, misfits[:-1]) if contradicted else np.nan
     return seen, float(np.median(speed[fast]))
 
 
-def _fast_frames(state: EdgeState, fit: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Speed in every frame, px a frame, and the faster half of the core frames among those that move 2 px."""
+def _misfits_of_exposures(
+    strip: Strip, state: EdgeState, fit: Floats, exposures: Floats
+) -> tuple[Floats, Bools, Floats]:
+    """Speed in every frame, px a frame; the faster half of the core frames among those that move 2 px; and their misfit
+    with each exposure, shape (n_exposures,), without the tip's shading, which looks like any error of the exposure at
+    constant speed.
+    """
     core = core_frames(state, fit)
     speed = blur_lengths(state.edge, 1.0)
-    return speed, core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
-
-
-def _misfits_of_exposures(
-    strip: Strip, state: EdgeState, fit: Floats, speed: Floats, frames: NDArray[np.bool_], exposures: Floats
-) -> Floats:
-    """Misfit of some frames with each exposure, shape (n_exposures,). The tip's shading is left out: at constant speed
-    it looks like any error of the exposure.
-    """
+    fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
     bare = replace(state, shading=np.zeros_like(state.shading))
-    return np.array([misfit(strip, replace(bare, lengths=speed * tau), fit, frames) for tau in exposures])
+    misfits = [misfit(strip, replace(bare, lengths=speed * tau), fit, fast) for tau in exposures if fast.any()]
+    return speed, fast, np.array(misfits)
 
 
 def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:

@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vinetrack.core.records import CONTAINERS, IMAGES, Bools, Floats
+from vinetrack.core.records import CONTAINERS, IMAGES, Bools, Floats, Indices
 from vinetrack.core.tables import file_size
 
 if TYPE_CHECKING:
@@ -94,8 +94,13 @@ def decode_container(
                     n = len(decoded.times_s)
                     if (n + 1) * picture.nbytes > available_bytes:
                         raise MemoryError
-                    if buffer is None or n == len(buffer):
-                        buffer = _enlarged(buffer, picture, expected, available_bytes)
+                    if buffer is None:  # untouched memory takes no space
+                        # 256: frames for which memory is reserved if a film does not declare their number (chosen)
+                        fits = expected and expected * picture.nbytes <= available_bytes
+                        buffer = np.empty((expected if fits else 256, *picture.shape), picture.dtype)
+                    elif n == len(buffer):
+                        small, buffer = buffer, np.empty((n + n // 2 + 1, *picture.shape), picture.dtype)
+                        buffer[:n] = small
                     buffer[n] = picture
                     decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base)
                     decoded.corrupt.append(bool(frame.is_corrupt))
@@ -113,7 +118,7 @@ def decode_container(
     return decoded
 
 
-def damaged_frames(decoded: Decoded, slot: NDArray[np.int_]) -> Bools:
+def damaged_frames(decoded: Decoded, slot: Indices) -> Bools:
     """Mark frames that are corrupt or coded from corrupt frames, shape (n_frames,). A decoder marks only the frame in
     which it met the fault. The frames after it are coded as differences from it and are equally wrong, without a
     message, until the next key frame. Shapes: slot (n_frames,) → (n_frames,).
@@ -126,19 +131,6 @@ def damaged_frames(decoded: Decoded, slot: NDArray[np.int_]) -> Bools:
     for i in range(len(damaged) - 2, -1, -1):
         damaged[i] |= damaged[i + 1] and decoded.between[i]
     return damaged
-
-
-def _enlarged(
-    buffer: NDArray[Any] | None, picture: NDArray[Any], expected: int | None, available_bytes: float
-) -> NDArray[Any]:
-    """Return a larger buffer with the same frames; untouched memory takes no space."""
-    if buffer is None:
-        # 256: frames for which memory is reserved if a film does not declare their number (chosen)
-        count = expected if expected and expected * picture.nbytes <= available_bytes else 256
-        return np.empty((count, *picture.shape), picture.dtype)
-    enlarged = np.empty((len(buffer) + len(buffer) // 2 + 1, *buffer.shape[1:]), buffer.dtype)
-    enlarged[: len(buffer)] = buffer
-    return enlarged
 
 
 @dataclass(frozen=True)
@@ -407,11 +399,11 @@ class Frames:
 
     recording: Recording
     luma: NDArray[Any]
-    slot: NDArray[np.int_]
-    damaged: NDArray[np.bool_]
+    slot: Indices
+    damaged: Bools
     notes: tuple[str, ...] = ()
-    slots_before: NDArray[np.int_] = field(default_factory=lambda: np.zeros(0, dtype=int))
-    slots_after: NDArray[np.int_] = field(default_factory=lambda: np.zeros(0, dtype=int))
+    slots_before: Indices = field(default_factory=lambda: np.zeros(0, dtype=int))
+    slots_after: Indices = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     def __len__(self) -> int:
         return len(self.luma)
@@ -528,35 +520,24 @@ def _inspect_container(path: Path) -> Recording:
             if first is None:
                 raise RecordingError("not one frame can be decoded", "the file is damaged or empty", path.name)
             depth = first.format.components[0].bits
-            declared = _declared_frames(stream, container)
             playback = float(stream.average_rate) if stream.average_rate else None
+            declared = stream.frames or None
+            if declared is None and playback:  # of the header; if absent, duration times playback rate
+                seconds = (container.duration or 0) / 1e6
+                if stream.duration is not None and stream.time_base is not None:
+                    seconds = float(stream.duration * stream.time_base)
+                declared = max(round(seconds * playback), 0) or None
             return Recording(path, "container", first.width, first.height, depth, declared, playback_fps=playback)
     except (av.error.FFmpegError, UnicodeDecodeError) as error:
         # PyAV decodes names in a header as UTF-8, which fails for a damaged one.
-        raise RecordingError(*_why_unreadable(path, messages, str(error)), path.name) from error
-
-
-def _declared_frames(stream: Any, container: Any) -> int | None:
-    """Frame count of the header; if absent, duration times playback rate."""
-    if stream.frames > 0:
-        return int(stream.frames)
-    seconds = math.nan if container.duration is None else container.duration / 1e6
-    if stream.duration is not None and stream.time_base is not None:
-        seconds = float(stream.duration * stream.time_base)
-    if math.isnan(seconds) or not stream.average_rate:
-        return None
-    return max(round(seconds * float(stream.average_rate)), 0) or None
-
-
-def _why_unreadable(path: Path, messages: list[str], error: str) -> tuple[str, str]:
-    """What is wrong with a file that cannot be opened, and what to do."""
-    if "moov atom not found" in " ".join([*messages, error]):
-        with path.open("rb") as stream:
-            if stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}:
-                return "cut short: the index that is written last is missing", "copy the file again, or repair it"
-    if path.suffix.lower() not in CONTAINERS:
-        return "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
-    return "not a video, or its beginning is damaged", "copy it from the camera again"
+        why = "not a video, or its beginning is damaged", "copy it from the camera again"
+        if path.suffix.lower() not in CONTAINERS:
+            why = "not a video that can be read", "save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
+        with path.open("rb") as begin:
+            is_film = begin.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
+        if is_film and "moov atom not found" in " ".join([*messages, str(error)]):
+            why = "cut short: the index that is written last is missing", "copy the file again, or repair it"
+        raise RecordingError(*why, path.name) from error
 
 
 def _assemble(recording: Recording, decoded: Decoded, index: PacketIndex | None) -> Frames:
@@ -598,7 +579,7 @@ def _assemble(recording: Recording, decoded: Decoded, index: PacketIndex | None)
     return Frames(recording, decoded.pictures, slot, damaged, tuple(notes), before, after)
 
 
-def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[NDArray[np.int_], str]:
+def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[Indices, str]:
     """Return the capture period of every frame since the first from its timestamp, both (n_frames,), and a note on
     irregularities ("" if there are none). Timestamps are rounded to whole multiples of their median spacing, so that a
     missing frame leaves a gap. Those that repeat, run backwards or fit no common period are not used; frames are then

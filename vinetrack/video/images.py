@@ -37,11 +37,8 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
     true_fps, stated = recording.capture_fps, trial.capture_fps
     if true_fps is not None:
         if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
-            raise RecordingError(
-                f"capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording",
-                "correct the sheet",
-                trial.name,
-            )
+            message = f"capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording"
+            raise RecordingError(message, "correct the sheet", trial.name)
         return true_fps
     if not np.isfinite(stated):
         raise RecordingError("capture_fps is missing", "the file knows its playback rate only", trial.name)
@@ -62,11 +59,8 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
         return stated_s
     # 0.02: relative difference within which exposures of sheet and recording are the same (chosen)
     if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > 0.02:
-        raise RecordingError(
-            f"exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording",
-            "correct the sheet",
-            trial.name,
-        )
+        message = f"exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording"
+        raise RecordingError(message, "correct the sheet", trial.name)
     return true_s
 
 
@@ -101,7 +95,15 @@ def inspect_cine(path: Path) -> Recording:
             offsets = tuple(int(at) for at in np.frombuffer(header, "<i8", count, table))
             frames = _cine_frames(path, stream, header, (version, compression, bitmap, setup), offsets, size)
         setup_bytes = header[setup:]
-        rate, exposure_s, times_s, notes = _cine_clock(name, setup_bytes, _tagged_blocks(header[:table], setup), count)
+        blocks: dict[int, bytes] = {}  # content of the tagged blocks behind the settings, by type
+        at, more = setup + struct.unpack_from("<H", header, setup + MARK_AT + 2)[0], 1
+        while more and at + 8 <= table:
+            length, kind, more = struct.unpack_from("<IHH", header, at)
+            if length < 8 or at + length > table:
+                break
+            blocks[kind] = header[at + 8 : at + length]
+            at += length
+        rate, exposure_s, times_s, notes = _cine_clock(name, setup_bytes, blocks, count)
     except (struct.error, ValueError, OSError) as error:
         if isinstance(error, RecordingError):
             raise
@@ -128,9 +130,7 @@ def _cine_frames(
     packed_bits = {0: None, 256: 10, 1024: 12}  # of a packed pixel, by `biCompression`
     grey = compression == 0 or (compression == 2 and 0 <= filters <= 6)
     if not (version == 1 and grey and packing in packed_bits and bits in (8, 16)):
-        kind = (
-            f"version {version}, compression {compression}, packing {packing}, {bits} bits, colour filter {filters:#x}"
-        )
+        kind = f"version {version}, compression {compression}, packing {packing}, {bits} bits, colours {filters:#x}"
         raise RecordingError(f"a cine of {kind} is not read", "save it as raw cine or AVI", name)
     packed = packed_bits[packing]
     frames = RawFrames(
@@ -155,21 +155,6 @@ def _cine_frames(
             raise RecordingError(f"a frame takes {taken} bytes where {wanted}", "it is not read", name)
         starts.append(at + annotation)
     return replace(frames, offsets=tuple(starts))
-
-
-def _tagged_blocks(header: bytes, setup: int) -> dict[int, bytes]:
-    """Content of the tagged blocks behind the settings, by type."""
-    blocks: dict[int, bytes] = {}
-    at = setup + struct.unpack_from("<H", header, setup + MARK_AT + 2)[0]
-    while at + 8 <= len(header):
-        length, kind, more = struct.unpack_from("<IHH", header, at)
-        if length < 8 or at + length > len(header):
-            break
-        blocks[kind] = header[at + 8 : at + length]
-        at += length
-        if not more:
-            break
-    return blocks
 
 
 def _cine_clock(
@@ -211,13 +196,10 @@ def inspect_mraw(path: Path) -> Recording:
     """Read the side file of a Photron `.mraw`."""
     data = next(iter(_siblings(path, (".mraw",))), None)
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
-    if side is None:
-        raise RecordingError(
-            "its .cih or .cihx is missing, which describes the pictures", "put it in the same folder", path.name
-        )
+    if side is None or data is None:
+        missing = ".mraw is missing, which holds" if side else ".cih or .cihx is missing, which describes"
+        raise RecordingError(f"its {missing} the pictures", "put it in the same folder", path.name)
     facts = read_side_file(side)
-    if data is None:
-        raise RecordingError("its .mraw is missing, which holds the pictures", "put it in the same folder", path.name)
     grey = not facts.colour or facts.colour.lower().startswith("mono")
     if not (facts.file_format.lower() == "mraw" and grey and facts.stored_bits in (8, 12, 16)):
         raise RecordingError(
@@ -263,10 +245,19 @@ def read_side_file(path: Path) -> SideFile:
             data = stream.read(4_000_000)
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", name=name) from None
-    values = _cihx_values(name, data) if path.suffix.lower() == ".cihx" else _cih_values(data)
+    if path.suffix.lower() == ".cihx":
+        values = _cihx_values(name, data)
+    else:  # lines `key : value`, of which the first counts
+        lines = [line.partition(":") for line in data.decode("utf-8", "replace").splitlines()]
+        values = {key.strip(): text.strip() for key, colon, text in reversed(lines) if colon}
 
     def value(key: str) -> float:
-        return _as_number(values.get(key, ""))
+        """The number at the beginning of a value, or a fraction such as 1/20000; 0 where there is none."""
+        match = re.match(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)(?:\s*/\s*([0-9.]+))?", values.get(key, ""))
+        try:
+            return float(match.group(1)) / float(match.group(2) or 1) if match else 0.0
+        except (ValueError, ZeroDivisionError):
+            return 0.0
 
     rate, exposure_s, notes = value("Record Rate(fps)"), value("Shutter Speed(s)"), []
     # A number above 1 is the denominator: 20000 for 1/20000 s.
@@ -301,15 +292,8 @@ def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count:
 
 def _siblings(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """Files of the same name with one of the suffixes, in upper or lower case."""
-    if not path.parent.is_dir():
-        return []
-    return sorted(at for at in path.parent.iterdir() if at.stem == path.stem and at.suffix.lower() in suffixes)
-
-
-def _cih_values(data: bytes) -> dict[str, str]:
-    """Values of the lines `key : value`."""
-    lines = (line.partition(":") for line in data.decode("utf-8", "replace").splitlines())
-    return {key.strip(): text.strip() for key, colon, text in reversed(list(lines)) if colon}
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    return sorted(at for at in beside if at.stem == path.stem and at.suffix.lower() in suffixes)
 
 
 def _cihx_values(name: str, data: bytes) -> dict[str, str]:
@@ -333,15 +317,6 @@ def _cihx_values(name: str, data: bytes) -> dict[str, str]:
     if root is None:
         raise RecordingError("its XML is damaged", "copy it from the camera again", name)
     return {key: (root.findtext(place) or "").strip() for key, place in places.items()}
-
-
-def _as_number(text: str) -> float:
-    """The number at the beginning of a value, or a fraction such as 1/20000; 0 where there is none."""
-    match = re.match(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)(?:\s*/\s*([0-9.]+))?", text)
-    try:
-        return float(match.group(1)) / float(match.group(2) or 1) if match else 0.0
-    except (ValueError, ZeroDivisionError):
-        return 0.0
 
 
 def inspect_images(path: Path) -> Recording:
@@ -372,12 +347,19 @@ def read_images(recording: Recording) -> Frames:
     count, dtype = recording.declared_frames or 0, np.dtype(np.uint8 if recording.bit_depth == 8 else np.uint16)
     is_damaged: list[bool] = []
 
+    # Decoders silently fill a missing part with grey: a JPEG or PNG must have its end marker.
+    markers = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
+
     def pictures() -> Iterator[NDArray[Any]]:
         for file in recording.files:
+            with file.open("rb") as stream:
+                stream.seek(max(file.stat().st_size - 64, 0))
+                whole = markers.get(file.suffix.lower(), b"") in stream.read()
             picture = _read_or_none(file)
-            readable = picture is not None and picture.shape == (recording.height, recording.width)
-            is_damaged.append(not readable or not _has_end_marker(file))
-            yield picture if readable and picture is not None else np.zeros((recording.height, recording.width), dtype)
+            if picture is None or picture.shape != (recording.height, recording.width):
+                picture, whole = np.zeros((recording.height, recording.width), dtype), False
+            is_damaged.append(not whole)
+            yield picture
 
     if recording.kind == "stack":
         luma = filled(recording, _stack_pages(recording), count, dtype)
@@ -395,10 +377,15 @@ def read_images(recording: Recording) -> Frames:
             f"{name}: damaged: {damaged.sum()} of {len(luma)} pictures are cut short or unreadable, first {first}"
         )
     slot = np.arange(len(luma))
-    if recording.numbers:
-        slot, missing = _capture_periods(np.array(recording.numbers))
-        if missing:
-            notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
+    if len(recording.numbers) > 2:  # of the files, which may count in any step
+        steps = np.diff(recording.numbers)
+        step = int(np.median(steps))
+        if step > 0 and not np.any(steps % step) and np.all(steps > 0):
+            periods = np.concatenate([[0], np.cumsum(steps // step)])
+            missing = int(periods[-1] - slot[-1])
+            if 0 < missing <= max(3, len(slot) // 10):
+                slot = periods
+                notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
     return Frames(recording, luma, slot, damaged, tuple(notes))
 
 
@@ -432,32 +419,8 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
     files = tuple(file for _, file in group)
     numbers = tuple(number for number, _ in group)
     left_out = [f.name for f in images if f not in set(files)]
-    if not left_out:
-        return files, numbers, ()
-    note = f"{folder.name}: {len(left_out)} images not numbered like the rest are left out, first {left_out[0]}"
-    return files, numbers, (note,)
-
-
-def _capture_periods(numbers: NDArray[np.int_]) -> tuple[NDArray[np.int_], int]:
-    """Capture periods from the numbers of the files, which may count in any step, and how many are missing."""
-    consecutive = np.arange(len(numbers))
-    if len(numbers) < 3:
-        return consecutive, 0
-    steps = np.diff(numbers)
-    step = int(np.median(steps))
-    if step <= 0 or np.any(steps % step) or np.any(steps <= 0):
-        return consecutive, 0
-    slot = np.concatenate([[0], np.cumsum(steps // step)])
-    missing = int(slot[-1] - consecutive[-1])
-    return (slot, missing) if missing <= max(3, len(numbers) // 10) else (consecutive, 0)
-
-
-def _has_end_marker(file: Path) -> bool:
-    """Whether a JPEG or PNG has its end marker: decoders silently fill a missing part with grey."""
-    markers = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
-    with file.open("rb") as stream:
-        stream.seek(max(file.stat().st_size - 64, 0))
-        return markers.get(file.suffix.lower(), b"") in stream.read()
+    what = f"{len(left_out)} images not numbered like the rest are left out"
+    return files, numbers, (f"{folder.name}: {what}, first {left_out[0]}",) if left_out else ()
 
 
 def _read_or_none(file: Path) -> NDArray[Any] | None:
@@ -492,20 +455,13 @@ def _stack_pages(recording: Recording) -> Iterator[NDArray[Any]]:
             yield np.asarray(page)
 
 
-def _dng_pages(tiff: Any) -> Iterator[Any]:
-    """Pages of a DNG file with their sub-pages."""
-    for page in tiff.pages:
-        yield page
-        yield from page.pages or ()
-
-
 def _dng_clock(file: Path) -> tuple[float | None, float | None]:
     """Capture rate (tag 51044 of CinemaDNG) and exposure (33434 of TIFF/EP, ISO 12234-2) of a frame, None if absent."""
     import tifffile
 
     values: dict[int, float] = {}
     with tifffile.TiffFile(file) as tiff:
-        for page in _dng_pages(tiff):
+        for page in (part for whole in tiff.pages for part in (whole, *(whole.pages or ()))):
             for code in (51044, 33434):
                 if code in page.tags and code not in values:
                     value = page.tags[code].value
@@ -520,10 +476,21 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
     import tifffile
 
     with tifffile.TiffFile(file) as tiff:
-        pages = [p for p in _dng_pages(tiff) if p.photometric in (32803, 34892, 1, 2)]
+        parts = (part for whole in tiff.pages for part in (whole, *(whole.pages or ())))
+        pages = [part for part in parts if part.photometric in (32803, 34892, 1, 2)]
         page = max(pages, key=lambda p: int(p.imagewidth) * int(p.imagelength) * (2 if p.photometric == 32803 else 1))
         if page.compression == 1 and page.bitspersample == 12:
-            raw = _unpack_12_bit(file, page)
+            # Two pixels in three bytes, rows beginning on whole bytes
+            with file.open("rb") as stream:
+                strips = []
+                for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+                    stream.seek(offset)
+                    strips.append(stream.read(count))
+            height, width = int(page.imagelength), int(page.imagewidth)
+            row = (width * 12 + 7) // 8
+            data = np.frombuffer(b"".join(strips), np.uint8)[: height * row].reshape(height, row)
+            padded = np.pad(data, ((0, 0), (0, -row % 3)))
+            raw = unpack_pixels(padded.ravel(), 12).reshape(height, -1)[:, :width]
         else:
             raw = np.asarray(page.asarray())
         mosaic = page.photometric == 32803
@@ -532,17 +499,3 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
     if mosaic:
         raw = mosaic_brightness(raw)
     return raw.astype(np.uint16)
-
-
-def _unpack_12_bit(file: Path, page: Any) -> NDArray[np.uint16]:
-    """Unpack two pixels from three bytes, most significant bits first, rows beginning on whole bytes."""
-    with file.open("rb") as stream:
-        parts = []
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-            stream.seek(offset)
-            parts.append(stream.read(count))
-    height, width = int(page.imagelength), int(page.imagewidth)
-    row = (width * 12 + 7) // 8
-    data = np.frombuffer(b"".join(parts), np.uint8)[: height * row].reshape(height, row)
-    padded = np.pad(data, ((0, 0), (0, -row % 3)))
-    return unpack_pixels(padded.ravel(), 12).reshape(height, -1)[:, :width]

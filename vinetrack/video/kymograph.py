@@ -1,10 +1,10 @@
 """Initial paths of the front: monotone paths through the kymograph (frame by column), by dynamic programming.
 
-A path is found in two passes. The first (`first_path`) knows neither film nor background, only that a column changes
-once, when the front passes it: `path_by_change` maximises the change collected along the path; `path_by_appearance`
-separates columns that look as at the end of the recording from columns that look as at its start. The second pass
-(`edge`) knows film and background and compares every pixel with both; distances are clipped, so that a door, a payload
-flying ahead or a reflection cannot capture the path.
+A path is found in two passes. The first knows neither film nor background, only that a column changes once, when the
+front passes it: `path_by_change` maximises the change collected along the path; `path_by_appearance` separates columns
+that look as at the end of the recording from columns that look as at its start. The second (`edge`) knows both and
+compares every pixel with them; distances are clipped, so that a door, a payload flying ahead or a reflection cannot
+capture the path.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from vinetrack.video.edge_kernels import FASTMATH
 
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
-
 
 # ------------------------------------------------------------------------------
 # Compiled: the largest change of each pixel, and paths through pixels that change in order.
@@ -281,12 +280,12 @@ def _votes(
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def mean_appearance(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int, window: int
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int
 ) -> np.ndarray:
-    """Return the mean brightness of each pixel in the frames after (film) and before (background) the front passes it.
+    """Return the mean brightness of each pixel in the 12 frames after (film) and before (background) the front passes.
     Shapes: strip (n_frames, n_across, n_along); scale, offset, path (n_frames,) → (2, n_across, end − begin).
     """
-    n, rows, _ = strip.shape
+    window, (n, rows, _) = 12, strip.shape  # frames that are averaged (derived)
     front = np.empty(n + 1, np.int64)
     for t in range(n):
         front[t] = min(max(math.ceil(path[t]), begin), end)

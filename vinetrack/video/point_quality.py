@@ -80,7 +80,10 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     first = _first_moving_point(y, max(REST_SIGMAS * noise, REST_PX))
     tolerance = max(REST_SIGMAS * noise, END_REST_PX)
     last = len(y) - 1 - _first_moving_point(-y[::-1], tolerance)
-    if last == len(y) - 1 and _stops_abruptly(y, tolerance):
+    steps = np.diff(y[-7:])
+    # 5.0: ratio of the steps to the tolerance above which a fast edge that stands still in the last two frames stops,
+    # though elsewhere two equal positions are no rest (chosen); the step before may be shorter than a whole one
+    if last == len(y) - 1 and len(steps) == 6 and abs(steps[-1]) <= tolerance < steps[:-2].min() / 5.0:
         last -= 2
     return int(good[first]), int(good[max(last, first)])
 
@@ -98,13 +101,6 @@ def _first_moving_point(y: Floats, tolerance: float) -> int:
             break
     # Two equal positions may be a slow start; a rest has three.
     return last_at_rest + 1 if last_at_rest >= 2 else 0
-
-
-def _stops_abruptly(y: Floats, tolerance: float) -> bool:
-    """Whether a fast edge stands still in the last two frames; the step before may be shorter than a whole one."""
-    steps = np.diff(y[-7:])
-    # 5.0: ratio of the steps to the tolerance that shows so, though elsewhere two equal positions are no rest (chosen)
-    return len(steps) == 6 and abs(steps[-1]) <= tolerance and float(steps[:-2].min()) > 5.0 * tolerance
 
 
 def assess_points(
@@ -227,7 +223,7 @@ class Ending:
 
 
 def ending_of(
-    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_], whole: bool,
+    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: Indices, whole: bool,
     place: int,
 ) -> Ending:  # fmt: skip
     """How an edge that moved ends; only a `whole` recording can be truncated. Shapes: luma (n_frames, height, width);
@@ -240,30 +236,24 @@ def ending_of(
     if whole and quality.last_moving >= followed[-1] and quality.left_picture is None:
         at_first = np.median(edge_px[followed][: max(quality.first_moving, 1)])
         truncated_px = float(edge_px[followed[-1]]) - float(at_first)
-    return Ending(grown_px, truncated_px, tuple(growth_end_notes(luma, quality, edge_px, name, number)), name, place)
-
-
-def growth_end_notes(
-    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_]
-) -> list[str]:
-    """Say why the edge stops before the recording does; arrays as in `ending_of`."""
-    n, last = len(edge_px), quality.last_moving
+    remark, n, last = "", len(edge_px), quality.last_moving
     # 4: fewest frames of standstill at the end that are reported (chosen)
-    if last < 0 or last >= n - 4 or quality.left_picture is not None:
-        return []
-    change = mean_changes(luma, 5)
-    before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
-    least = float(np.min(change)) if len(change) else 0.0
-    later = float(np.median(change[last + 1 :]))
-    resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
-    if not resting.size:
-        return [f"{name}: the leading edge is not seen after frame {number[last]}"]
-    where = f"{name}: the leading edge stops at {np.median(resting):.0f} px after frame {number[last]}"
-    # 0.3: change of the pictures after the stop, as a part of that in motion, above which the picture goes on
-    # changing (chosen)
-    if later - least > 0.3 * (before - least):
-        return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
-    return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
+    if 0 <= last < n - 4 and quality.left_picture is None:
+        change = mean_changes(luma, 5)
+        before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
+        least, later = float(np.min(change)), float(np.median(change[last + 1 :]))
+        resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
+        where = f"{name}: the leading edge stops at {np.median(resting) if resting.size else np.nan:.0f} px"
+        where = f"{where} after frame {number[last]}"
+        # 0.3: change of the pictures after the stop, as a part of that in motion, above which the picture goes on
+        # changing (chosen)
+        if not resting.size:
+            remark = f"{name}: the leading edge is not seen after frame {number[last]}"
+        elif later - least > 0.3 * (before - least):
+            remark = f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"
+        else:
+            remark = f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"
+    return Ending(grown_px, truncated_px, (remark,) if remark else (), name, place)
 
 
 def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
@@ -278,11 +268,21 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     if len(columns) < 5 * SHORTEST_BARE_PX or frames < 8:
         return passed[1]
     arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
-    difference = _lasting_change(strip, columns, arrival)
+    # Mean square over the rows of the last minus the first looks at each column, averaged over 5
+    last, difference = _mean(strip, slice(frames - 2, frames), columns), np.zeros(len(columns))
+    for when in np.unique(arrival):
+        those = arrival == when
+        before = _mean(strip, slice(max(int(when) - 8, 0), max(int(when) - 2, 1)), columns[those])
+        difference[those] = np.mean((last[:, those] - before) ** 2, axis=0)
+    noise = strip.noise**2 * (0.5 + 0.2)
+    difference = np.convolve(np.clip(difference - noise, 0, None), np.ones(5) / 5, mode="same")
     film_difference = max(float(np.median(difference[: int(part * len(difference))])) for part in film_parts)
     # 0.2: share of the film's median difference from the background (chosen)
     is_bare = difference < 0.2 * film_difference
-    bare_from = _first_bare_column(is_bare, strip.values.shape[1])
+    # First of SHORTEST_BARE_PX or more bare columns in a row, with no more after it that are not bare than are across
+    film_after = np.cumsum(~is_bare[::-1])[::-1]
+    runs = np.convolve(is_bare, np.ones(SHORTEST_BARE_PX), mode="full")[SHORTEST_BARE_PX - 1 :] > SHORTEST_BARE_PX - 0.5
+    bare_from = int(np.argmax(runs & (film_after <= strip.values.shape[1])))
     if bare_from < 3 * SHORTEST_BARE_PX or is_bare[bare_from - 2 * SHORTEST_BARE_PX : bare_from].mean() > 0.3:
         return passed[1]
     growth = _speed(arrival, bare_from - 6 * SHORTEST_BARE_PX, bare_from - 5)
@@ -295,33 +295,13 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     return int(columns[bare_from]) + 1 if flies_on else passed[1]
 
 
-def _first_bare_column(is_bare: NDArray[np.bool_], longest: int) -> int:
-    """First of SHORTEST_BARE_PX or more bare columns in a row, with at most `longest` after it that are not bare."""
-    film_after = np.cumsum(~is_bare[::-1])[::-1]
-    runs = np.convolve(is_bare, np.ones(SHORTEST_BARE_PX), mode="full")[SHORTEST_BARE_PX - 1 :] > SHORTEST_BARE_PX - 0.5
-    starts = np.flatnonzero(runs & (film_after <= longest))
-    return int(starts[0]) if len(starts) else 0
-
-
-def _speed(arrival: NDArray[np.int_], first: int, last: int) -> float:
+def _speed(arrival: Indices, first: int, last: int) -> float:
     """Mean speed between two columns, columns a frame."""
     first, last = max(first, 0), min(last, len(arrival)) - 1
     return (last - first) / max(float(arrival[last] - arrival[first]), 0.5)
 
 
-def _lasting_change(strip: Strip, columns: NDArray[np.int_], arrival: NDArray[np.int_]) -> Floats:
-    """Mean square over the rows of the last minus the first looks at each column, (n_columns,), averaged over 5."""
-    last = _mean(strip, slice(len(strip.values) - 2, len(strip.values)), columns)
-    out = np.zeros(len(columns))
-    for when in np.unique(arrival):
-        those = arrival == when
-        before = _mean(strip, slice(max(int(when) - 8, 0), max(int(when) - 2, 1)), columns[those])
-        out[those] = np.mean((last[:, those] - before) ** 2, axis=0)
-    noise = strip.noise**2 * (0.5 + 0.2)
-    return np.convolve(np.clip(out - noise, 0, None), np.ones(5) / 5, mode="same")
-
-
-def _mean(strip: Strip, frames: slice, columns: NDArray[np.int_]) -> NDArray[np.float32]:
+def _mean(strip: Strip, frames: slice, columns: Indices) -> NDArray[np.float32]:
     """Mean brightness of some columns over some frames, shape (n_across, n_columns)."""
     values = strip.values[frames][:, :, columns].astype(np.float32)
     level = values * strip.scale[frames, None, None] + strip.offset[frames, None, None]

@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.video.frames import (
     Frames,
     PacketIndex,
@@ -31,7 +31,19 @@ from vinetrack.video.kymograph import largest_steps
 MAX_FRAMES = 150  # Maximum number of frames in which the axis is sought, spread evenly over the changes (chosen)
 MIN_GROWN_PART = 0.16  # Part of all change that must be growth (chosen)
 
-Pixels = tuple[Floats, Floats, Floats, Floats, int]  # Pixels that change: x, y, time of change and weight, shape
+
+class Pixels(NamedTuple):
+    """Pixels that change: their places, time of change and weight, shape (n_pixels,) each; and the number of times."""
+
+    x: Floats
+    y: Floats
+    time: Floats
+    weight: Floats
+    n_times: int
+
+    def where(self, kept: Bools) -> Pixels:
+        """Return some of the pixels. Shapes: kept (n_pixels,)."""
+        return Pixels(self.x[kept], self.y[kept], self.time[kept], self.weight[kept], self.n_times)
 
 
 class SmallPictures:
@@ -41,18 +53,21 @@ class SmallPictures:
     """
 
     def __init__(self, luma: NDArray[Any]) -> None:
-        self.frames, self.factor = _small_frames(luma)
-        self.shape = luma.shape[1:]
+        import cv2
 
-    @cached_property
-    def _busy(self) -> tuple[NDArray[np.float32], float]:
-        """Frames in which something changes, and the variance of their noise."""
-        return _frames_with_change(self.frames)
+        n, height, width = luma.shape
+        self.shape, self.factor = (height, width), max(1.0, max(height, width) / 240)  # at most 240 px (chosen)
+        size = (max(8, round(width / self.factor)), max(8, round(height / self.factor)))
+        small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
+        sampled = small[:, ::4, ::4] + np.float32(1.0)
+        gain = np.median(sampled / sampled[n // 2], axis=(1, 2))
+        small /= np.clip(gain, 0.2, 5.0)[:, None, None]
+        self.frames = small * np.float32(255.0 / max(float(small.max()), 1.0))
 
     @cached_property
     def changed(self) -> Pixels:
         """All pixels that change."""
-        return _changed(*self._busy)
+        return changed_pixels(self.frames)
 
     @cached_property
     def grown(self) -> Pixels:
@@ -60,81 +75,53 @@ class SmallPictures:
         reduced where many change at the same time, as where a door comes to rest. If hardly any change lasts
         (MIN_GROWN_PART), this is `changed`.
         """
-        x, y, time, weight, n_times = self.changed
-        if not len(x):
+        if not len(self.changed.x):
             return self.changed
-        frames, noise = self._busy
-        rows, columns = y.astype(int), x.astype(int)
-        lasting = _step_fraction(frames[:, rows, columns].astype(float), time.astype(int), noise)
-        kept = lasting * _contrast_gain(frames, rows, columns, noise) > 0.4  # score of growth (measured)
-        if weight[kept].sum() < MIN_GROWN_PART * weight.sum():
+        frames, noise = _busy_frames(self.frames)
+        rows, columns = self.changed.y.astype(int), self.changed.x.astype(int)
+        lasting = _step_fraction(frames[:, rows, columns].astype(float), self.changed.time.astype(int), noise)
+        # 0.4: score of growth (measured)
+        kept = self.changed.where(lasting * _contrast_gain(frames, rows, columns, noise) > 0.4)
+        if kept.weight.sum() < MIN_GROWN_PART * self.changed.weight.sum():
             return self.changed
-        weight = weight[kept] * _timing_information(time[kept], weight[kept], n_times)
-        return x[kept], y[kept], time[kept], weight, n_times
+        # The information of a pixel changing just when a front passes it, in nats, is minus the logarithm of the part
+        # of all change that occurs at that time: where much changes at once, the order of changes says little.
+        time, span = kept.time.astype(int), int(order_tolerance(kept.n_times))
+        by_time = np.bincount(time, kept.weight, kept.n_times)
+        share = np.convolve(by_time, np.ones(2 * span + 1))[span : span + kept.n_times] / by_time.sum()
+        # 0.05: minimum information of a change, in nats (chosen)
+        return kept._replace(weight=kept.weight * (0.05 - np.log(np.minimum(share[time], 1.0))))
 
 
-def changed_pixels(small: NDArray[np.float32], count: int) -> Pixels:
-    """Find the pixels that change. Shapes: small (n_frames, height, width)."""
-    return _changed(*_frames_with_change(small[:count]))
-
-
-def _frames_with_change(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-    """Return the frames in which something changes, and the variance of their noise."""
-    busy = small[_busy_frames(small)]
-    return busy, _noise_power(busy)
-
-
-def _changed(busy: NDArray[np.float32], noise_power: float) -> Pixels:
-    frame, weight = _changes(busy, noise_power)
-    rows, columns = np.nonzero(weight > 0)
-    time = frame[rows, columns].astype(float)
-    return columns.astype(float), rows.astype(float), time, weight[rows, columns].astype(float), len(busy)
-
-
-def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
-    """Shrink pictures to at most 240 px (chosen) and correct flicker; also return the factor."""
-    import cv2
-
-    n, height, width = luma.shape
-    factor = max(1.0, max(height, width) / 240)
-    size = (max(8, round(width / factor)), max(8, round(height / factor)))
-    small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
-    sampled = small[:, ::4, ::4] + np.float32(1.0)
-    gain = np.median(sampled / sampled[n // 2], axis=(1, 2))
-    small /= np.clip(gain, 0.2, 5.0)[:, None, None]
-    return small * np.float32(255.0 / max(float(small.max()), 1.0)), factor
-
-
-def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
-    """Select at most MAX_FRAMES frames, spread evenly over the changes rather than over time."""
-    n = len(small)
-    if n <= MAX_FRAMES:
-        return np.arange(n)
-    # Squares: a few pixels that change much are activity, many that change a little are noise.
-    activity = np.array([np.sqrt(np.mean((after - before) ** 2)) for before, after in pairwise(small)])
-    floor = float(np.quantile(activity, 0.2))
-    busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
-    total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
-    return np.unique(np.searchsorted(total, np.linspace(0, total[-1], MAX_FRAMES)).clip(0, n - 1))
-
-
-def _changes(frames: NDArray[np.float32], noise_power: float) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
-    """Frame of the largest lasting change of each pixel, and its weight; shapes (height, width)."""
+def changed_pixels(small: NDArray[np.float32]) -> Pixels:
+    """Find the pixels that change for good, by their largest step. Shapes: small (n_frames, height, width)."""
+    frames, noise_power = _busy_frames(small)
     n = len(frames)
     window = int(np.clip(n // 6, 2, 8))
     frame, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
     floor = max(30.0 * noise_power, 0.02 * float(np.quantile(best, 0.995)))
-    return frame, np.where(best > floor, np.log(np.maximum(best, noise_power) / noise_power), 0.0).astype(np.float32)
+    weight = np.where(best > floor, np.log(np.maximum(best, noise_power) / noise_power), 0.0).astype(np.float32)
+    rows, columns = np.nonzero(weight > 0)
+    time = frame[rows, columns].astype(float)
+    return Pixels(columns.astype(float), rows.astype(float), time, weight[rows, columns].astype(float), n)
 
 
-def _noise_power(frames: NDArray[np.float32]) -> float:
-    """Variance of the noise of a pixel, at least that of quantisation."""
-    changes = np.abs(np.diff(frames[:: max(1, len(frames) // 30), ::2, ::2], axis=0)).ravel()
-    noise = 1.4826 * float(np.median(changes)) / np.sqrt(2)
-    return max(noise, 0.7) ** 2
+def _busy_frames(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+    """At most MAX_FRAMES frames, spread evenly over the changes rather than over time; and the variance of the noise of
+    a pixel in them, at least that of quantisation.
+    """
+    if (n := len(small)) > MAX_FRAMES:
+        # Squares: a few pixels that change much are activity, many that change a little are noise.
+        activity = np.array([np.sqrt(np.mean((after - before) ** 2)) for before, after in pairwise(small)])
+        floor = float(np.quantile(activity, 0.2))
+        busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
+        total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
+        small = small[np.unique(np.searchsorted(total, np.linspace(0, total[-1], MAX_FRAMES)).clip(0, n - 1))]
+    changes = np.abs(np.diff(small[:: max(1, len(small) // 30), ::2, ::2], axis=0)).ravel()
+    return small, max(1.4826 * float(np.median(changes)) / np.sqrt(2), 0.7) ** 2
 
 
-def _step_fraction(values: Floats, frame: NDArray[np.int_], noise_power: float) -> Floats:
+def _step_fraction(values: Floats, frame: Indices, noise_power: float) -> Floats:
     """Fraction of each pixel's variance, beyond noise, that a single step at `frame` explains, shape (n_pixels,).
     `values` has shape (n_frames, n_pixels). A passing object leaves a pixel as it was, so that a step explains hardly
     any.
@@ -147,9 +134,7 @@ def _step_fraction(values: Floats, frame: NDArray[np.int_], noise_power: float) 
     return explained / np.maximum(explained + unexplained, 1e-9)
 
 
-def _contrast_gain(
-    frames: NDArray[np.float32], rows: NDArray[np.int_], columns: NDArray[np.int_], noise_power: float
-) -> Floats:
+def _contrast_gain(frames: NDArray[np.float32], rows: Indices, columns: Indices, noise_power: float) -> Floats:
     """How much more changed pixels differ from their surroundings at the end than at the beginning, shape (n_pixels,).
     1 if they did not differ at first, 0 if they do not differ at the end.
     """
@@ -203,18 +188,6 @@ def order_tolerance(n_times: int) -> float:
     return max(2.0, 0.03 * n_times)
 
 
-def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
-    """Information of a pixel changing just when a front passes it, in nats, shape (n_pixels,). It is minus the
-    logarithm of the fraction of all change that occurs at that time: where much changes at once, the order of changes
-    says little.
-    """
-    by_time = np.bincount(time.astype(int), weight, n_times)
-    span = int(order_tolerance(n_times))
-    share = np.convolve(by_time, np.ones(2 * span + 1))[span : span + n_times] / by_time.sum()
-    # 0.05: minimum information of a change, in nats (chosen)
-    return np.asarray(0.05 - np.log(np.minimum(share[time.astype(int)], 1.0)))
-
-
 # ------------------------------------------------------------------------------
 # Selection of the frames that show the event, so that the rest of a long recording is neither decoded nor held.
 #
@@ -242,7 +215,7 @@ def read_event(recording: Recording, frame_range: tuple[int, int] | None = None)
     return read_frames(recording)
 
 
-def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], count: int) -> tuple[int, int] | None:
+def event_range(pictures: list[NDArray[np.uint8]], numbers: Indices, count: int) -> tuple[int, int] | None:
     """Return the first and last frame of the event, both and a margin included, from samples of the recording; None if
     nothing changes. Shapes: pictures (height, width); numbers (n_pictures,).
     """
@@ -267,7 +240,7 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], co
     # 6.0, 3.0: change of a pixel that counts, in units of its noise (measured), and at least, grey levels (chosen)
     limit = np.maximum(6.0 * np.maximum(noise, np.median(noise)), 3.0)
 
-    def differ(still: NDArray[np.float32]) -> NDArray[np.int_]:
+    def differ(still: NDArray[np.float32]) -> Indices:
         counts = [np.count_nonzero(np.abs(level(picture) - still) > limit) for picture in pictures]
         return np.flatnonzero(np.array(counts) >= 8)  # pixels that must have changed (chosen)
 
@@ -295,7 +268,7 @@ def _film_event(recording: Recording, frame_range: tuple[int, int] | None) -> Fr
     return read_frames(recording, part=(frame_range[0], min(frame_range[1], count - 1), index))
 
 
-def _sample_film(recording: Recording, index: PacketIndex) -> tuple[list[NDArray[np.uint8]], NDArray[np.int_]]:
+def _sample_film(recording: Recording, index: PacketIndex) -> tuple[list[NDArray[np.uint8]], Indices]:
     """Sample the key frames of a film or, if these are too rare, every n-th frame of the whole film."""
     keys = np.flatnonzero(index.key)
     # Key frames so close to each other that no event fits between two of them

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools, Floats
+from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video.axis import Axis
 
@@ -80,7 +80,15 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
     else:
         scale, offset, shift, stabilised = before.scale, before.offset, before.shift_px, before.stabilised
     values = sample(luma, axis, np.arange(-half, half + 1), shift if stabilised else None)
-    return Strip(values, scale, offset, shift, _noise(values, scale), axis, stabilised)
+    # Noise of a pixel from differences of neighbouring frames, grey levels. Medians over pixels, since motion affects
+    # few of them; at least 1, since compression freezes a picture at rest, while moving pixels are never known better.
+    step = max(1, len(values) // 40)
+    first, second = values[:-1:step, ::4, ::4], values[1::step, ::4, ::4]
+    n = min(len(first), len(second))
+    change = np.abs(second[:n].astype(np.float32) - first[:n].astype(np.float32))
+    medians = np.median(change, axis=(1, 2)) if n else np.zeros(1)
+    noise = max(1.0, float(np.quantile(medians, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))
+    return Strip(values, scale, offset, shift, noise, axis, stabilised)
 
 
 def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
@@ -90,31 +98,18 @@ def snap_to_grid(axis: Axis, tolerance_px: float = 0.4) -> Axis:
     if axis.bends:
         return axis
     (x0, y0), (x1, y1) = axis.from_px, axis.to_px
+    x, y = round((x0 + x1) / 2), round((y0 + y1) / 2)
     if abs(y1 - y0) <= tolerance_px and abs(x1 - x0) > 10:
-        y = round((y0 + y1) / 2)
         return Axis((round(x0), y), (round(x1), y), axis.width_px)
     if abs(x1 - x0) <= tolerance_px and abs(y1 - y0) > 10:
-        x = round((x0 + x1) / 2)
         return Axis((x, round(y0)), (x, round(y1)), axis.width_px)
     return axis
 
 
-def _noise(values: NDArray[Any], scale: Floats) -> float:
-    """Estimate the standard deviation of a pixel from differences of neighbouring frames, grey levels, at least 1.
-    Medians over pixels are used, since motion affects few of them. The minimum is needed because compression freezes a
-    picture at rest, while moving pixels are never known better than to a grey level.
-    """
-    step = max(1, len(values) // 40)
-    first, second = values[:-1:step, ::4, ::4], values[1::step, ::4, ::4]
-    n = min(len(first), len(second))
-    change = np.abs(second[:n].astype(np.float32) - first[:n].astype(np.float32))
-    medians = np.median(change, axis=(1, 2)) if n else np.zeros(1)
-    return max(1.0, float(np.quantile(medians, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))
-
-
-def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: Floats | None = None) -> NDArray[Any]:
+def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | None = None) -> NDArray[Any]:
     """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along). An axis
-    along rows or columns of the picture is sliced without interpolation, after moving it by less than half a pixel.
+    along rows or columns of the picture is sliced without interpolation, after moving it by less than half a pixel;
+    beyond the picture its border is repeated.
     Given `shift_px`, every frame is interpolated at its own displacement. Shapes: luma (n_frames, height, width);
     rows_px (n_rows,); shift_px (n_frames, 2) → (n_frames, n_rows, n_along).
     """
@@ -124,7 +119,15 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: 
     along, across = axis.direction, axis.normal
     start = axis.points(np.array(0.0), float(rows_px[0]))
     if shift_px is None and not axis.bends and max(abs(along)) > 1 - 1e-9:
-        return _slice(luma, start, along, across, len(rows_px), n_along)
+        level = abs(along[0]) > 0.5
+        steps = (along[0], across[1]) if level else (across[0], along[1])
+        counts = (n_along, len(rows_px)) if level else (len(rows_px), n_along)
+        x, y = (
+            np.clip(np.rint(start[k] + np.arange(counts[k]) * steps[k]), 0, luma.shape[2 - k] - 1).astype(int)
+            for k in (0, 1)
+        )
+        part = luma[:, y][:, :, x]
+        return np.ascontiguousarray(part if level else part.transpose(0, 2, 1))
     out = np.empty((len(luma), len(rows_px), n_along), luma.dtype)
     shifts = np.zeros((len(luma), 2)) if shift_px is None else shift_px
     if axis.bends:
@@ -138,19 +141,6 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: 
         matrix = np.column_stack([along, across, start + shift])  # from (along, row, 1) to x and y in the picture
         cv2.warpAffine(frame, matrix, cut.shape[::-1], dst=cut, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return out
-
-
-def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_rows: int, n_along: int) -> NDArray[Any]:
-    """Slice whole pixels of an axis along rows or columns of the picture; beyond the picture its border is repeated."""
-    level = abs(along[0]) > 0.5
-    steps = (along[0], across[1]) if level else (across[0], along[1])
-    counts = (n_along, n_rows) if level else (n_rows, n_along)
-    x, y = (
-        np.clip(np.rint(start[k] + np.arange(counts[k]) * steps[k]), 0, luma.shape[2 - k] - 1).astype(int)
-        for k in (0, 1)
-    )
-    part = luma[:, y][:, :, x]
-    return np.ascontiguousarray(part if level else part.transpose(0, 2, 1))
 
 
 # ------------------------------------------------------------------------------
@@ -191,7 +181,7 @@ def steadied(luma: NDArray[Any], axis: Axis, half: int) -> tuple[Floats, Floats,
     return unit / gain, -fit[:, 1] * unit / gain, shift, shaken
 
 
-def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> NDArray[np.int_]:
+def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> Indices:
     """Whole pixels (x, y) of the background on both sides of a tube, from its start to its end, shape (n, 2); none
     where there is hardly any.
     """
@@ -208,7 +198,7 @@ def _beside(axis: Axis, half: int, shape: tuple[int, ...]) -> NDArray[np.int_]:
     return places[np.abs(axis.along_and_across(places)[1]) > half + BAND_GAP_PX - 1]
 
 
-def _followed(luma: NDArray[Any], places: NDArray[np.int_], picks: NDArray[np.int_]) -> tuple[Floats, Floats, Floats]:
+def _followed(luma: NDArray[Any], places: Indices, picks: Indices) -> tuple[Floats, Floats, Floats]:
     """Register every frame again and again, each time from where it was found: fit, shift and its standard error."""
     largest_step_px, converged_px = 1.5, 0.02  # Largest shift of one round, and change that is none (chosen)
     basis, shift = _reference(luma[picks], places, None), np.zeros((len(luma), 2))
@@ -239,7 +229,7 @@ def shifts_agree(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) ->
     return float(np.mean(difference[strongest])) < limit
 
 
-def _reference(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | None) -> Floats:
+def _reference(luma: NDArray[Any], places: Indices, shift_px: Floats | None) -> Floats:
     """Median over some frames of pixels of the background, ones, and minus the slopes along x and y, (4, n_pixels)."""
     beside = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
     middle, left, right, above, below = (
@@ -248,7 +238,7 @@ def _reference(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | 
     return np.stack([middle, np.ones(len(places)), (left - right) / 2, (above - below) / 2])
 
 
-def _pixels(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | None) -> NDArray[Any]:
+def _pixels(luma: NDArray[Any], places: Indices, shift_px: Floats | None) -> NDArray[Any]:
     """Pixels (x, y) of every frame, each moved by its own shift, bicubic; shape (n_frames, n_pixels)."""
     import cv2
 
@@ -264,9 +254,7 @@ def _pixels(luma: NDArray[Any], places: NDArray[np.int_], shift_px: Floats | Non
     return np.stack(moved).reshape(len(luma), -1)[:, : len(places)]
 
 
-def register(
-    luma: NDArray[Any], places: NDArray[np.int_], basis: Floats, shift_px: Floats | None
-) -> tuple[Floats, Floats]:
+def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Floats | None) -> tuple[Floats, Floats]:
     """Register every frame to the static background by robust least squares. The model is frame(x) = gain · picture(x −
     shift) + level, linearised in the shift. A ridge keeps the level near zero, and the shift at zero where the
     background has no texture. Returns gain, level, shift in x and y of every frame, shape (n_frames, 4), and the

@@ -60,12 +60,6 @@ class Measurement:
     capture_fps: float
     recording: Recording
 
-    @property
-    def growth_m(self) -> float:
-        """Distance from the first usable position to the furthest, m."""
-        position_m = self.tracking.track.lead_position_m[self.tracking.track.usable]
-        return float(np.max(position_m) - position_m[0]) if position_m.size else math.nan
-
 
 Keep = Callable[[tuple[object, ...], Callable[[], Tracking]], Tracking]
 
@@ -80,11 +74,17 @@ def measure_recording(
         raise RecordingError("no recording is named", "fill in the column video", trial.name)
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording)
-    calibration = calibration_of(trial, settings, folder, recording)
-    if calibration is None and not math.isfinite(trial.m_per_px):
-        raise RecordingError(
-            "there is no scale", "give `calibration` in experiment.yaml, or mm_per_px in the sheet", trial.name
-        )
+    calibration = None
+    if not math.isfinite(trial.m_per_px):
+        if settings.calibration is None:
+            remedy = "give `calibration` in experiment.yaml, or mm_per_px in the sheet"
+            raise RecordingError("there is no scale", remedy, trial.name)
+        image = folder / (getattr(settings.calibration, "image", None) or "")
+        state = image.stat().st_mtime_ns if image.is_file() else 0
+        try:
+            calibration = _calibrated(settings.calibration, folder, recording.width, recording.height, state)
+        except CalibrationError as error:
+            raise RecordingError(error.what, error.remedy, "calibration") from error
     m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
     axis = given_axis(trial, settings, m_per_px)
     diameter_px = math.nan if axis is None else trial.diameter_m / m_per_px  # an axis that is found has its width
@@ -101,26 +101,11 @@ def measure_recording(
         along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
     tracking = in_metres(tracking, trial, m_per_px, position_m)
-    notes = [*tracking.track.notes]
     # Notes on a scale that was merely given belong to the experiment, not to each of its trials.
     if calibration is not None and math.isfinite(calibration.reprojection_px):
-        notes += calibration.notes
-    tracking = replace(tracking, track=replace(tracking.track, notes=tuple(notes)))
+        notes = (*tracking.track.notes, *calibration.notes)
+        tracking = replace(tracking, track=replace(tracking.track, notes=notes))
     return Measurement(tracking, m_per_px, rel_sigma, calibration, capture_fps, recording)
-
-
-def calibration_of(
-    trial: Trial, settings: ExperimentSettings, folder: Path, recording: Recording
-) -> PlaneCalibration | None:
-    """The calibration of the experiment; None where the trial has its own scale or there is no calibration."""
-    if math.isfinite(trial.m_per_px) or settings.calibration is None:
-        return None
-    image = folder / (getattr(settings.calibration, "image", None) or "")
-    state = image.stat().st_mtime_ns if image.is_file() else 0
-    try:
-        return _calibrated(settings.calibration, folder, recording.width, recording.height, state)
-    except CalibrationError as error:
-        raise RecordingError(error.what, error.remedy, "calibration") from error
 
 
 @lru_cache(maxsize=8)
@@ -188,22 +173,27 @@ class RecordingFacts:
         return math.nan if self.n_frames is None else (self.n_frames - 1) / self.capture_fps
 
 
+def _facts(
+    trial: Trial, recording: Recording, m_per_px: float, scale_rel_sigma: float, capture_fps: float,
+    n_frames: int | None, axis: Axis | None,
+) -> RecordingFacts:  # fmt: skip
+    """Facts of one recording that its header and the sheet state."""
+    return RecordingFacts(
+        trial=trial.name, n_frames=n_frames, capture_fps=capture_fps, playback_fps=recording.playback_fps, axis=axis,
+        mm_per_px=1e3 * m_per_px, scale_rel_sigma=scale_rel_sigma, picture_mm=1e3 * m_per_px * recording.width,
+    )  # fmt: skip
+
+
 def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
     """Facts of a recording that was tracked."""
-    tracking = measurement.tracking
-    mm_per_px = 1e3 * measurement.m_per_px
-    return RecordingFacts(
-        trial=trial.name,
-        n_frames=len(tracking.track.time_s),
-        capture_fps=measurement.capture_fps,
-        playback_fps=measurement.recording.playback_fps,
-        mm_per_px=mm_per_px,
-        scale_rel_sigma=measurement.scale_rel_sigma,
-        picture_mm=mm_per_px * measurement.recording.width,
-        axis=tracking.axis,
+    tracking, mm_per_px = measurement.tracking, 1e3 * measurement.m_per_px
+    position_m = tracking.track.lead_position_m[tracking.track.usable]
+    stated = measurement.recording, measurement.m_per_px, measurement.scale_rel_sigma, measurement.capture_fps
+    return replace(
+        _facts(trial, *stated, len(tracking.track.time_s), tracking.axis),
         tube_width_mm=mm_per_px * tracking.tube_width_px,
         tube_width_sigma_mm=mm_per_px * tracking.tube_width_sigma_px,
-        growth_mm=1e3 * measurement.growth_m,
+        growth_mm=1e3 * float(np.max(position_m) - position_m[0]) if position_m.size else math.nan,
         mean_speed_m_s=mean_speed(tracking.track),
     )
 
@@ -291,9 +281,7 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
         (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
         (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
     )
-    return [
-        f"growth runs {way} in the picture ({_named(names)}) and {remark}" for names, way, remark in findings if names
-    ]
+    return [f"growth runs {way} in the picture ({_named(who)}) and {remark}" for who, way, remark in findings if who]
 
 
 def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
@@ -329,31 +317,20 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
 def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
     """Convert the facts of a recording to a JSON mapping; units are in the keys."""
     axis = None if facts.axis is None else axis_entry(facts.axis)
-    return {key: value for key, value in vars(facts).items() if key != "axis"} | {
-        "duration_s": facts.duration_s,
-        "axis": axis,
-    }
+    return vars(facts) | {"duration_s": facts.duration_s, "axis": axis}
 
 
 def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
     """Cells of one recording's row."""
     ends = () if facts.axis is None else (*facts.axis.from_px, *facts.axis.to_px)
     axis = "{},{} → {},{}".format(*(round(end) for end in ends)) if ends else "–"
+    frames, plays = facts.n_frames, facts.playback_fps
     return (
-        facts.trial,
-        "–" if facts.n_frames is None else str(facts.n_frames),
-        f"{facts.capture_fps:g}",
-        "–" if facts.playback_fps is None else f"{facts.playback_fps:.4g}",
-        number(facts.duration_s),
-        number(facts.mm_per_px, 4),
-        number(facts.picture_mm),
-        axis,
-        f"{math.degrees(trial.growth_angle_rad):g}",
-        number(facts.tube_width_mm),
-        number(1e3 * trial.diameter_m),
-        number(facts.growth_mm),
-        number(1e3 * trial.length_m),
-    )
+        facts.trial, "–" if frames is None else str(frames), f"{facts.capture_fps:g}",
+        "–" if plays is None else f"{plays:.4g}", number(facts.duration_s), number(facts.mm_per_px, 4),
+        number(facts.picture_mm), axis, f"{math.degrees(trial.growth_angle_rad):g}", number(facts.tube_width_mm),
+        number(1e3 * trial.diameter_m), number(facts.growth_mm), number(1e3 * trial.length_m),
+    )  # fmt: skip
 
 
 SETTINGS = "experiment.yaml"
@@ -421,16 +398,9 @@ def _stated_facts(
     if not math.isfinite(m_per_px) and scale is not None:
         m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
     count = _frames_present(recording)
-    return RecordingFacts(
-        trial=trial.name,
-        n_frames=recording.declared_frames if count is None else count,
-        capture_fps=capture_rate(trial, recording),
-        playback_fps=recording.playback_fps,
-        mm_per_px=1e3 * m_per_px,
-        scale_rel_sigma=rel_sigma,
-        picture_mm=1e3 * m_per_px * recording.width,
-        axis=given_axis(trial, settings, m_per_px),
-    )
+    count = recording.declared_frames if count is None else count
+    axis = given_axis(trial, settings, m_per_px)
+    return _facts(trial, recording, m_per_px, rel_sigma, capture_rate(trial, recording), count, axis)
 
 
 def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
@@ -498,8 +468,17 @@ def _scale_problems(
         lacking = "no recording has a scale" if none else f"{len(unscaled)} recordings have no scale"
         remedy = "give it here, or mm_per_px in the sheet"
         problems.append(Problem(f"is missing: {lacking}", file=SETTINGS, column="calibration", remedy=remedy))
-    elif unscaled:
-        problems += _calibration_problems(settings, folder, sizes, calibrations)
+    image = getattr(settings.calibration, "image", None)
+    if unscaled and settings.calibration is not None and (image is None or (folder / image).exists()):
+        place: dict[str, Any] = {"file": SETTINGS, "column": "calibration" if image is None else "calibration.image"}
+        notes: dict[str, None] = {}
+        try:
+            for size in sizes:
+                calibrations[size] = calibrate(settings.calibration, folder, *size)
+                notes |= dict.fromkeys(calibrations[size].notes if image is not None else ())
+            problems += [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
+        except CalibrationError as error:  # only the first is reported
+            problems.append(Problem(message=f"cannot be used: {error.what}", remedy=error.remedy, **place))
     of_all: list[Problem] = []  # of the axis that all share, in the first picture that it does not fit
     for trial, recording in opened.items():
         if trial.axis is not None:
@@ -527,23 +506,3 @@ def _axis_problems(
     width_m = trial.diameter_m if width_mm is None or math.isnan(width_mm) else width_mm / 1e3
     complaint = curve_problem(axis_through(through), width_m / m_per_px / 2, (recording.width, recording.height))
     return [] if complaint is None else [Problem(message=complaint[0], column="axis", remedy=complaint[1], **place)]
-
-
-def _calibration_problems(
-    settings: ExperimentSettings, folder: Path, sizes: list[tuple[int, int]], calibrations: Calibrations
-) -> list[Problem]:
-    """Read the calibration for each picture size into `calibrations`; only the first problem is reported."""
-    image = getattr(settings.calibration, "image", None)
-    if settings.calibration is None or (image is not None and not (folder / image).exists()):
-        return []
-    place: dict[str, Any] = {"file": SETTINGS, "column": "calibration" if image is None else "calibration.image"}
-    notes: dict[str, None] = {}
-    for width_px, height_px in sizes:
-        try:
-            calibration = calibrate(settings.calibration, folder, width_px, height_px)
-            calibrations[width_px, height_px] = calibration
-        except CalibrationError as error:
-            return [Problem(message=f"cannot be used: {error.what}", remedy=error.remedy, **place)]
-        if image is not None:
-            notes |= dict.fromkeys(calibration.notes)
-    return [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]

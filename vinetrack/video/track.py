@@ -249,13 +249,27 @@ def track_pixels(
         strip, followed, width_px = follow(luma, trial, axis, exposure_s * capture_fps, small)
     except RecordingError as error:
         raise RecordingError(error.what, error.remedy, name) from error
-    random_px, total_px = _edge_errors(strip, followed, trial)
+    # Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
+    # The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
+    # larger one counts.
+    edge_px = followed.edge_px
+    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
+    moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
+    use, is_body = moving & np.isfinite(edge_px), trial.travel_ratio == 1
+    random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
+    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
+    total_px = np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
     quality = assess_points(
         followed.edge_px, total_px, frames.slot[rows], number, unsure=followed.unsure,
         repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
     )  # fmt: skip
     if quality.last_moving < 0:
-        raise RecordingError(f"{_why_motionless(total_px, quality)}", name=name)
+        lost = ~(total_px < LOST_SIGMA_PX) | ~(np.hypot(total_px, quality.departure_px) < LOST_SIGMA_PX)
+        # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
+        if np.mean(lost) > 0.5:
+            what = "something moves, but its edge is too vague to be followed"
+            raise RecordingError(what, "film it nearer, with more light or contrast, or at more frames a second", name)
+        raise RecordingError("nothing moves along the axis", "check the recording, or give the axis", name)
     # Random, with the disagreement of bands and the distance of outliers; and shared by neighbouring frames: of edge,
     # stabilisation and path.
     random_px = np.hypot(np.maximum(random_px, followed.bands_sigma_px), quality.departure_px)
@@ -304,32 +318,6 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
         first_odd = int(number[odd][0])
         notes.append(f"{name}: {int(odd.sum())} frames are unlike all others and rejected, first frame {first_odd}")
     return rows, notes
-
-
-def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Floats, Floats]:
-    """Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
-    The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
-    larger one counts.
-    """
-    edge_px = followed.edge_px
-    # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
-    moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
-    use, is_body = moving & np.isfinite(edge_px), trial.travel_ratio == 1
-    random_px = calibrated_sigma(edge_px, followed.sigma_px, use, is_body=is_body)
-    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
-    return random_px, np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
-
-
-def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
-    """The message for a recording in which no frame is moving."""
-    lost = ~(total_px < LOST_SIGMA_PX) | ~(np.hypot(total_px, quality.departure_px) < LOST_SIGMA_PX)
-    # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
-    if np.mean(lost) > 0.5:
-        return (
-            "something moves, but its edge is too vague to be followed: film it nearer, with more light or"
-            " contrast, or at more frames a second"
-        )
-    return "nothing moves along the axis; check the recording, or give the axis"
 
 
 def _notes(
