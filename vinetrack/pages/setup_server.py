@@ -130,11 +130,11 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
         timed = rate is not None
         trial = replace(trial, capture_fps=rate or 1.0, exposure_s=trial.exposure_s if timed else math.nan)
     remarks: list[str] = []
-    growth_m = m_per_px = math.nan
+    growth_mm = m_per_px = math.nan
     if scaled:
         measurement = measure_recording(trial, settings, folder)
-        tracking, m_per_px, growth_m = measurement.tracking, measurement.m_per_px, measurement.growth_m
-        remarks = [problem.reason for problem in size_problems(trial, tracked_facts(trial, measurement))]
+        tracking, m_per_px, facts = measurement.tracking, measurement.m_per_px, tracked_facts(trial, measurement)
+        growth_mm, remarks = facts.growth_mm, [problem.reason for problem in size_problems(trial, facts)]
     else:
         # Widths are in millimetres: without a scale the axis has none.
         tracking = track_recording(trial, given_axis(trial, settings, math.nan))
@@ -150,7 +150,7 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
         "flag": [str(flag) for flag in track.flag],
         "shake_px": _numbers(tracking.shake_px, 2),
         "mm_per_px": _rounded(1e3 * m_per_px, 6),
-        "growth_mm": _rounded(1e3 * growth_m, 2),
+        "growth_mm": _rounded(growth_mm, 2),
         "tube_width_mm": _rounded(1e3 * m_per_px * tracking.tube_width_px, 2),
         "timed": timed,
         "scaled": scaled,
