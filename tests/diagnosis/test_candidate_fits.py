@@ -18,7 +18,7 @@ from vinetrack.diagnosis.candidate_fits import SubsetFitter, full_fit, with_curv
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
-from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, pushes, select_effects, slack_fit
+from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, select_effects, slack_fit
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import YIELD_PRESSURE, Fit
@@ -152,7 +152,6 @@ def slackened() -> Fit:
 
 @pytest.mark.slow
 def test_a_slack_tail_is_found_where_the_model_has_it_push(slackened: Fit):
-    assert pushes(slackened)
     slack = slack_fit(slackened)
     assert slack is not None
     assert slack.names == ("tail_slack",)
@@ -163,16 +162,16 @@ def test_a_slack_tail_is_found_where_the_model_has_it_push(slackened: Fit):
 
 def test_a_bare_vine_on_the_level_pulls_its_tail():
     found = fit(vt.base_model(), grown_with_tail(0.0, "taut", np.pi / 2), profile=False)
-    assert not pushes(found)
-    assert slack_fit(found) is None
+    slack = slack_fit(found)
+    assert slack is not None
+    assert abs(slack.delta_chi2) < 0.5
 
 
 @pytest.mark.slow
-def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_pushes(slackened, monkeypatch):
+def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_pushes(slackened):
     # As a fit looks that has taken the slack for scatter: no tail pushes, and pressures deviate by their most.
     solution = slackened.solution
     bent = replace(slackened, solution=replace(solution, state=replace(solution.state, spread=(0.04, 0.15))))
-    monkeypatch.setattr("vinetrack.diagnosis.selection.pushes", lambda _: False)
     slack = slack_fit(bent)
     assert slack is not None
     assert slack.sigma > 5

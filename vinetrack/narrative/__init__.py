@@ -80,9 +80,6 @@ SENTENCES = {
     "final_speed": "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine",
     "film_uncertain": "the choice of film is uncertain: {um:g} µm is the fastest in only {odds:.0%} of the draws; "
     "measuring B and P_y of the first two films would decide it",
-    "budget_of_fastest": "uncertainty budget of the fastest, {trial}: final speed by each input alone",
-    "not_in_budget": "not included: the burst stress, a guess from one vine, and effects not in the model (`vinetrack "
-    "predict`)",
     "supply_needs_wall": "--supply-s needs --thickness-um: how fast the vine takes up gas depends on its wall",
     "keeps_pressure": "closed chamber that keeps the gauge pressure within {percent:g} %, by the gas law in absolute "
     "pressure",

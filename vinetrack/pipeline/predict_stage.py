@@ -505,9 +505,6 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield ""
     if choices[0].odds < 0.8 and len(choices) > 1:
         yield str(remark("film_uncertain", um=1e6 * choices[0].thickness_m, odds=choices[0].odds))
-    yield str(remark("budget_of_fastest", trial=trial_text(best.inputs.trial)))
-    yield from table([(f"  {share.name}", speed_band_text(share), str(share.why)) for share in best.shares])
-    yield f"  {remark('not_in_budget')}"
     yield from (f"! {warning}" for warning in design_checks(best))
 
 
