@@ -34,11 +34,9 @@ from numpy.typing import NDArray
 
 import vinetrack as vt
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidate_fits import restart_exponents
 from vinetrack.diagnosis.force_inversion import FittedMotion
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out
 from vinetrack.diagnosis.learned_force import LearnedForce
-from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import missing_force
 from vinetrack.diagnosis.propose import propose
 
@@ -112,8 +110,6 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
     campaign = make(f"outsider:{law}", seed)
     pairs, begun = list(campaign.pairs), time.process_time()
     fit = initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), None, {}), profile=False)
-    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
-        fit = restart_exponents(fit)
     learned = missing_force(fit).learned
     row: dict[str, object] = {"seed": seed, "law": law, "n_trials": len(pairs), "chi2_per_dof": fit.chi2_per_dof}
     row["processor_s"] = time.process_time() - begun

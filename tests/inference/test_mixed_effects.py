@@ -16,7 +16,7 @@ from vinetrack.inference.fit_result import _deviate
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
-    at_zero_deviations,
+    at_prior_means,
     bounded_solve,
     deviance,
     estimate_between_trial_sd,
@@ -87,14 +87,20 @@ def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
     assert white / (1 - RHO**2) == pytest.approx(columns.T @ np.linalg.solve(dense, columns))
 
 
-def test_the_marginal_likelihood_agrees_with_the_dense_gaussian() -> None:
-    n_trials, count, keys, spread, flat_sd = 3, 12, 2, 0.7, 50.0
+@pytest.mark.parametrize(("flat_sd", "moved"), [(50.0, 0.0), (0.5, 2.0)])
+def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd: float, moved: float) -> None:
+    """Also where the data have moved release and origin far from their priors."""
+    n_trials, count, keys, spread = 3, 12, 2, 0.7
     columns = columns_of(n_trials, count, keys, seed=2)
-    frame, state = frame_of(n_trials, count, keys, flat_sd), state_of(n_trials, keys, spread)
+    effects = np.tile([moved, -moved, 0.0, 0.0], (n_trials, 1))
+    frame = frame_of(n_trials, count, keys, flat_sd)
+    state = replace(state_of(n_trials, keys, spread), trial_effects=effects)
     part = marginal(crossed(columns), frame, state)
     found = deviance(part, frame, state, state.spread, restricted=False)
     # The same by brute force: shared numbers by least squares, then the density of what is left.
     noise = covariance(count, RHO, SIGMA)
+    for c in columns:
+        c[:, 6] += c[:, :2] @ effects[0, :2]
     dense = [noise + flat_sd**2 * c[:, :2] @ c[:, :2].T + spread**2 * np.outer(c[:, 3], c[:, 3]) for c in columns]
     square = sum(c[:, 4:6].T @ np.linalg.solve(v, c[:, 4:6]) for c, v in zip(columns, dense, strict=True))
     slope = sum(c[:, 4:6].T @ np.linalg.solve(v, c[:, 6]) for c, v in zip(columns, dense, strict=True))
@@ -113,7 +119,8 @@ def test_residuals_at_zero_deviations_are_restored() -> None:
     for column, effects in zip(whole, state.trial_effects, strict=True):
         column[:, -1] += column[:, 2:4] @ effects[2:]
     white = at_correlation(crossed(columns), RHO)
-    assert at_zero_deviations(white, state, -1) == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
+    frame = replace(frame_of(3, 15, 2), release_origin_precision=np.zeros((3, 2)))
+    assert at_prior_means(white, frame, state, -1) == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
 
 
 def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -> None:

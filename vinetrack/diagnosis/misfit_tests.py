@@ -275,8 +275,6 @@ SEARCH_CHI2_PER_DOF, SEARCH_SIGMAS = 1.5, 6.0
 # Significance that the largest plausible size of an effect must reach for the effect to be testable (chosen)
 TESTABLE_SIGMAS = 3.0
 
-ONE_SIDED_95 = 1.645  # Derived: quantile of the normal distribution
-
 
 def exceeds_slow_errors(fit: Fit) -> bool:
     """Whether the misfit of a fit exceeds the noise and, as a fraction of growth, the slow errors of the tracks. Slow
@@ -429,19 +427,23 @@ class MisfitTests:
         indices = self._shapes_of(effect.name)
         if not indices or not effect.parameters:
             return {}, bool(indices)
-        # The shape with the largest standard error gives a limit that holds whatever form the effect has.
-        index = max(indices, key=lambda i: self.scores.sigma[i])
-        size, sigma = float(self.scores.size[index]), float(self.scores.sigma[index])
-        parameter = self.sensitivities.shapes[index].size
+        size, sigma = self.scores.size[indices], self.scores.sigma[indices]
+        parameter = self.sensitivities.shapes[indices[0]].size
         largest_plausible = max(abs(bound - parameter.zero) for bound in plausible_range(parameter))
-        key = f"{effect.name}.{parameter.name}"
-        if not math.isfinite(sigma) or largest_plausible < TESTABLE_SIGMAS * self.scores.sigma[indices].min():
+        if not np.isfinite(sigma).all() or largest_plausible < TESTABLE_SIGMAS * sigma.min():
             return {}, False
-        if parameter.sign:
-            return {
-                key: parameter.zero + parameter.sign * (max(parameter.sign * size, 0.0) + ONE_SIDED_95 * sigma)
-            }, True
-        return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
+        # The limit of the shape with the largest one holds whatever form the effect has.
+        beyond = np.maximum(parameter.sign * size, 0.0) if parameter.sign else np.abs(size)
+        limits = beyond + self._quantiles(0.95)[indices] * sigma
+        sign = parameter.sign or math.copysign(1.0, size[np.argmax(limits)])
+        return {f"{effect.name}.{parameter.name}": parameter.zero + sign * float(limits.max())}, True
+
+    def _quantiles(self, probability: float) -> Floats:
+        """Quantile of every size in standard errors: Student's t where these are those of the scatter of trials."""
+        from scipy.stats import norm, t
+
+        by_scatter = self.scores.robust_sigma > self.scores.plain_sigma
+        return np.where(by_scatter, t.ppf(probability, max(self.scores.degrees, 3.0)), norm.ppf(probability))
 
     def predicted_size(self, effect: Effect, index: int) -> tuple[Number, ...]:
         """One-step estimate of an effect's size with its standard error; empty where the model is too far off."""
@@ -449,7 +451,7 @@ class MisfitTests:
             return ()
         size, sigma = float(self.scores.size[index]), float(self.scores.sigma[index])
         parameter = self.sensitivities.shapes[index].size
-        value = parameter.zero + size
+        value, reach = parameter.zero + size, float(self._quantiles(0.975)[index]) * sigma
         return (
             Number(
                 key=f"{effect.name}.{parameter.name}",
@@ -458,8 +460,8 @@ class MisfitTests:
                 unit=parameter.unit,
                 value=value,
                 sigma=sigma,
-                low=value - 1.96 * sigma,
-                high=value + 1.96 * sigma,
+                low=value - reach,
+                high=value + reach,
                 dof=self.scores.degrees,
                 method="predicted",
                 lower=parameter.bounds[0],

@@ -444,7 +444,7 @@ def _aligned(
             problem.release_origin_precision[i, 1] = 1e24  # The origin is known.
         state = first_state(data, np.empty(0), trial_effects)
         noise = rho, np.array([trial_data.noise_m**2 * (1 - rho**2) for trial_data in data])
-        solution = solve(predictor, problem, state, FixedTerms((0.0, 0.0), noise), warm=True)
+        solution = solve(predictor, problem, state, FixedTerms(noise=noise), warm=True)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     square = at_correlation(solution.cross_products, rho)[:, :2, :2]

@@ -26,8 +26,9 @@ from vinetrack.inference.whitening import at_correlation
 #     y_ij = o_i + f(t_ij − r_i; θ, ln B_v(i) + b_i + z_iᵀγ, P_i (1 + p_i + z_iᵀγ)) + e_ij
 #
 # About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + Z_i Δu_i + e_i, with the sensitivities of
-# `vinetrack.inference.sensitivity`. The estimates, repeated in turn until they converge (Lindstrom & Bates, Biometrics
-# 46, 673, 1990; Pinheiro & Bates, Mixed-Effects Models in S and S-PLUS, Springer 2000, chapter 7):
+# `vinetrack.inference.sensitivity`. Variances of this linear model and steps of θ and u_i are computed in turn until
+# neither changes (Lindstrom & Bates, Biometrics 46, 673, 1990; Pinheiro & Bates, Mixed-Effects Models in S and S-PLUS,
+# Springer 2000, chapter 7).
 
 # ------------------------------------------------------------------------------
 # Compiled loops over trials for the likelihood of the variance components, which a fit evaluates some thousand times.
@@ -329,13 +330,14 @@ def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: Mixed
     """Whitened cross products of keys, residual and further columns with the trial effects integrated out. Shapes:
     cross_products (n_trials, 3, k, k) → (n_trials, k − 4, k − 4).
     """
-    white = at_zero_deviations(whitened_products(cross_products, state), state, N_TRIAL_EFFECTS + n_keys)
+    white = at_prior_means(whitened_products(cross_products, state), problem, state, N_TRIAL_EFFECTS + n_keys)
     return eliminated(white, trial_effect_prior(problem, state)[1])[0]
 
 
-def at_zero_deviations(white: Floats, state: FitState, residual: int) -> Floats:
-    """Cross products with the residual taken at zero deviations of pressure and ln B instead of the current ones.
-    Shapes: white (n_trials, k, k) → (n_trials, k, k).
+def at_prior_means(white: Floats, problem: MixedProblem, state: FitState, residual: int) -> Floats:
+    """Cross products with the residual taken at zero deviations of pressure and ln B instead of the current ones, and
+    with what the priors of release and origin add: their pull, and their penalty at the current values. Shapes: white
+    (n_trials, k, k) → (n_trials, k, k).
     """
     columns = list(DEVIATION_COLUMNS)
     effects = state.trial_effects[:, columns, None]
@@ -345,6 +347,11 @@ def at_zero_deviations(white: Floats, state: FitState, residual: int) -> Floats:
     restored[:, residual, :] = restored[:, :, residual]
     # With r' = r + Z d, the product r'ᵀr' has the cross term rᵀZd twice, and dᵀZᵀZd.
     restored[:, residual, residual] += explained[:, residual] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
+    offset = state.trial_effects[:, :2] - problem.release_origin_mean
+    pull = problem.release_origin_precision * offset
+    restored[:, :2, residual] -= pull
+    restored[:, residual, :2] -= pull
+    restored[:, residual, residual] += np.sum(pull * offset, axis=1)
     return np.asarray(restored)
 
 
@@ -441,7 +448,7 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
     """Eliminate release and origin, and take the residual at zero deviations. Shapes: cross_products (n_trials, 3, k,
     k).
     """
-    white = at_zero_deviations(whitened_products(cross_products, state), state, -1)
+    white = at_prior_means(whitened_products(cross_products, state), problem, state, -1)
     precision = problem.release_origin_precision
     log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
     log_alignment = np.sum(

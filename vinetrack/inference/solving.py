@@ -463,8 +463,8 @@ def assemble(
     if smooth is not None:
         trials = _with_smooth_errors_removed(trials, smooth)
     precision_of_fit = widened_covariance(predictor, solution, trials, by_noise, extended if smooth else None, pooled)
-    by_noise, precision_of_fit = (each.first(len(layout.free)) for each in (by_noise, precision_of_fit))
-    numbers = _numbers(predictor, solution, extended.state.theta, by_noise, precision_of_fit, profile=profile)
+    precision_of_fit = precision_of_fit.first(len(layout.free))
+    numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit, profile=profile)
     count = len(numbers)
     between = np.zeros((count, count)) if pooled is None else pooled.between[:count, :count]
     between = _in_SI_units(layout, numbers, between)
@@ -538,7 +538,6 @@ def _numbers(
     predictor: Predictor,
     solution: Solution,
     theta: Floats,
-    by_noise: Precision,
     precision_of_fit: Precision,
     *,
     profile: bool,
@@ -555,9 +554,11 @@ def _numbers(
         if not math.isfinite(sigma[k]):
             low, high, method = problem.lower[k], problem.upper[k], "none"
         elif doubtful[k] and profile:
-            # The likelihood accounts for the noise alone; the interval is widened by the ratio of the errors.
-            narrow = math.sqrt(by_noise.covariance[k, k])
-            low, high = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
+            # The likelihood accounts for the noise alone, without the lens or pooling: the interval is widened by the
+            # ratio of the errors, and lies about the value that is stated.
+            narrow = math.sqrt(precision(solution).covariance[k, k])
+            ends = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
+            low, high = (end + theta[k] - solution.state.theta[k] for end in ends)
             method = "profile"
         low, high = max(low, problem.lower[k]), min(high, problem.upper[k])
         at = [b for b in (problem.lower[k], problem.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]

@@ -945,6 +945,7 @@ REMEDIES = {
     "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
 }  # fmt: skip
 
+
 def _recordings(trials: Sequence[str]) -> str:
     some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
     return f"{_count(len(trials), 'recording')} ({some})"
