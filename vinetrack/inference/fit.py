@@ -434,17 +434,17 @@ def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) ->
 def _aligned(
     model: Model, data: Sequence[FitTrial], host: Model | None, rho: float, *, from_rest: bool
 ) -> tuple[Predictor, Floats, Floats]:
-    predictor = Predictor(_without_free_parameters(model, data), data, host)
-    predictor.has_pressure_deviation[:] = predictor.has_damping_deviation[:] = False
+    predictor, undeviating = (Predictor(_without_free_parameters(model, data), data, host) for _ in range(2))
+    undeviating.has_pressure_deviation[:] = undeviating.has_damping_deviation[:] = False
     try:
         trial_effects, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
-        problem = make_problem(predictor, trial_effects)
+        problem = make_problem(undeviating, trial_effects)
         for i in np.flatnonzero(rest_is_seen(data) & from_rest).tolist():
             trial_effects[i, ORIGIN] = problem.release_origin_mean[i, 1] = data[i].rest_origin_m
             problem.release_origin_precision[i, 1] = 1e24  # The origin is known.
         state = first_state(data, np.empty(0), trial_effects)
         noise = rho, np.array([trial_data.noise_m**2 * (1 - rho**2) for trial_data in data])
-        solution = solve(predictor, problem, state, FixedTerms(noise=noise), warm=True)
+        solution = solve(undeviating, problem, state, FixedTerms(noise=noise), warm=True)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     square = at_correlation(solution.cross_products, rho)[:, :2, :2]

@@ -78,14 +78,14 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[Remark, ...
 class TrialEstimates:
     """What a fit estimated for one trial; deviations are relative, of the set pressure and of the vine's B."""
 
-    release_s: OrNaN
-    release_sigma_s: OrNaN
-    origin_m: OrNaN
-    origin_sigma_m: OrNaN
-    pressure_deviation: OrNaN
-    pressure_deviation_sigma: OrNaN
-    damping_deviation: OrNaN
-    damping_deviation_sigma: OrNaN
+    release_s: OrNaN = math.nan
+    release_sigma_s: OrNaN = math.nan
+    origin_m: OrNaN = math.nan
+    origin_sigma_m: OrNaN = math.nan
+    pressure_deviation: OrNaN = math.nan
+    pressure_deviation_sigma: OrNaN = math.nan
+    damping_deviation: OrNaN = math.nan
+    damping_deviation_sigma: OrNaN = math.nan
 
 
 def _array(content: Any) -> Floats:
@@ -103,7 +103,7 @@ class FitSummary(NumberTable, JsonRecord):
     `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
     """
 
-    names: Annotated[tuple[str, ...], Field(alias="model")]
+    names: Annotated[tuple[str, ...], Field(alias="model")] = ()
     refused: Annotated[
         str, BeforeValidator(lambda reason: reason or ""), PlainSerializer(lambda text: text or None)
     ] = ""

@@ -135,7 +135,7 @@ def _reading(path: Path) -> Iterator[None]:
             where = f"{path} does not exist: give a results folder, or write it with vinetrack run or snakemake"
         raise ResultsError(where) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        fault = error if isinstance(error, OSError | ValueError) else repr(error)
+        fault = str(error).partition("\n")[0] if isinstance(error, OSError | ValueError) else repr(error)
         raise ResultsError(f"{path} cannot be read ({fault}): delete it and run snakemake again") from None
 
 

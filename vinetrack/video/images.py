@@ -352,12 +352,13 @@ def read_images(recording: Recording) -> Frames:
 
     def pictures() -> Iterator[NDArray[Any]]:
         for file in recording.files:
-            with file.open("rb") as stream:
-                stream.seek(max(file.stat().st_size - 64, 0))
-                whole = markers.get(file.suffix.lower(), b"") in stream.read()
             picture = _read_or_none(file)
             if picture is None or picture.shape != (recording.height, recording.width):
                 picture, whole = np.zeros((recording.height, recording.width), dtype), False
+            else:
+                with file.open("rb") as stream:
+                    stream.seek(max(file.stat().st_size - 64, 0))
+                    whole = markers.get(file.suffix.lower(), b"") in stream.read()
             is_damaged.append(not whole)
             yield picture
 
