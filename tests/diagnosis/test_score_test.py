@@ -186,20 +186,24 @@ def test_scores_that_a_specimen_shares_count_once() -> None:
     assert np.mean(alone.robust_sigma * 40) < 0.6 * np.mean(of.robust_sigma * 40)
 
 
-def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
+@pytest.mark.parametrize(("trials", "scatter", "least"), [(12, 0.0, 0.92), (8, 5.0, 0.92)])
+def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials: int, scatter: float, least: float) -> None:
+    """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
     friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, cast(Any, None)
     answers = EffectSensitivities((CandidateShape(friction, (), 1e-3),), [], ())
     held = []
-    for _ in range(300):
-        one = scores(draw, 12, 1, sizes=true * unit)
-        of_trials = (one.trial_scores * unit, one.trial_informations * unit**2)
-        of = Scores(one.score * unit, one.information * unit**2, *of_trials, 1, [str(i) for i in range(12)])
+    for _ in range(2000):
+        one = scores(draw, trials, 1, sizes=true * unit)
+        more = scatter * np.sqrt(one.trial_informations[:, :, 0]) * draw.standard_normal((trials, 1))
+        of_trials = ((one.trial_scores + more) * unit, one.trial_informations * unit**2)
+        score, groups = (one.score + more.sum(axis=0)) * unit, [str(i) for i in range(trials)]
+        of = Scores(score, one.information * unit**2, *of_trials, 1, groups)
         asked = MisfitTests(fit, (friction,), answers, fit, of, QUIET, FALSE_ALARM_LEVEL_FIRST_ROUND)
         limits, testable = asked.upper_limits(friction)
         assert testable
         held.append(limits["tail_friction.mu_w"] > true)
-    assert 0.92 < np.mean(held) < 0.99
+    assert least < np.mean(held) < 0.99
 
 
 def test_systematic_errors_that_imitate_a_shape_are_integrated_out() -> None:

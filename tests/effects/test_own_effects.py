@@ -113,6 +113,7 @@ def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeyp
         ("-q * np.sqrt(s.tail_position)", "-(q + 0.1) * np.sqrt(s.tail_position) + 0.05"),  # acts at no size
         ("return -q", 'open("x") if q < 0 else None\n    return -q'),
         ("return -q", 'open("x")\n    return -q'),
+        ("s.tail_position)", "s.tail_position / q)"),  # cannot be evaluated where it vanishes
         ("s.tail_position)", "s.tail_place)"),
         ("def tail_force", "def pull"),
         ("import numpy as np\n", "import numpy as np\ndef :\n"),

@@ -14,6 +14,7 @@ import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.simulate import SimulationError, simulate
+from vinetrack.inference import solving
 from vinetrack.inference.fit import fit_subset
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
@@ -113,6 +114,18 @@ def test_a_parameter_at_its_bound_has_an_interval_by_profile() -> None:
     gamma = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs)["gamma"]
     assert gamma.bound == gamma.lower == 0.6
     assert (gamma.low, gamma.method) == (0.6, "profile")
+
+
+def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a lens, of which the profile knows nothing: it was three quarters as wide."""
+    pairs = [(replace(t, position_systematic_m=1e-3), track) for t, track in small_campaign(seed=5, replicates=2)[0]]
+    linear = vt.fit(vt.base_model(), pairs, profile=False)
+    place = linear.numbers.index(linear["n"])
+    monkeypatch.setattr(solving, "near_bound", lambda _, sigma: np.arange(sigma.size) == place)
+    n = vt.fit(vt.base_model(), pairs)["n"]
+    assert (n.method, n.value) == ("profile", linear["n"].value)
+    assert n.high - n.low == pytest.approx(linear["n"].high - linear["n"].low, rel=0.02)
+    assert n.low < n.value < n.high
 
 
 def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campaign) -> None:

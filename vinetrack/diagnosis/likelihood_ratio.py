@@ -555,7 +555,7 @@ def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
 
 def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
     """Posterior probabilities of hypotheses by label, equally likely beforehand; they add up to 1. ln L is divided by
-    the best one's inflation. The film mass of each vine is free within `systematics.FILM_ERROR` of the stated value.
+    the best one's inflation. The film mass of each vine is free within `FILM_ERROR` of the stated value.
     """
     if not hypotheses:
         return {}

@@ -6,9 +6,8 @@ falls to order 1.4. Near the yield pressure the speed relaxes in microseconds wh
 exceeds what holds it. An implicit L-stable method with error-controlled steps copes with all four.
 
 `_integrate` follows one trajectory as a state machine. A vine is at rest (`_wait_for_drive`, `_start_from_rest`),
-moving (`_cut_at_breakpoint`, `radau_step`, `_judge_step`, `_next_step_size`) or has a slack tail
-(`vinetrack.dynamics.integrator`). The code uses only numbers, tuples and arrays, so that numba can compile it.
-
+moving (`_cut_at_breakpoint`, `radau_step`, `_judge_step`, `_next_step_size`) or has a slack tail. The code uses only
+numbers, tuples and arrays, so that numba can compile it.
 """
 
 from __future__ import annotations

@@ -195,8 +195,8 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
 
 
 def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
-    """Parameters of a model, as parameters of a larger one that contains it. Returns parameters that the model lacks
-    are at their `zero`. Shapes: parameters (n_trials, n_parameters of the model) → (n_trials, n_parameters of the
+    """Parameters of a model, as parameters of a larger one that contains it. Those that the model lacks are
+    at their `zero`. Shapes: parameters (n_trials, n_parameters of the model) → (n_trials, n_parameters of the
     host).
     """
     lacking = [name for name in model.names if name not in host]
@@ -284,7 +284,7 @@ def trial_inputs(trial: Trial) -> TrialInputs:
 
 
 def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
-    """The inputs of trials at other pressures; the mass of the gas in them changes accordingly. Returns A changed copy.
+    """The inputs of trials at other pressures; the mass of the gas in them changes accordingly.
     Shapes: inputs (n_trials, n_fields); set_pressure_Pa, yield_pressure_Pa (n_trials,) → (n_trials, n_fields).
     """
     place = {name: k for k, name in enumerate(TrialInputs._fields)}

@@ -398,11 +398,15 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
     for worked in effect.worked:
         yield from _worked_faults(effect, worked)
     if effect.parameters:
+        zero = ", ".join(f"{p.name} = {p.zero:g}" for p in effect.parameters)
         for hook, function in effect.functions.items():
-            value = float(function(_STATE, _RIG, *effect.zero))
+            try:
+                value = float(function(_STATE, _RIG, *effect.zero))
+            except ArithmeticError as error:
+                yield f"{hook} fails at {zero} ({error}): give what shapes the effect a `zero=` that can be evaluated"
+                continue
             unchanged = getattr(_STATE, field) if isinstance(field := HOOKS[hook], str) else field
             if not math.isclose(value, unchanged, rel_tol=1e-9, abs_tol=1e-12):
-                zero = ", ".join(f"{p.name} = {p.zero:g}" for p in effect.parameters)
                 yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({unchanged:g})"
 
 
@@ -415,7 +419,7 @@ def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
         if unknown := set(worked.parameters) - set(values):
             raise ValueError(f"there is no parameter {', '.join(sorted(unknown))}")
         value = float(effect.functions[worked.hook](state, rig, *(values | dict(worked.parameters)).values()))
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, ArithmeticError) as error:
         yield f"a worked number of {worked.hook} cannot be tried ({error})"
         return
     if not math.isclose(value, worked.expected, rel_tol=worked.rel, abs_tol=1e-12):

@@ -3,7 +3,7 @@
 Matters at high speed with a payload that fills much of the core: the gas moves with the leading edge, the payload
 twice as fast, and has to push past it.
 
-    tail force −½ρ_gas (C A_pay) ẏ², with ẏ = ẋ − ẏ the payload's speed through the gas, (r−1)ẏ in general
+    tail force −½ρ_gas (C A_pay) ẏ², as the payload, at ẋ = 2ẏ, moves at ẏ through the gas; at (r−1)ẏ in general
 
 ρ_gas = (P + P_atm)/(287 T). C·A_pay is drag coefficient times frontal area; in a narrow core C rises far above that of
 free air, since the gas has to squeeze past. Without a payload there is no such force.

@@ -205,7 +205,7 @@ def profile_interval(
 ) -> tuple[float, float]:
     """Profile-likelihood interval of one parameter: constrained fits whose −2 ln L lies within `reach`² of the best.
     Between-trial standard deviations and noise stay those of the best fit, so that for a linear model this is the
-    interval ± `reach` · `sigma`. A side that meets a bound first ends there. Returns low, high : float: Scaled.
+    interval ± `reach` · `sigma`. A side that meets a bound first ends there. Returns low, high, scaled.
     """
     problem, state = solution.problem, solution.state
     held = FixedTerms(state.spread, (state.rho, state.variance))
@@ -423,8 +423,9 @@ def with_smooth_errors(fit: Fit) -> Solution:
 # smaller noise determines it, and the misfit of the others passes for their noise, which reduces their weights
 # further. So:
 #
-# 1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too. 2. The parameters
-# θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M).
+# 1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too.
+# 2. The parameters θ_i of trial i scatter about the shared θ, θ_i ~ N(θ, τ² M), with M the covariance of a typical
+#    trial alone, by its noise, and τ² at the maximum of the restricted likelihood.
 
 
 @dataclass(frozen=True)

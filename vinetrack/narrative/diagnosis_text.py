@@ -939,11 +939,13 @@ def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -
     )
 
 
-# What improves a number whose error comes mostly from what all trials share
-REMEDIES = {
-    "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
-    "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
-}  # fmt: skip
+def mostly_shared_text(names: Sequence[str], source: str) -> str:
+    """Return the message that a measurement would improve numbers more than further trials."""
+    remedies = {
+        "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
+        "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
+    }  # fmt: skip
+    return f"most of the error of {', '.join(names)} comes from what all trials share: {remedies[source]}"
 
 
 def _recordings(trials: Sequence[str]) -> str:
@@ -967,9 +969,7 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"{f', although {joined(may_vary)} may vary from trial to trial' if may_vary else ''}: an effect is missing, or"
         " the tracks have slow errors larger than their noise"
     ),
-    "mostly_shared": lambda names, source: (
-        f"most of the error of {', '.join(names)} comes from what all trials share: {REMEDIES[source]}"
-    ),
+    "mostly_shared": mostly_shared_text,
     "trials_disagree": lambda differences: (
         "trials disagree by more than their noise, in "
         f"{', '.join(f'{name} by ± {size}' for name, size in _with_sizes(differences))}: they get nearly equal weights"

@@ -85,20 +85,23 @@ def difference_in_words(result: LikelihoodRatio) -> str:
     return f"{name}s differ {' and '.join(parts)}"
 
 
+# What to do about each difference between trials
+BETWEEN_REMEDIES = {
+    N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
+    ORDER_DRIFT: "Repeat six trials in random order, number all trials in the column `order`, and read the gauge at "
+    "each",
+    SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
+    DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
+}
+
+
 def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = ()) -> str:
     """What to do about the differences between trials in an answer set; blank where there are none."""
     trials = [trial.trial for trial in step.tests.fit.trials]
     names = [result.names[-1] for result in answers or step.answer_set if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""
-    remedies = {
-        N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
-        ORDER_DRIFT: "Repeat six trials in random order, number all trials in the column `order`, and read the gauge "
-        "at each",
-        SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
-        DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
-    }
-    text = "".join(f" {remedies[name]}." for name in names)
+    text = "".join(f" {BETWEEN_REMEDIES[name]}." for name in names)
     if ORDER_DRIFT not in names and SPECIMEN not in names:
         return text
     _, stated = trial_order(trials)
