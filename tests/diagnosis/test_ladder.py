@@ -16,7 +16,7 @@ from vinetrack.diagnosis import ladder as ladder_module
 from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.schema import with_names
-from vinetrack.inference.fit import predict_prepared, predict_trials
+from vinetrack.inference.fit import predict_prepared, prepared_pairs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
@@ -69,7 +69,9 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs:
     for condition in dict.fromkeys(trial.condition for trial, _ in one_vine):
         seen = [pair for pair in one_vine if pair[0].condition != condition]
         unseen = [pair for pair in one_vine if pair[0].condition == condition]
-        predicted += predict_trials(vt.fit(vt.base_model(), seen, profile=False), unseen, from_rest=True)
+        predicted += predict_prepared(
+            vt.fit(vt.base_model(), seen, profile=False), prepared_pairs(unseen), from_rest=True
+        )
     by_hand = Errors(tuple(predicted), {}).rms_m
     assert left_out(found).rms_m == pytest.approx(by_hand, rel=0.05)
     assert by_hand > 1.1 * in_sample(found).rms_m

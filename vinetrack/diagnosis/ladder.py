@@ -27,7 +27,7 @@ from vinetrack.diagnosis.replicates import Replicates, align_replicates, first_t
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, catalogue, find_effect
-from vinetrack.inference.fit import fit, fit_subset, predict_prepared, predict_trials
+from vinetrack.inference.fit import fit, fit_subset, predict_prepared, prepared_pairs
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import Predictor
@@ -137,7 +137,7 @@ def compare(
 
     fitted = {trial.name for trial in fit.trials}
     chosen = [(trial, track) for trial, track in pairs_of(experiment, tracks)[0] if trial.name in fitted]
-    predicted = predict_trials(fit, chosen, from_rest=True)
+    predicted = predict_prepared(fit, prepared_pairs(chosen), from_rest=True)
     measured = {trial.name: track for trial, track in chosen}
     errors = _final_speed_errors(fit, predicted, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}

@@ -30,11 +30,13 @@ from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, pr
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
 from vinetrack.inference.marginal_likelihood import FitState, inverse_of_block, matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import (
+    CONVERGED_DECREASE,
     MOST_ITERATIONS,
     POOR_FIT,
     FixedTerms,
     Solution,
     Watch,
+    cost,
     first_state,
     make_problem,
     solve,
@@ -390,13 +392,8 @@ def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) ->
 FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
 
 
-def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
-    """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`."""
-    return predict_prepared(fit, prepared_pairs(pairs), from_rest=from_rest)
-
-
 def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
-    """As `predict_trials`, for trials whose data are already prepared."""
+    """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`."""
     rho = 0.0 if from_rest else fit.noise_correlation
     predictor, trial_effects, square = aligned_to_trials(fit, data, from_rest=from_rest)
     return _predicted(predictor, trial_effects, square, rho, fit.noise_m**2 * (1 - rho**2))
@@ -444,7 +441,10 @@ def _aligned(
             problem.release_origin_precision[i, 1] = 1e24  # The origin is known.
         state = first_state(data, np.empty(0), trial_effects)
         noise = rho, np.array([trial_data.noise_m**2 * (1 - rho**2) for trial_data in data])
-        solution = solve(undeviating, problem, state, FixedTerms(noise=noise), warm=True)
+        # 1e-5, 20: decrease, as a part of the misfit, at which a prediction is aligned, and most steps (chosen)
+        least = max(1e-5 * cost(undeviating, problem, replace(state, rho=rho, variance=noise[1])), CONVERGED_DECREASE)
+        held, how = FixedTerms(noise=noise), {"most_iterations": 20, "least_decrease": least}
+        solution = solve(undeviating, problem, state, held, warm=True, **how)  # type: ignore[arg-type]
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     square = at_correlation(solution.cross_products, rho)[:, :2, :2]
@@ -710,5 +710,5 @@ def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
     >>> [trial.name for trial in vt.predict(fit, pairs[6:])]
     ['P48_1', 'P48_2']
     """
-    pairs = list(pairs)
-    return with_bands(fitted, prepared_pairs(pairs), predict_trials(fitted, pairs))
+    data = prepared_pairs(pairs)
+    return with_bands(fitted, data, predict_prepared(fitted, data))
