@@ -46,7 +46,7 @@ FLOORS = (
 BUDGETS = {
     "cli": (634, 4, 5),
     "core": (1466, 9, 57),
-    "diagnosis": (10885, 22, 132),
+    "diagnosis": (10884, 22, 132),
     "dynamics": (2455, 8, 28),
     "effects": (713, 3, 7),
     "experiment": (1909, 7, 17),

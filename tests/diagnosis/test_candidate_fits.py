@@ -162,9 +162,7 @@ def test_a_slack_tail_is_found_where_the_model_has_it_push(slackened: Fit):
 
 def test_a_bare_vine_on_the_level_pulls_its_tail():
     found = fit(vt.base_model(), grown_with_tail(0.0, "taut", np.pi / 2), profile=False)
-    slack = slack_fit(found)
-    assert slack is not None
-    assert abs(slack.delta_chi2) < 0.5
+    assert slack_fit(found) is None
 
 
 @pytest.mark.slow

@@ -472,14 +472,13 @@ TAIL_SLACK = Effect(
 
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
-    """Refit the model with tails that may go slack; None where none is taut or the fit fails. Trial effects may have
-    absorbed the misfit until no tail pushes: where trials scatter much, the refit starts without them.
+    """Refit the model with tails that may go slack; None without a taut tail whose payload could run ahead, or where the
+    fit fails. Effects of trials that scatter much may have absorbed the misfit: the refit then starts without them.
     """
-    if not any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials):
+    trials = (one.trial for one in fit.trials)
+    if not any(trial.payload_kg > 0 and trial.tail_slack != "free" and trial.travel_ratio != 1 for trial in trials):
         return None
-    data = [
-        replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
-    ]
+    data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
     try:
         slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
         after = refit(slack, thorough=False, afresh=has_excess_scatter(fit))
