@@ -472,7 +472,7 @@ TAIL_SLACK = Effect(
 
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
-    """Refit the model with tails that may go slack; None without a taut tail whose payload could run ahead, or where the
+    """Refit the model with tails that may go slack; None where no taut tail has a payload that could run ahead, or the
     fit fails. Effects of trials that scatter much may have absorbed the misfit: the refit then starts without them.
     """
     trials = (one.trial for one in fit.trials)
