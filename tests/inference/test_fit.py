@@ -15,7 +15,7 @@ from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.simulate import SimulationError, simulate
 from vinetrack.inference import solving
-from vinetrack.inference.fit import fit_subset
+from vinetrack.inference.fit import fit_subset, predict_prepared
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.fit_summary import film_influence
@@ -85,6 +85,15 @@ def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign:
     assert found.origin_m == pytest.approx(origin_m, abs=2e-3)
     # B is known to 1 %, so the speed to 3 %: 8 mm of 280 at the end, less with a release of its own.
     assert found.rms_m < 4e-3
+
+
+def test_positions_without_any_noise_are_predicted_like_others(campaign: Campaign) -> None:
+    data = campaign[0].predictor.data[:2]
+    exact = [replace(trial_data, noise_m=0.0) for trial_data in data]
+    others = predict_prepared(campaign[0], data, from_rest=True)
+    for found, other in zip(predict_prepared(campaign[0], exact, from_rest=True), others, strict=True):
+        assert found.rms_m == pytest.approx(other.rms_m, rel=0.01)
+        assert found.release_s == pytest.approx(other.release_s, abs=1e-4)
 
 
 def test_a_refit_stays_at_the_solution_or_comes_back_to_it(campaign: Campaign) -> None:

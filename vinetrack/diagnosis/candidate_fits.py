@@ -305,8 +305,6 @@ Report = Callable[[str], None]  # Called with a few words on what is being done
 
 FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
 
-ALIKE_COSINE = 0.95  # Cosine from which two effects count as alike (chosen)
-
 MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
 
 # −2 ln L by which a subset fit may end behind the best and still be fitted to all trials (chosen)
@@ -371,7 +369,10 @@ class CandidateFits:
         """Fit each effect alone that may be the best or near it."""
         if self.linear_prediction_holds:
             return self.fit_to_all_trials(all_of_them=all_of_them)
-        self._fit_subsets(self.names if all_of_them else self._promising(most=5))
+        by_score = sorted(self.names, key=lambda name: -self.tests.best_z(name)[0])
+        # 5, 4: effects of the largest predicted gains and of the highest scores, fitted to the subset (chosen)
+        promising = dict.fromkeys((*self.names[:5], *by_score[:4], *self._promising))
+        self._fit_subsets(self.names if all_of_them else promising)
         ranked = sorted(self.subset_fits.values(), key=lambda subset_fit: subset_fit.deviance)
         chosen = [subset_fit for subset_fit in ranked if subset_fit.deviance - ranked[0].deviance < SUBSET_REACH]
         for subset_fit in chosen if all_of_them else chosen[: self.max_full_fits]:
@@ -384,7 +385,7 @@ class CandidateFits:
         may end in a local minimum. And a model whose parameters have adapted to the lack of an effect may predict no
         gain for it, not even the right sign.
         """
-        for name in self.names if all_of_them else self._promising():
+        for name in self.names if all_of_them else self._promising:
             if name not in self.fitted and name not in self.failed:
                 self._fit_from_prediction(name)
         self._fit_simpler_forms()
@@ -408,21 +409,11 @@ class CandidateFits:
                 if known is None or simpler.delta_chi2 > max(known.delta_chi2, FAILED_FIT_DELTA_CHI2):
                     self.fitted[simpler.label] = simpler
 
-    def _promising(self, most: int = 0) -> list[str]:
-        """Effects of a large predicted gain, `most` in any case, or of the highest score, and those that look like the
-        most promising one.
-        """
-        names = self.names
-        top = self.tests.predicted_gain(names[0]) if names else 0.0
-        by_score = sorted(names, key=lambda name: -self.tests.best_z(name)[0])
-        return [
-            name
-            for k, name in enumerate(names)
-            if k < most
-            or name in by_score[: max(most - 1, 1)]
-            or self.tests.predicted_gain(name) > MIN_SHARE_OF_BEST_PREDICTION * top
-            or self.tests.cosine(name, names[0]) > ALIKE_COSINE
-        ]
+    @property
+    def _promising(self) -> list[str]:
+        """Effects of a large part of the largest predicted gain."""
+        gains = {name: self.tests.predicted_gain(name) for name in self.names}
+        return [name for name in gains if gains[name] > MIN_SHARE_OF_BEST_PREDICTION * max(gains.values())]
 
     def _fit_subsets(self, names: Iterable[str]) -> None:
         """Fit effects to the subset, each from its best shapes and from the sizes of common slips in the sheet."""

@@ -200,7 +200,7 @@ def _where(table: pd.DataFrame, fails: bool) -> Iterator[Remark]:
         if steps and len(set(usable[column])) >= 3:
             ranks = [np.corrcoef(np.arange(step.size), np.argsort(np.argsort(step)))[0, 1] for step in steps]
             if min(ranks) > 0.75 or max(ranks) < -0.75:
-                yield remark("misfit_rises" if ranks[0] > 0 else "misfit_falls", column=column)
+                yield remark("misfit_follows", column=column, rises=bool(ranks[0] > 0))
 
 
 def _named(row: pd.Series, table: pd.DataFrame) -> dict[str, object]:

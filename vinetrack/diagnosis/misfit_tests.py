@@ -414,11 +414,6 @@ class MisfitTests:
         index = max(indices, key=lambda i: self.one_sided_z[i])
         return float(self.one_sided_z[index]), index
 
-    def cosine(self, first: str, second: str) -> float:
-        """Largest |cosine| between shapes of two effects."""
-        pairs = np.ix_(self._shapes_of(first), self._shapes_of(second))
-        return float(np.max(np.abs(self.scores.cosines[pairs]), initial=0.0))
-
     def upper_limits(self, effect: Effect) -> tuple[dict[str, float], bool]:
         """Upper limit (one-sided 95 %) of an undetected size, and whether a plausible size would be detected at all.
         Returns limits (by `effect.parameter`, SI; empty where no trial responds to the effect or it is not testable),

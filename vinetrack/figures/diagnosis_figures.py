@@ -17,6 +17,7 @@ import numpy as np
 from vinetrack.core.units import number
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
+from vinetrack.narrative.diagnosis_text import drift_condition
 from vinetrack.narrative.verdict_text import estimates_text, listed_names
 from vinetrack.results.folder_layout import Results, empty_table, read_diagnosis, read_result
 
@@ -302,14 +303,7 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
 
 
 def _draw_drift_panel(ax: Axes, groups: pd.DataFrame, against: str, markers: dict[str, str]) -> None:
-    # Conditions that a parameter may drift with: name, unit, and factor from SI
-    name, unit, factor = {
-        "pressure_Pa": ("pressure", "kPa", 1e-3),
-        "payload_kg": ("payload", "g", 1e3),
-        "growth_angle_rad": ("growth angle", "°", 180 / math.pi),
-        "chamber_m3": ("chamber", "l", 1e3),
-        "inlet_m": ("inlet", "mm", 1e3),
-    }.get(against, (against.replace("_", " "), "", 1.0))
+    name, unit, factor = drift_condition(against)
     names = list(dict.fromkeys(groups["vine"]))
     by_vine = against == "vine"
     for model, (colour, line, offset) in _MODELS.items():

@@ -439,12 +439,11 @@ def _aligned(
         for i in np.flatnonzero(rest_is_seen(data) & from_rest).tolist():
             trial_effects[i, ORIGIN] = problem.release_origin_mean[i, 1] = data[i].rest_origin_m
             problem.release_origin_precision[i, 1] = 1e24  # The origin is known.
-        state = first_state(data, np.empty(0), trial_effects)
-        noise = rho, np.array([trial_data.noise_m**2 * (1 - rho**2) for trial_data in data])
+        state = replace(first_state(data, np.empty(0), trial_effects), rho=rho)
         # 1e-5, 20: decrease, as a part of the misfit, at which a prediction is aligned, and most steps (chosen)
-        least = max(1e-5 * cost(undeviating, problem, replace(state, rho=rho, variance=noise[1])), CONVERGED_DECREASE)
-        held, how = FixedTerms(noise=noise), {"most_iterations": 20, "least_decrease": least}
-        solution = solve(undeviating, problem, state, held, warm=True, **how)  # type: ignore[arg-type]
+        least = max(1e-5 * cost(undeviating, problem, state), CONVERGED_DECREASE)
+        held = FixedTerms(noise=(rho, state.variance))
+        solution = solve(undeviating, problem, state, held, warm=True, most_iterations=20, least_decrease=least)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     square = at_correlation(solution.cross_products, rho)[:, :2, :2]

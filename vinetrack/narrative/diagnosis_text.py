@@ -684,6 +684,17 @@ def fails_most_text(
     )
 
 
+def drift_condition(column: str) -> tuple[str, str, float]:
+    """Return name, unit and factor from SI of a condition that a parameter may drift with."""
+    return {
+        "pressure_Pa": ("pressure", "kPa", 1e-3),
+        "payload_kg": ("payload", "g", 1e3),
+        "growth_angle_rad": ("growth angle", "°", 180 / math.pi),
+        "chamber_m3": ("chamber volume", "l", 1e3),
+        "inlet_m": ("inlet", "mm", 1e3),
+    }.get(column, (column.replace("_", " "), "", 1.0))
+
+
 def drift_text(
     row: Mapping[str, Any],
     steady: bool = True,
@@ -715,14 +726,7 @@ def drift_text(
             f"{who} would have to be {amount} larger in the {larger} half of the growth than in the {smaller}"
             f" ({z:.1f} σ), though it should not change along the growth."
         )
-    # Conditions that a parameter may drift with: name, unit, and factor from SI
-    name, shown, times = {
-        "pressure_Pa": ("pressure", "kPa", 1e-3),
-        "payload_kg": ("payload", "g", 1e3),
-        "growth_angle_rad": ("growth angle", "°", 180 / math.pi),
-        "chamber_m3": ("chamber volume", "l", 1e3),
-        "inlet_m": ("inlet", "mm", 1e3),
-    }[against]
+    name, shown, times = drift_condition(against)
     if steady:
         return (
             f"{who} rises by {amount} from {start * times:.3g} {shown} to {stop * times:.3g} {shown} of {name}"
@@ -925,7 +929,7 @@ def _of_draws(share: float) -> str:
 
 def _with_sizes(changes: Sequence[tuple[str, float, str]]) -> list[tuple[str, str]]:
     """Names of numbers and sizes of their changes, in display units."""
-    shown = [(name, size, *display_unit(unit)) for name, size, unit in changes]
+    shown = ((name, size, *display_unit(unit)) for name, size, unit in changes)
     return [(name, f"{size * factor:.2g} {unit}".rstrip()) for name, size, unit, factor in shown]
 
 
@@ -949,8 +953,7 @@ def mostly_shared_text(names: Sequence[str], source: str) -> str:
 
 
 def _recordings(trials: Sequence[str]) -> str:
-    some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
-    return f"{_count(len(trials), 'recording')} ({some})"
+    return f"{_count(len(trials), 'recording')} ({joined(trials[:4])}{' and others' if len(trials) > 4 else ''})"
 
 
 # Remarks that take more than a template, by their codes
@@ -1055,11 +1058,9 @@ REMARKS: dict[str, Callable[..., str]] = {
         f" (at most {z:.1f} σ, at {_condition_text(**condition)})."
     ),
     "fails_most": fails_most_text,
-    "misfit_rises": lambda column: (
-        f"The {'higher the pressure' if column == 'pressure_Pa' else 'larger the payload'}, the larger the misfit."
-    ),
-    "misfit_falls": lambda column: (
-        f"The {'lower the pressure' if column == 'pressure_Pa' else 'smaller the payload'}, the larger the misfit."
+    "misfit_follows": lambda column, rises: (
+        f"The {('lower', 'higher')[rises] if column == 'pressure_Pa' else ('smaller', 'larger')[rises]} the"
+        f" {'pressure' if column == 'pressure_Pa' else 'payload'}, the larger the misfit."
     ),
     "drifts": drift_text,
     "like_no_law": like_no_law_text,

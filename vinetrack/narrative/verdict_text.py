@@ -88,8 +88,7 @@ def difference_in_words(result: LikelihoodRatio) -> str:
 # What to do about each difference between trials
 BETWEEN_REMEDIES = {
     N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
-    ORDER_DRIFT: "Repeat six trials in random order, number all trials in the column `order`, and read the gauge at "
-    "each",
+    ORDER_DRIFT: "Repeat six trials in random order, number all in the column `order`, and read the gauge at each",
     SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
     DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
 }
