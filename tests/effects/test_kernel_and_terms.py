@@ -22,8 +22,8 @@ from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.equations import TrialArrays
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, effects_on
-from vinetrack.dynamics.simulate import simulate, trial_inputs
-from vinetrack.effects import Effect, catalogue
+from vinetrack.dynamics.simulate import simulate
+from vinetrack.effects import Effect, TrialInputs, catalogue
 
 PACKAGE = Path(vinetrack.__file__).parent
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
@@ -43,7 +43,7 @@ def accelerations(
     """Of the tail, by the compiled rates, at these pressures of the chamber (none: as at release)."""
     chamber_at_release, acceleration = callable_parts(model.effects)
     theta = model.parameters_for(trial.vine)
-    on, rig = effects_on(model, theta[None])[0], np.array(trial_inputs(trial))
+    on, rig = effects_on(model, theta[None])[0], np.array(TrialInputs.of(trial))
     bends = np.array([(b.start_m, b.arc_m, b.radius_m) for b in trial.bends]).reshape(-1, 3)
     arrays = TrialArrays(on, rig, theta, np.empty(0), np.empty(0), bends)
     pressures = np.full(time.size, chamber_at_release(arrays)) if chamber is None else chamber

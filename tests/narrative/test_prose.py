@@ -7,10 +7,8 @@ import re
 from pathlib import Path
 
 import vinetrack
-from vinetrack.diagnosis.result import BETWEEN_SUMMARIES
 from vinetrack.narrative import SENTENCES
 from vinetrack.narrative.diagnosis_text import REMARKS
-from vinetrack.narrative.verdict_text import BETWEEN_REMEDIES
 
 PACKAGE = Path(vinetrack.__file__).parent
 FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
@@ -49,10 +47,6 @@ def test_no_module_outside_the_room_of_prose_parses_it() -> None:
         if cuts_prose(node)
     ]
     assert cut == []
-
-
-def test_every_difference_between_trials_has_a_remedy() -> None:
-    assert BETWEEN_REMEDIES.keys() == BETWEEN_SUMMARIES.keys()
 
 
 def test_every_code_has_a_sentence_and_every_sentence_a_code() -> None:

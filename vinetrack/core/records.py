@@ -26,8 +26,11 @@ FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "correct
 # Flags of points that are not measurements of the leading edge
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 
-# Suffixes of recordings: films, and pictures of which a folder or a stack is one
-CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
+# Suffixes of recordings: side files of high-speed cameras, all their files, which state the capture rate, films, and
+# pictures of which a folder or a stack is one
+SIDE_FILES = (".cih", ".cihx")
+CAMERA_FILES = frozenset({".cine", ".mraw", *SIDE_FILES})
+CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts"}) | CAMERA_FILES - {*SIDE_FILES}
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
 
 
@@ -111,10 +114,10 @@ class Trial:
     corrections: tuple[Correction, ...] = ()
 
     def group(self, shared: str) -> str:
-        """Return the group of this trial for a parameter that is shared within groups."""
-        if shared == "day":
-            return f"day {self.day}" if self.day else ""
-        return self.vine if shared == "vine" else ""
+        """Return the group of this trial by a column of the sheet, blank for `all`; a specimen is one of its vine."""
+        if shared in ("vine", "specimen"):
+            return f"{self.vine}, {self.specimen}" if shared == "specimen" and self.specimen else self.vine
+        return f"{shared} {value}" if (value := getattr(self, shared, "")) else ""
 
     @property
     def area_m2(self) -> float:

@@ -32,9 +32,8 @@ from vinetrack.diagnosis.likelihood_ratio import (
     with_trace_errors,
 )
 from vinetrack.diagnosis.result import (
-    BETWEEN_SUMMARIES,
+    BETWEEN,
     BETWEEN_TRIALS,
-    DAY,
     N_BY_VINE,
     ORDER_DRIFT,
     REFITTED,
@@ -46,7 +45,7 @@ from vinetrack.effects import Effect, Parameter
 from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, Number, groups_of
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, Number
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import with_smooth_errors
 
@@ -56,9 +55,6 @@ from vinetrack.inference.position_errors import with_smooth_errors
 # Each hypothesis has several forms, of which the best counts: a drift of B, a drift of the pressure, or a step of the
 # pressure from some trial on; specimens and days differ in B, in pressure, or in both. `between_trials` states the
 # model and compares the hypotheses.
-
-SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0  # Standard deviation of ln B and of P_y among tubes of one kind
-
 
 MIN_TRIALS_EACH_SIDE = 2  # Minimum number of trials before and after a change (derived)
 
@@ -82,11 +78,6 @@ def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
     return [Difference(N_BY_VINE, shared={EXPONENT: "vine"})]
 
 
-def _tube(trial: Trial) -> str:
-    """The tube of a trial: its vine, and the specimen where stated."""
-    return f"{trial.vine}, {trial.specimen}" if trial.specimen else trial.vine
-
-
 def _drifts(trials: Sequence[Trial]) -> list[Difference]:
     """Drift of ln B with the earlier trials of the same tube, and of ln P with all earlier trials."""
     if len(trials) < FEWEST_TRIALS:
@@ -94,8 +85,8 @@ def _drifts(trials: Sequence[Trial]) -> list[Difference]:
     ranks, stated = trial_order(trials)
     uses, count = np.zeros(ranks.size), Counter[str]()
     for i in np.argsort(ranks):
-        uses[i] = count[_tube(trials[i])]
-        count[_tube(trials[i])] += 1
+        uses[i] = count[trials[i].group(SPECIMEN)]
+        count[trials[i].group(SPECIMEN)] += 1
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
     forms = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
     return [
@@ -148,45 +139,35 @@ def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
 
 
 def _groups(trials: Sequence[Trial]) -> list[Difference]:
-    """Differences between the specimens and days that the sheet states."""
-    stated_differences: list[Difference] = []
-    if all(trial.specimen for trial in trials):
-        tubes = tuple(_tube(trial) for trial in trials)
-        # A vine with a single tube has its own B already.
-        several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
-        groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
-        stated_differences += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
-    days = groups_of(trials, "day")
-    # 0.03, 300.0, 0.03: standard deviations of ln B, P_y and ln P between days (chosen)
-    stated_differences += _forms(DAY, days, trials, 0.03, 300.0, gain_sd=0.03, stated=True)
-    return stated_differences
+    """Differences between the specimens, days and other groups of trials that columns of the sheet state."""
+    found: list[Difference] = []
+    for name in BETWEEN:
+        if BETWEEN[name].B_sd and all(getattr(trial, name) for trial in trials):
+            groups = [trial.group(name) for trial in trials]
+            tubes = Counter(vine for vine, _ in {(trial.vine, trial.specimen) for trial in trials})
+            # A vine with a single tube has its own B already.
+            alone = [name == SPECIMEN and tubes[trial.vine] == 1 for trial in trials]
+            found += _forms(name, ["" if one else group for one, group in zip(alone, groups, strict=True)], trials)
+    return found
 
 
-def _forms(
-    name: str,
-    groups: Sequence[str],
-    trials: Sequence[Trial],
-    B_sd: float,
-    pressure_sd_Pa: float,
-    *,
-    gain_sd: float = 0.0,
-    stated: bool,
-) -> list[Difference]:
-    """Forms in which groups differ: in B, in pressure, or in both; with `gain_sd`, also by a factor of the pressure."""
+def _forms(name: str, groups: Sequence[str], trials: Sequence[Trial], *, stated: bool = True) -> list[Difference]:
+    """Forms in which groups differ: in B, in pressure, in both, or by a factor of the pressure."""
     if len({group for group in groups if group}) < 2 and stated:
         return []
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
     driven = np.isfinite(pressures_Pa) & (pressures_Pa > 0)
     per_Pa = np.where(driven, 1 / np.where(driven, pressures_Pa, 1.0), 0.0)
     groups = tuple(groups)
-    in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, np.ones(len(groups)), B_sd, B_sd)
-    in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
-    in_gain = BetweenTerm(f"{name}.gain", "ΔlnP", "", True, groups, np.ones(len(groups)), gain_sd, gain_sd)
+    sd, ones = BETWEEN[name], np.ones(len(groups))
+    in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, ones, sd.B_sd, sd.B_sd)
+    in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, sd.pressure_sd_Pa, sd.pressure_sd_Pa)
+    in_gain = BetweenTerm(f"{name}.gain", "ΔlnP", "", True, groups, ones, sd.gain_sd, sd.gain_sd)
     member = np.array([[group == label for label in dict.fromkeys(groups) if label] for group in groups], dtype=float)
     is_confounded = confounded(member, trials)
     return [
         Difference(name, terms, stated=stated, confounded=is_confounded)
-        for terms in ((in_B,), (in_P,), (in_B, in_P), *([(in_gain,)] if gain_sd else []))
+        for terms in ((in_B,), (in_P,), (in_B, in_P), *([(in_gain,)] if sd.gain_sd else []))
         if not any(term.pressure for term in terms) or driven.any()
     ]
 
@@ -208,9 +189,9 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
         later = partial(_later_tube, members, tube, groups, trials)
         groups = list(_likeliest(fit, base, begins, later).terms[0].groups)
     conditions = [trial.condition for trial in trials]
-    changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
+    changes = _forms(SPECIMEN, groups, trials, stated=False) if any(groups) else []
     if _replicates_are_consecutive(ranks, conditions):
-        changes += _forms(SPECIMEN, conditions, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
+        changes += _forms(SPECIMEN, conditions, trials, stated=False)
     return changes
 
 
@@ -219,7 +200,7 @@ def _later_tube(
 ) -> Difference:
     """Another tube for the later trials of a vine, beside those of the vines before."""
     apart = [tube if i in members[first:] else group for i, group in enumerate(groups)]
-    return _forms(SPECIMEN, apart, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
+    return _forms(SPECIMEN, apart, trials, stated=False)[-1]
 
 
 def _replicates_are_consecutive(ranks: Floats, conditions: Sequence[str]) -> bool:
@@ -349,8 +330,8 @@ def _effect_of(difference: Difference) -> Effect:
     return Effect(
         name=difference.name,
         kind=BETWEEN_TRIALS,
-        summary=BETWEEN_SUMMARIES[difference.name],
-        text=BETWEEN_SUMMARIES[difference.name],
+        summary=BETWEEN[difference.name].summary,
+        text=BETWEEN[difference.name].summary,
         parameters=drift or parameters,
         functions={},
         needs=(),

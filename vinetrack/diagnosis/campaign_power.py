@@ -10,6 +10,7 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from vinetrack.diagnosis.score_test import testable
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
+from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
@@ -88,8 +90,9 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark
     exact = [replace(trial, yield_pressure_sigma_Pa=0.0) for trial in design.trials]
     # Noise-free replicates have the same track, which is simulated once. They are compared by their text, because from
     # Python 3.13 on records that hold a NaN are not equal to themselves.
+    ungrouped: dict[str, Any] = dict.fromkeys(GROUPINGS, "")
     signatures = [
-        repr((replace(trial, name="", specimen="", day="", order=0.0), camera))
+        repr((replace(trial, name="", order=0.0, **ungrouped), camera))
         for trial, camera in zip(exact, cameras, strict=True)
     ]
     first = [signatures.index(signature) for signature in dict.fromkeys(signatures)]

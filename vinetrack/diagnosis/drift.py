@@ -40,6 +40,7 @@ from vinetrack.diagnosis.replicates import (
 from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
 from vinetrack.inference.fit import fit_subset, rest_is_seen
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number, TrialFit
@@ -121,7 +122,7 @@ def common_edges(members: Sequence[ResidualCourse]) -> Floats:
 
 def stretch_means(course: ResidualCourse, along: str, edges: Floats) -> tuple[Floats, Floats]:
     """Means of [residual, scatter response] in each stretch, NaN where there is no frame, and the numbers of frames.
-    Returns means, frames. Shapes: edges (n_stretches + 1,) → (n_stretches, 3).
+    Shapes: edges (n_stretches + 1,) → (n_stretches, 3).
     """
     values, at = np.column_stack([course.residual_m, course.scatter_response]), getattr(course, along)
     stretch = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
@@ -162,14 +163,8 @@ FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine
 LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scatter of pressure and B (chosen)
 
 
-# Conditions on which a parameter should not depend: attributes of a trial, and whether a trend is one of the logarithm
-COVARIATES = {
-    "pressure_Pa": True,
-    "payload_kg": False,
-    "growth_angle_rad": False,
-    "chamber_m3": True,
-    "inlet_m": True,
-}
+# Conditions on which a parameter should not depend, as fields of a trial
+COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
 
 
 @dataclass(frozen=True)
@@ -549,7 +544,8 @@ def _against(estimates: PerTrialEstimates, against: str) -> Iterator[ConstancyTe
 
 def _coordinate(against: str, levels: Floats) -> Floats:
     """The coordinate in which a trend is linear. Shapes: levels (n_trials,) → (n_trials,)."""
-    return np.log(levels) if COVARIATES[against] and np.all(levels > 0) else levels
+    linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
+    return levels if linear else np.log(levels)
 
 
 def _slope(

@@ -86,8 +86,7 @@ def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
 
 def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[float, float] | None = None) -> float:
     """Predicted fall of −2 ln L with a difference, from the sensitivities of the fit. The deviation of each trial is a
-    column of the linear mixed model already, and the columns of the coefficients are multiples of it. Returns fall of
-    −2 ln L.
+    column of the linear mixed model already, and the columns of the coefficients are multiples of it.
     """
     cross_products, problem, state = _widened(fit, base, difference)
     before = marginal(base.cross_products, base.problem, base.state)
@@ -458,8 +457,8 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
 
 
 def robust_ratio(after: Fit, names: Collection[str]) -> float:
-    """Ratio of the standard error of a size from the scatter of trials to that from the noise model; at least 1.
-    Returns the largest ratio of all these sizes.
+    """Ratio of the standard error of a size from the scatter of trials to that from the noise model; at least 1. The
+    largest of all these sizes.
     """
     if not names or len(after.trials) < FEWEST_CLUSTERS:
         return 1.0

@@ -37,6 +37,7 @@ from vinetrack.diagnosis.score_test import (
 )
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect
+from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_data import FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.inference.marginal_likelihood import FitState, solve_per_trial, trial_effect_prior
@@ -551,7 +552,7 @@ def _false_alarms(tests: MisfitTests) -> dict[str, float]:
         "noise that is larger in motion": 0.1 * level,
     }
     trials = [trial.trial for trial in tests.fit.trials]
-    if any(trial.specimen or trial.day or math.isfinite(trial.order) for trial in trials):
+    if any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials):
         rates["specimens, days or the order of trials"] = level
     return rates
 

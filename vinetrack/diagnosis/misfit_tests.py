@@ -144,7 +144,7 @@ CAREFUL_PRESSURE_SCATTER = 0.02  # Relative standard deviation of pressure that 
 
 def between_conditions_p(fit: Fit) -> float:
     """p-value that conditions differ in pressure or B no more than replicates do. 1 where replicates are too few, or
-    where conditions differ by less than is usual in careful work. Returns p-value.
+    where conditions differ by less than is usual in careful work.
     """
     stated = [
         trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
@@ -213,9 +213,7 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
 
 
 def noise_in_motion_p(fit: Fit) -> float:
-    """p-value that residuals summed over stretches are no noisier in motion than at rest; 1 where this is unknown.
-    Returns p-value.
-    """
+    """p-value that residuals summed over stretches are no noisier in motion than at rest; 1 where this is unknown."""
     from scipy.stats import f
 
     at_rest: list[Floats] = []

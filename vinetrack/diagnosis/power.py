@@ -228,9 +228,8 @@ class FurtherTrials:
 
 
 def sheet_cells(trial: Trial) -> dict[str, float]:
-    """Cells of the sheet that describe how to set up a further trial, without blank ones. Returns by column."""
-    names = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa", "payload_g",
-             "chamber_l", "inlet_mm", "growth_angle_deg", "capture_fps")  # fmt: skip
+    """Cells of the sheet that describe how to set up a further trial, without blank ones."""
+    names = [*(name for name, column in COLUMNS.items() if column.limit), "yield_pressure_kPa", "capture_fps"]
     cells = {name: COLUMNS[name].of_trial(trial) for name in names}
     return {name: float(f"{value:.6g}") for name, value in cells.items() if math.isfinite(value)}
 

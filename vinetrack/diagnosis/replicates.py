@@ -519,9 +519,7 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
 
 
 def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
-    """Covariance of the means of one trial's stretches, shape (n_stretches, n_stretches), m². Shape (n_stretches,
-    n_stretches).
-    """
+    """Covariance of the means of one trial's stretches, shape (n_stretches, n_stretches), m²."""
     return _covariance(group, scatter.variances)
 
 

@@ -159,9 +159,7 @@ def _first_step(size: Parameter) -> float:
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
-    """Plausible range of a parameter; where the effect states none, three times its default on either side of zero.
-    Returns low, high : float, SI.
-    """
+    """Plausible range of a parameter; where the effect states none, three times its default on either side of zero."""
     if parameter.plausible is not None:
         return parameter.plausible
     low, high = parameter.bounds

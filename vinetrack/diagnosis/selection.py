@@ -394,9 +394,7 @@ def _quantile(number: Number) -> float:
 
 
 def size_not_excluded(estimate: float, sigma: float, parameter: Parameter) -> tuple[float, float, float]:
-    """Combine the estimate of a size with its plausible range (truncated normal posterior). Returns mean, sd, limit :
-    float.
-    """
+    """Combine the estimate of a size with its plausible range (truncated normal posterior)."""
     from scipy.stats import truncnorm
 
     low, high = plausible_range(parameter)

@@ -18,7 +18,7 @@ import pandas as pd
 
 from vinetrack.core.records import Floats, Kinematics, Trial
 from vinetrack.dynamics.kernel import Trace
-from vinetrack.dynamics.model import Model, check_needs, effects_on, trial_inputs
+from vinetrack.dynamics.model import Model, check_needs, effects_on
 from vinetrack.effects import HOOKS, Effect, EffectError, State, TrialInputs, catalogue
 
 # ------------------------------------------------------------------------------
@@ -93,7 +93,7 @@ class _Hooks:
     """The functions of a model's effects, called with the inputs of one trial and the parameters of its vine."""
 
     def __init__(self, model: Model, trial: Trial, measured: bool) -> None:
-        self.rig = trial_inputs(trial)
+        self.rig = TrialInputs.of(trial)
         theta = model.parameters_of(trial)
         on = effects_on(model, theta[None, :])[0]
         # A measured pressure includes everything that happens in the chamber.
@@ -209,7 +209,7 @@ class AuditedMotion:
 
     def drive_N(self) -> Floats:
         """The drive on the tail ½PA (PA/r), shape (n,), with the set pressure unless it was measured."""
-        rig = trial_inputs(self.trial)
+        rig = TrialInputs.of(self.trial)
         pressure = rig.set_pressure if self.pressure_Pa is None else self.pressure_Pa
         return np.broadcast_to(np.asarray(pressure * rig.area / rig.travel_ratio, dtype=float), self.time_s.shape)
 
@@ -292,7 +292,7 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
         # It changes nothing but the reported position.
         state = without.state._replace(tail_tension=np.maximum(without.tension_N, 0.0))  # type: ignore[arg-type]
         sizes = (parameter.default for parameter in effect.parameters)
-        seen = effect.functions["observed_position"](state, trial_inputs(motion.trial), *sizes)
+        seen = effect.functions["observed_position"](state, TrialInputs.of(motion.trial), *sizes)
         shift = np.asarray(seen, dtype=float) - motion.lead_position_m
         i = int(np.argmax(np.abs(shift)))
         return motion.row(effect.name, i, size=size, shift_m=float(shift[i]))

@@ -242,7 +242,7 @@ class Batch:
         return self.arrays.starts
 
     def run(self, relative_tolerance: float = RELATIVE_TOLERANCE) -> tuple[Floats, Floats]:
-        """Integrate every trial. Returns out, ends. Shapes (n_times, 4), (n_trials, 5)."""
+        """Integrate every trial: out, shape (n_times, 4), and ends, shape (n_trials, 5)."""
         count = self.starts.size - 1
         out, ends = np.empty((self.stamps.size, 4)), np.empty((count, 5))
         # For fewer than 64 trials another thread costs more than it saves.

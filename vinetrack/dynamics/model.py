@@ -244,45 +244,6 @@ def base_model() -> Model:
     return make_model()
 
 
-# ------------------------------------------------------------------------------
-# The inputs of effects that are constant for a trial, as SI numbers.
-
-
-def trial_inputs(trial: Trial) -> TrialInputs:
-    """The inputs of effects for a trial."""
-    whole_body = trial.travel_ratio == 1
-    length = trial.length_m if math.isfinite(trial.length_m) else 0.0
-    area = trial.area_m2 if math.isfinite(trial.diameter_m) else 0.0
-    linear_density = trial.linear_density_kg_m
-    pressure = 0.0 if whole_body and not math.isfinite(trial.pressure_Pa) else trial.pressure_Pa
-    yield_pressure = 0.0 if whole_body and not math.isfinite(trial.yield_pressure_Pa) else trial.yield_pressure_Pa
-    gas_density = (pressure + trial.ambient_pressure_Pa) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
-    fold = 0.0 if linear_density == 0 else linear_density * math.pi * trial.thickness_m
-    return TrialInputs(
-        set_pressure=pressure,
-        yield_pressure=yield_pressure,
-        diameter=trial.diameter_m,
-        thickness=trial.thickness_m,
-        length=length,
-        area=area,
-        linear_density=linear_density,
-        mass_loss=trial.mass_loss_kg_m if linear_density else 0.0,
-        payload_mass=trial.payload_kg,
-        cos_angle=math.cos(trial.growth_angle_rad),
-        travel_ratio=trial.travel_ratio,
-        ambient_pressure=trial.ambient_pressure_Pa,
-        chamber_volume=trial.chamber_m3,
-        inlet_area=math.pi * trial.inlet_m**2 / 4,
-        least_mass=fold + gas_density * area * length / trial.travel_ratio**2,
-        has_bends=float(bool(trial.bends)),
-        tail_on_reel=float(trial.tail_store == "reel"),
-        bend_count=float(len(trial.bends)),
-        bend_total=sum(bend.arc_m / bend.radius_m for bend in trial.bends),
-        as_printed=float(trial.mass_loss == "as_printed"),
-        tail_free=float(trial.tail_slack == "free" and not whole_body),
-    )
-
-
 def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
     """The inputs of trials at other pressures; the mass of the gas in them changes accordingly.
     Shapes: inputs (n_trials, n_fields); set_pressure_Pa, yield_pressure_Pa (n_trials,) → (n_trials, n_fields).

@@ -14,8 +14,8 @@ from vinetrack.core.problems import UserError
 from vinetrack.core.records import Bend, Floats, Trial
 from vinetrack.dynamics.equations import TOO_HARD
 from vinetrack.dynamics.kernel import RELATIVE_TOLERANCE, Batch, Trace, lay_out, starts_of
-from vinetrack.dynamics.model import Model, base_model, check_needs, host_for, trial_inputs
-from vinetrack.effects import Effect, TrialInputs, catalogue
+from vinetrack.dynamics.model import Model, base_model, check_needs, host_for
+from vinetrack.effects import REFERENCE_TRIAL, Effect, TrialInputs, catalogue
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def prepare(
 ) -> Batch:
     """Lay out trials for the compiled kernel."""
     check_needs(model, *trials)
-    inputs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(-1, len(TrialInputs._fields))
+    inputs = np.array([TrialInputs.of(trial) for trial in trials], dtype=float).reshape(-1, len(TrialInputs._fields))
     if parameters is None:
         groups = [(trial.vine, trial.group("day")) for trial in trials]
         of_group = {group: model.parameters_for(*group) for group in set(groups)}
@@ -166,19 +166,6 @@ def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
 # ------------------------------------------------------------------------------
 # Motion of a reference vine with and without one effect: the data of the effect's figure.
 
-# The largest vine of Alvarez et al. (2025), grown downwards with their payload, 0.4 m long
-REFERENCE = Trial(
-    name="reference",
-    vine="reference",
-    diameter_m=24e-3,
-    thickness_m=200e-6,
-    length_m=0.4,
-    pressure_Pa=28e3,
-    yield_pressure_Pa=3e3,
-    payload_kg=35.6e-3,
-    chamber_m3=3.7e-3,
-    inlet_m=6e-3,
-)
 REFERENCE_VALUES = {"eversion_damping.B": 6.44, "eversion_damping.n": 0.37}
 
 
@@ -187,15 +174,15 @@ def _reference(effect: Effect) -> tuple[Trial, Trace | None, str]:
     vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
     still = f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm"
     if set(effect.functions) == {"rest_force"}:
-        level = replace(REFERENCE, growth_angle_rad=math.pi / 2)
+        level = replace(REFERENCE_TRIAL, growth_angle_rad=math.pi / 2)
         trace = np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3])
         return level, trace, f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
     if "trace_time" in effect.functions:
         trace = np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3])
-        return REFERENCE, trace, f"{vine}, straight down, a pressure recorded while it rises to 28 kPa in 20 ms"
+        return REFERENCE_TRIAL, trace, f"{vine}, straight down, a pressure recorded while it rises to 28 kPa in 20 ms"
     if effect.name == "capstan_friction":
-        return replace(REFERENCE, bends=(Bend(0.1, 0.1, 0.1),)), None, f"{still}, one radian of bend after 100 mm"
-    return REFERENCE, None, still
+        return replace(REFERENCE_TRIAL, bends=(Bend(0.1, 0.1, 0.1),)), None, f"{still}, one radian of bend after 100 mm"
+    return REFERENCE_TRIAL, None, still
 
 
 def reference_words(effect: Effect) -> str:

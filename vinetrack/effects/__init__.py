@@ -7,7 +7,7 @@ own, `own_effects(paths)` all of them, tried out.
 from __future__ import annotations
 
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.effects._base import HOOKS, Effect, Parameter, State, TrialInputs, Worked
+from vinetrack.effects._base import HOOKS, REFERENCE_TRIAL, Effect, Parameter, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import (
     EffectError,
     catalogue,
@@ -25,6 +25,7 @@ from vinetrack.effects._catalogue import (
 __all__ = [
     "BASE_EFFECTS",
     "HOOKS",
+    "REFERENCE_TRIAL",
     "Effect",
     "EffectError",
     "Parameter",

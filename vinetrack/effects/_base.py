@@ -16,6 +16,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from vinetrack.core.records import Trial
+from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
+
 HOOKS: Mapping[str, str | float] = {
     "true_time": "time",
     "trace_time": "time",
@@ -85,6 +88,48 @@ class TrialInputs(NamedTuple):
     bend_total: float  #: sum of their angles, rad
     as_printed: float  #: 1 where the paper's terms are taken literally
     tail_free: float  #: 1 where the tail goes slack instead of carrying compression
+
+    @classmethod
+    def of(cls, trial: Trial) -> TrialInputs:
+        """Those of one trial."""
+        whole_body = trial.travel_ratio == 1
+        length = trial.length_m if math.isfinite(trial.length_m) else 0.0
+        area = trial.area_m2 if math.isfinite(trial.diameter_m) else 0.0
+        linear_density = trial.linear_density_kg_m
+        pressure = 0.0 if whole_body and not math.isfinite(trial.pressure_Pa) else trial.pressure_Pa
+        yield_pressure = 0.0 if whole_body and not math.isfinite(trial.yield_pressure_Pa) else trial.yield_pressure_Pa
+        gas_density = (pressure + trial.ambient_pressure_Pa) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+        fold = 0.0 if linear_density == 0 else linear_density * math.pi * trial.thickness_m
+        return cls(
+            set_pressure=pressure,
+            yield_pressure=yield_pressure,
+            diameter=trial.diameter_m,
+            thickness=trial.thickness_m,
+            length=length,
+            area=area,
+            linear_density=linear_density,
+            mass_loss=trial.mass_loss_kg_m if linear_density else 0.0,
+            payload_mass=trial.payload_kg,
+            cos_angle=math.cos(trial.growth_angle_rad),
+            travel_ratio=trial.travel_ratio,
+            ambient_pressure=trial.ambient_pressure_Pa,
+            chamber_volume=trial.chamber_m3,
+            inlet_area=math.pi * trial.inlet_m**2 / 4,
+            least_mass=fold + gas_density * area * length / trial.travel_ratio**2,
+            has_bends=float(bool(trial.bends)),
+            tail_on_reel=float(trial.tail_store == "reel"),
+            bend_count=float(len(trial.bends)),
+            bend_total=sum(bend.arc_m / bend.radius_m for bend in trial.bends),
+            as_printed=float(trial.mass_loss == "as_printed"),
+            tail_free=float(trial.tail_slack == "free" and not whole_body),
+        )
+
+
+# The largest vine of Alvarez et al. (2025), grown downwards with their payload, 0.4 m long
+REFERENCE_TRIAL = Trial(
+    name="reference", vine="reference", diameter_m=24e-3, thickness_m=200e-6, length_m=0.4, pressure_Pa=28e3,
+    yield_pressure_Pa=3e3, payload_kg=35.6e-3, chamber_m3=3.7e-3, inlet_m=6e-3,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

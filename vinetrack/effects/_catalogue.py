@@ -18,6 +18,7 @@ import re
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from numbers import Real
 from pathlib import Path
@@ -25,10 +26,20 @@ from types import MappingProxyType, ModuleType
 from typing import Any
 
 from vinetrack.core.problems import UserError
+from vinetrack.core.records import Bend
 from vinetrack.core.tables import file_size, write_json
 from vinetrack.core.terminal import table
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.effects._base import HOOKS, KINDS, Effect, Parameter, State, TrialInputs, Worked
+from vinetrack.effects._base import (
+    HOOKS,
+    KINDS,
+    REFERENCE_TRIAL,
+    Effect,
+    Parameter,
+    State,
+    TrialInputs,
+    Worked,
+)
 
 # ------------------------------------------------------------------------------
 # First run of a user's own effects: each is a program, so it is announced before it runs, and remembered by hash.
@@ -359,12 +370,7 @@ _STATE = State(
     pressure=27e3, yield_pressure=3e3, area=4.5e-4, linear_density=0.018, moving_mass=0.039, damping_gain=1.1,
     bend_angle=0.5, tail_tension=2.0, observed=0.101,
 )  # fmt: skip
-_RIG = TrialInputs(
-    set_pressure=28e3, yield_pressure=3e3, diameter=24e-3, thickness=200e-6, length=0.28, area=4.5e-4,
-    linear_density=0.018, mass_loss=0.009, payload_mass=0.0356, cos_angle=1.0, travel_ratio=2.0,
-    ambient_pressure=101_325.0, chamber_volume=3.7e-3, inlet_area=2.8e-5, least_mass=6e-5, has_bends=1.0,
-    tail_on_reel=0.0, bend_count=1.0, bend_total=1.0, as_printed=0.0, tail_free=0.0,
-)  # fmt: skip
+_RIG = TrialInputs.of(replace(REFERENCE_TRIAL, bends=(Bend(0.1, 0.1, 0.1),)))
 
 
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:

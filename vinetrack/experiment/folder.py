@@ -20,8 +20,8 @@ import numpy as np
 
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.core.records import IMAGES, Correction, Floats, Trial
-from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, with_names
+from vinetrack.core.records import IMAGES, SIDE_FILES, Correction, Floats, Trial
+from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, unusual_value_hint, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,
@@ -357,7 +357,7 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
         )
         remedy = "run the trials in random order, or repeat six of them in random order, and number them under order"
         yield Problem("confounded", message, "order", file=SHEET, severity="warning", remedy=remedy)
-    for column in ("specimen", "day"):
+    for column in GROUPINGS:
         # Every condition has a single specimen or day, while they differ within a vine.
         values = {(trial.vine, trial.condition, getattr(trial, column)) for trial in trials}
         if not values or any(not value for *_, value in values):
@@ -418,7 +418,7 @@ def _in_no_row(experiment: Experiment) -> list[Problem]:
 
     named = {normal(path) for path in (*experiment.recordings, *(path for _, path in experiment.settings.paths))}
     named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
-    named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in (".cih", ".cihx")}
+    named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in SIDE_FILES}
     found = [name for name in tables.list_recordings(experiment.folder) if normal(name) not in named]
     if not found:
         return []

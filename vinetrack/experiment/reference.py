@@ -18,14 +18,6 @@ from vinetrack.core.units import UNITS, split_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 from vinetrack.experiment.settings import CALIBRATIONS, AxisSettings, ExperimentSettings, Limits, RunSettings
 
-_PAGE_HEAD = """# Every column and key
-
-Generated from the declarations that validate them: `vinetrack settings` prints the same, `vinetrack settings --json -`
-prints it for a program, and `vinetrack settings --page docs/settings.md` writes this page. A column, or a key of
-`experiment.yaml`, may state another unit in its name (`pressure_psi`, `diameter_in`, …): it is converted, and
-`vinetrack check` reports the conversion. A blank cell means the default.
-"""
-
 
 @dataclass(frozen=True)
 class Entry:
@@ -98,7 +90,16 @@ def _groups() -> tuple[tuple[str, str, list[Entry]], ...]:
 
 def reference_page() -> str:
     """Return the reference as the page `docs/settings.md`."""
-    parts = [_PAGE_HEAD]
+    parts = [
+        "# Every column and key",
+        "",
+        "Generated from the declarations that validate them: `vinetrack settings` prints the same, `vinetrack",
+        "settings --json -` prints it for a program, and `vinetrack settings --page docs/settings.md` writes this",
+        "page. A column, or a key of `experiment.yaml`, may state another unit in its name (`pressure_psi`,",
+        "`diameter_in`, …): it is converted, and `vinetrack check` reports the conversion. A blank cell means the",
+        "default.",
+        "",
+    ]
     for _, title, entries in _groups():
         heading, _, shared = title.partition("; ")
         parts += [f"## {heading}", ""]

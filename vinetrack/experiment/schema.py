@@ -69,11 +69,14 @@ class Column:
         high = "" if math.isinf(self.high) else f" to {self.high:g}"
         return f"{above}{self.low:g}{high} {self.unit}".rstrip()
 
+    @property
+    def quantity(self) -> str:
+        """The name without its unit, in words."""
+        return split_unit(self.name)[0].replace("_", " ")
+
     def in_words(self, value: float) -> str:
         """Return a value as a phrase for a sentence: `a chamber of 3.7 litres`."""
-        quantity = split_unit(self.name)[0].replace("_", " ")
-        article = "an" if quantity[0] in "aeiou" else "a"
-        return f"{article} {quantity} of {value:.3g} {self.unit}".rstrip()
+        return f"{'an' if self.quantity[0] in 'aeiou' else 'a'} {self.quantity} of {value:.3g} {self.unit}".rstrip()
 
     def to_si(self, value: float) -> float:
         """Convert a value of this column to SI."""
@@ -87,7 +90,8 @@ class Column:
 
 def _read_columns() -> dict[str, Column]:
     with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+        head, *lines = csv.reader(file)
+    rows: list[dict[str, Any]] = [dict(zip(head, line, strict=True)) for line in lines]
     return {
         row["name"]: Column(
             **row
@@ -112,6 +116,12 @@ SHARED = tuple(name for name, column in COLUMNS.items() if column.shared)
 # Columns that `limits` of `experiment.yaml` may constrain for further trials, by the form of the constraint
 LIMITED = {kind: tuple(name for name in COLUMNS if COLUMNS[name].limit == kind) for kind in ("range", "choice")}
 
+# Columns of the rig, in which a further trial of the same vine may differ, with their fields of a trial
+RIG = {name: column.field for name, column in COLUMNS.items() if column.limit and column.condition_part}
+
+# Columns that sort trials into groups: specimens, days
+GROUPINGS = tuple(name for name, column in COLUMNS.items() if column.kind == "text" and column.shared)
+
 
 def option(column: str) -> str:
     """Return the command-line option for a column of the sheet."""
@@ -124,11 +134,10 @@ def option(column: str) -> str:
 # A cell of `trials.csv` and a value of `experiment.yaml` pass the same checks and get the same remedies. Values stay
 # in the unit of their column until `vinetrack.experiment.sheet.make_trial` converts them to SI.
 
-Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
-
-
 SHORTEST_AXIS_PX = 10  # Chosen: the direction of a shorter axis is too uncertain
 SMALLEST_POINT_SPACING_PX = 2  # Smallest distance between neighbouring points of a curved path (chosen)
+
+Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 
 
 class CellError(InputError, ValueError):

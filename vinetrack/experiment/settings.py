@@ -199,18 +199,9 @@ class Limits(_LimitedColumns):
         return value if value is None else (read_limit(column, value),)
 
 
-# Type of the value of each kind of column
-_TYPES: dict[str, Any] = {
-    "number": float,
-    "choice": float,
-    "text": str,
-    "path": str,
-    "bends": tuple[Bend, ...],
-    "window": tuple[float, float],
-    "yes_no": bool,
-}
-
-_SharedColumns: Any = _optional_fields({name: _TYPES[COLUMNS[name].kind] for name in SHARED})
+# Type of the value of each kind of column; all others are numbers
+_TYPES: Any = {"text": str, "path": str, "bends": tuple[Bend, ...], "window": tuple[float, float], "yes_no": bool}
+_SharedColumns: Any = _optional_fields({name: _TYPES.get(COLUMNS[name].kind, float) for name in SHARED})
 
 
 class ExperimentSettings(_SharedColumns):

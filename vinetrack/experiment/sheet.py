@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputError, Problem, did_you_mean
-from vinetrack.core.records import Trial
+from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
 from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, read_cell, unusual_value_hint, with_names
 from vinetrack.experiment.settings import (
@@ -193,8 +193,8 @@ def _may_state_rate(folder: Path, video: str) -> bool:
     """Whether a recording is of a kind that can carry its capture rate; whether it does, only opening it shows."""
     try:
         path = safe_join(folder, video)
-        files = path.iterdir() if path.is_dir() else [path, path.with_suffix(".cih"), path.with_suffix(".cihx")]
-        return any(file.suffix.lower() in (".dng", ".cine", ".cih", ".cihx") and file.exists() for file in files)
+        files = path.iterdir() if path.is_dir() else [path, *map(path.with_suffix, SIDE_FILES)]
+        return any(file.suffix.lower() in {".dng", *CAMERA_FILES} and file.exists() for file in files)
     except (TableError, OSError, ValueError):
         return False
 

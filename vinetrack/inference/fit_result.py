@@ -145,7 +145,7 @@ class ParameterMap:
         return np.array([number.scale for number in self.free])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
-        """Model parameters and yield pressures of every trial for scaled parameters. Returns rows, yields (naN where
+        """Model parameters and yield pressures of every trial for scaled parameters. Returns rows, yields (NaN where
         the value in the sheet applies). Shapes: theta (n_free,) → (n_trials, n_parameters).
         """
         rows = self.base.copy()

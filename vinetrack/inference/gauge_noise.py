@@ -393,7 +393,7 @@ class Growth:
 
 
 def polynomial_along(t: Floats, growth_m: Floats, time_degree: int, growth_degree: int) -> Floats:
-    """Powers of time and of growth. Returns the first column is 1. Shapes: t, growth_m (n,) → (n, bent + along + 1)."""
+    """Powers of time and of growth. The first column is 1. Shapes: t, growth_m (n,) → (n, bent + along + 1)."""
     return np.column_stack(
         [*(t**k for k in range(time_degree + 1)), *(growth_m**k for k in range(1, growth_degree + 1))]
     )

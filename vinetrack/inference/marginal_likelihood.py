@@ -521,7 +521,7 @@ def estimate_between_trial_sd(
 ) -> tuple[float, float]:
     """Between-trial standard deviations that maximise the restricted (or marginal) likelihood. The likelihood may have
     two maxima, since pressure and B can explain the same variation. So the search starts from the best of a grid and
-    the current values. Returns (float, float).
+    the current values.
     """
     from scipy.optimize import minimize
 

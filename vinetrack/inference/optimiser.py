@@ -119,9 +119,7 @@ def variance_floor(data: Sequence[FitTrial]) -> Floats:
 
 
 def estimable(problem: MixedProblem) -> tuple[bool, bool]:
-    """Whether there are enough trials to estimate the between-trial standard deviations of pressure and of ln B.
-    Returns (bool, bool).
-    """
+    """Whether there are enough trials to estimate the between-trial standard deviations of pressure and of ln B."""
     # 3: A between-trial standard deviation is estimated where it applies to this many more trials than there are
     # parameters without a prior (chosen)
     needed = np.count_nonzero(problem.prior_precision == 0) + 3

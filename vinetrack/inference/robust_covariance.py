@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.marginal_likelihood import (
     by_parameter,
@@ -403,8 +404,8 @@ def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics)
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
     """The clusters of trials whose errors may be correlated: specimens, else days, else single trials."""
-    for column in ("specimen", "day"):
-        names = [f"{trial.vine}, {trial.specimen}" if column == "specimen" else trial.day for trial in trials]
+    for column in GROUPINGS:
+        names = [trial.group(column) for trial in trials]
         if all(getattr(trial, column) for trial in trials) and len(set(names)) >= FEWEST_CLUSTERS:
             return names
     return [str(i) for i in range(len(trials))]  # Not their names: a planned trial may be there several times

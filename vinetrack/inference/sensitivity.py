@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.equations import ENDED
 from vinetrack.dynamics.kernel import Batch, Trace, lay_out, starts_of
-from vinetrack.dynamics.model import Model, check_needs, trial_inputs, with_pressures
+from vinetrack.dynamics.model import Model, check_needs, with_pressures
 from vinetrack.dynamics.simulate import (
     SimulationError,
     Trajectory,
@@ -28,6 +28,7 @@ from vinetrack.dynamics.simulate import (
     simulate_many,
     trajectories,
 )
+from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, ParameterMap
 from vinetrack.inference.whitening import all_products
@@ -220,7 +221,7 @@ class Predictor:
             [self.damping_column >= 0 and trial_data.trial.travel_ratio != 1 for trial_data in data], dtype=bool
         )
         check_needs(model, *(trial_data.trial for trial_data in data))
-        self.inputs = np.array([trial_inputs(trial_data.trial) for trial_data in data], dtype=float)
+        self.inputs = np.array([TrialInputs.of(trial_data.trial) for trial_data in data], dtype=float)
         self.bends = [bends_of(trial_data.trial) for trial_data in data]
         transformed = any(
             {"true_time", "observed_position", "row_delay", "averaged_over"} & set(effect.functions) for effect in model

@@ -264,7 +264,7 @@ def with_fitted_trace_errors(
 ) -> tuple[Predictor, Solution]:
     """A solution with the errors of the recorded pressures estimated, and the predictor of the corrected pressures. A
     poor model would distort the pressures: its trials keep the recorded ones. So do trials whose trace is no curve: the
-    errors of local lines are not known in detail. `how` are options of `solve`. Returns predictor, Solution.
+    errors of local lines are not known in detail. `how` are options of `solve`.
     """
     if not any(_has_errors(trial_data) for trial_data in predictor.data):
         return predictor, solution

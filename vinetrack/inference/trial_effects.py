@@ -57,9 +57,8 @@ def products_at_releases(
 ) -> Floats:
     """Whitened cross products of the columns and residual of a trial for each candidate release. Equivalent to
     `whitening.whiten` and a matrix product for each release. Curves are interpolated linearly, and constant beyond the
-    ends of the grid. Returns the last column is the residual. Shapes: time_s, position_m, first, relative_sd
-    (n_points,); releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) → (n_releases, n_columns,
-    n_columns).
+    ends of the grid. The last column is the residual. Shapes: time_s, position_m, first, relative_sd (n_points,);
+    releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) → (n_releases, n_columns, n_columns).
     """
     count, size, last = len(curves), len(time_s), len(grid_s) - 1
     begins = math.sqrt(1 - rho**2)

@@ -250,14 +250,12 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         return [f"{what}: no further trial within `limits` can be made and filmed."]
     count = len(plan.trials)
     lines = [f"To detect {what} with {percent(plan.target)} power ({percent(plan.before)} with the trials so far):"]
-    # Columns of the rig that a further trial may change, as printed
-    rig = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
     rows = []
     for cells, group in groupby(plan.trials, key=lambda trial: sheet_cells(trial.trial)):
         alike = list(group)
         added, kPa, grams = alike[0], cells.get("pressure_kPa", math.nan), cells.get("payload_g", 0.0)
         new = ["a new vine"] if added.new_vine else []
-        new += [f"{rig.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
+        new += [f"{(c := COLUMNS[name]).quantity} {cells.get(name, math.nan):g} {c.unit}" for name in added.changed]
         then = percent(alike[-1].probability)
         rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", then))
     if rows and plan.after > plan.before:
@@ -686,13 +684,10 @@ def fails_most_text(
 
 def drift_condition(column: str) -> tuple[str, str, float]:
     """Return name, unit and factor from SI of a condition that a parameter may drift with."""
-    return {
-        "pressure_Pa": ("pressure", "kPa", 1e-3),
-        "payload_kg": ("payload", "g", 1e3),
-        "growth_angle_rad": ("growth angle", "°", 180 / math.pi),
-        "chamber_m3": ("chamber volume", "l", 1e3),
-        "inlet_m": ("inlet", "mm", 1e3),
-    }.get(column, (column.replace("_", " "), "", 1.0))
+    for known in COLUMNS.values():
+        if known.field == column and known.scale:
+            return known.quantity, known.unit, known.scale.from_si(1.0)
+    return column.replace("_", " "), "", 1.0
 
 
 def drift_text(

@@ -15,9 +15,8 @@ from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
-    BETWEEN_SUMMARIES,
+    BETWEEN,
     BETWEEN_TRIALS,
-    DAY,
     MISSING,
     N_BY_VINE,
     NOT_TESTABLE,
@@ -50,12 +49,12 @@ if TYPE_CHECKING:
 
 def trials_differ(names: Sequence[str]) -> bool:
     """Whether every name of an answer set is a difference between trials."""
-    return bool(names) and all(name in BETWEEN_SUMMARIES for name in names)
+    return bool(names) and all(name in BETWEEN for name in names)
 
 
 def difference_headline(names: Sequence[str]) -> str:
     """The differences between trials of an answer set, each in a clause."""
-    return " or ".join(BETWEEN_SUMMARIES[name] for name in names)
+    return " or ".join(BETWEEN[name].summary for name in names)
 
 
 def difference_in_words(result: LikelihoodRatio) -> str:
@@ -85,22 +84,13 @@ def difference_in_words(result: LikelihoodRatio) -> str:
     return f"{name}s differ {' and '.join(parts)}"
 
 
-# What to do about each difference between trials
-BETWEEN_REMEDIES = {
-    N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
-    ORDER_DRIFT: "Repeat six trials in random order, number all in the column `order`, and read the gauge at each",
-    SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
-    DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
-}
-
-
 def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = ()) -> str:
     """What to do about the differences between trials in an answer set; blank where there are none."""
     trials = [trial.trial for trial in step.tests.fit.trials]
     names = [result.names[-1] for result in answers or step.answer_set if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""
-    text = "".join(f" {BETWEEN_REMEDIES[name]}." for name in names)
+    text = "".join(f" {BETWEEN[name].remedy}." for name in names)
     if ORDER_DRIFT not in names and SPECIMEN not in names:
         return text
     _, stated = trial_order(trials)

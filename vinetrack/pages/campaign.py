@@ -23,6 +23,7 @@ from vinetrack.diagnosis.ladder import compare
 from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
+from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
@@ -222,12 +223,12 @@ def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
 
     kept: list[str] = []
     for key in dict.fromkeys(key for settings in written.values() for key in settings):
-        sizes = ("diameter", "thickness", "length")
+        sizes = [name for name in LIMITED["choice"] if name not in RIG]
         # A size that those before determine is left out.
         before = [other for other in kept if other in sizes] if key in sizes else []
         if told_apart([*before, key]) > told_apart(before):
             kept.append(key)
-    told = kept or ["pressure"]
+    told = kept or ["pressure_kPa"]
     labels = {name: ", ".join(of[key] for key in told if of.get(key)) or name for name, of in written.items()}
     named = list(labels.values())
     # Conditions that differ in another setting get their name appended.
@@ -235,19 +236,13 @@ def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
 
 
 def _settings(trial: Trial) -> dict[str, str]:
-    """Settings that may distinguish conditions, in the units of the sheet."""
-    numbers = {
-        "diameter": (1e3 * trial.diameter_m, "mm"),
-        "thickness": (1e6 * trial.thickness_m, "µm"),
-        "length": (1e3 * trial.length_m, "mm long"),
-        "pressure": (trial.pressure_Pa / 1e3, "kPa"),
-        "payload": (1e3 * trial.payload_kg if trial.payload_kg else math.nan, "g"),
-        "angle": (math.degrees(trial.growth_angle_rad), "°"),
-        "chamber": (1e3 * trial.chamber_m3, "L"),
-        "inlet": (1e3 * trial.inlet_m, "mm inlet"),
-        "bends": (len(trial.bends) if trial.bends else math.nan, "bends"),
-    }
-    return {key: f"{value:.3g} {unit}" for key, (value, unit) in numbers.items() if math.isfinite(value)}
+    """Settings that may distinguish conditions, by column of the sheet and in its units; no payload is none."""
+    texts = {"bends": f"{len(trial.bends)} bends"} if trial.bends else {}
+    for name, column in COLUMNS.items():
+        if column.limit and math.isfinite(value := column.of_trial(trial)) and (value or name != "payload_g"):
+            which = f" {column.quantity}" if name in RIG or name == "length_mm" else ""
+            texts[name] = f"{value:.3g} {column.unit}{which}"
+    return texts
 
 
 # ------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import END_FRACTION, Floats, Trial, plain_track
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
-from vinetrack.experiment.schema import COLUMNS, with_names
+from vinetrack.experiment.schema import COLUMNS, RIG, with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, ParameterMap
@@ -111,17 +111,14 @@ def conditions_by_effort(
         yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
-# Columns of the sheet that describe a rig, with their fields of a trial
-RIG_FIELDS = {"chamber_l": "chamber_m3", "inlet_mm": "inlet_m", "growth_angle_deg": "growth_angle_rad"}
-
-
 def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
-    return tuple(column for column, name in RIG_FIELDS.items() if not _alike(rig, before, [name]))
+    return tuple(column for column, name in RIG.items() if not _alike(rig, before, [name]))
 
 
 def _typical_trials(trials: Sequence[Trial]) -> list[int]:
     """Index of a typical trial of each everting vine: the first with its commonest rig and yield pressure."""
-    rigs = [(trial.vine, trial.yield_pressure_Pa, trial.chamber_m3, trial.inlet_m, trial.bends) for trial in trials]
+    shown = ("vine", "yield_pressure_Pa", "bends", *RIG.values())
+    rigs = [tuple(getattr(trial, name) for name in shown) for trial in trials]
     texts = [repr(rig) for rig in rigs]
     places = []
     for vine in dict.fromkeys(trial.vine for trial in trials if trial.travel_ratio != 1):
@@ -155,7 +152,7 @@ def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int,
         rig = replace(vine, chamber_m3=chamber, inlet_m=inlet, growth_angle_rad=angle)
         changes = len(_changed(rig, vine))
         if changes == 0 or not inlet > vine.diameter_m:
-            at_hand = any(_alike(rig, trial, tuple(RIG_FIELDS.values())) for trial in used)
+            at_hand = any(_alike(rig, trial, tuple(RIG.values())) for trial in used)
             rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
     fewest = min((changed for changed, _, _ in rigs), default=0)
     return [(effort, rig) for changed, effort, rig in rigs if changed <= max(1, fewest)]
