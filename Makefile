@@ -12,7 +12,7 @@ help:  ## this list
 venv: $(STAMP)  ## .venv with the locked version of everything, extras included
 
 demo: $(STAMP)  ## 24 recordings, made in the virtual laboratory on first use, to results/demo/report.html
-	@$(BIN)/snakemake --cores $(CORES)
+	@$(BIN)/vinetrack run data/demo --cores $(CORES)
 
 guide: demo  ## outputs and pictures of the docs, printed and drawn anew from the demonstration
 	$(BIN)/python benchmarks/guide_pages.py

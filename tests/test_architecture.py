@@ -58,7 +58,7 @@ BUDGETS = {
     "narrative": (1877, 3, 12),
     "pages": (3362, 8, 24),
     "paper": (842, 3, 15),
-    "pipeline": (3139, 10, 13),
+    "pipeline": (3139, 10, 14),
     "planning": (2391, 5, 18),
     "report": (747, 2, 3),
     "results": (252, 2, 8),

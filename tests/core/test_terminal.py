@@ -28,7 +28,7 @@ def test_nothing_is_shown_where_nobody_looks(capfd: pytest.CaptureFixture[str]) 
     assert list(progress(["a", "b"], "trials")) == ["a", "b"]
     with progress(2, "steps", unit="step") as bar, waiting("fitting"):
         bar.advance()
-        bar.reach(2, 2)
+        bar.reach(2, 2, "trials")
         bar.begin("fitting the model")
-        bar.reach(1, 3)
+        bar.reach(1, 3, "clips")
     assert capfd.readouterr() == ("", "")

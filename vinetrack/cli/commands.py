@@ -17,7 +17,7 @@ import typer
 
 from vinetrack.cli.options import MORE, START, Answer, command
 from vinetrack.core.problems import UserError
-from vinetrack.pipeline.stages import STAGES, Job, Stage
+from vinetrack.pipeline.stages import STAGES, Job, Stage, compilation_told
 
 if TYPE_CHECKING:
     from vinetrack.pipeline.predict_stage import PredictionRequest
@@ -45,7 +45,7 @@ def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
     from vinetrack.core.terminal import waiting
     from vinetrack.pipeline.overlays_stage import track_file
 
-    with waiting(f"tracking {recording.name}"):
+    with waiting(f"tracking {recording.name}"), compilation_told(say):
         return (), track_file(recording, say, **options)
 
 
@@ -60,14 +60,15 @@ def _check(experiment: Path) -> Answer:
 
 
 @command()
-def _run(folder: Path, cores: int, results: Path | None, say: Say) -> Answer:
+def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say) -> Answer:
     """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
     from vinetrack.pipeline.workflow import check_before_run, run_chain, run_lines, run_paths
     from vinetrack.results.folder_layout import Results, read_json
 
     paths = run_paths(folder, results)
-    check_before_run(paths, say)
-    run_chain(paths, cores, say)
+    with compilation_told(say):
+        check_before_run(paths, say)
+    run_chain(paths, cores, say, verbose)
     made = Results(paths.results)
     content = {"results": made.folder, "report": made.report, "diagnosis": read_json(made.diagnosis)}
     return run_lines(made.folder), content
@@ -215,12 +216,11 @@ def _request(options: dict[str, Any], **more: Any) -> PredictionRequest:
     ),
     yield_pressure_kPa=YIELD_MEANING,
 )
-def _predict(sheet: Path | None, json: Path | None, options: dict[str, Any]) -> Answer:
+def _predict(sheet: Path | None, options: dict[str, Any]) -> Answer:
     """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
     from vinetrack.pipeline.predict_stage import predict_conditions
 
-    request = _request(options, sheet=sheet)
-    return predict_conditions(request, json=json, **options), None
+    return predict_conditions(_request(options, sheet=sheet), **options)
 
 
 @command(

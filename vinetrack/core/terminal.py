@@ -96,9 +96,9 @@ class Progress(Generic[Item]):
         """Show other work, of unknown length until `reach` says more."""
         self._bar.reset(self._task, description=description, total=None)
 
-    def reach(self, done: int, total: int) -> None:
-        """Set the number of completed steps, and of how many."""
-        self._bar.update(self._task, completed=done, total=total)
+    def reach(self, done: int, total: int, what: str) -> None:
+        """Set the number of completed steps, of how many, and of what."""
+        self._bar.update(self._task, completed=done, total=total, description=what)
 
     def __iter__(self) -> Iterator[Item]:
         with self:

@@ -163,10 +163,8 @@ def draw_over(
 
 def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
     """Return the shift of each frame along the axis by camera shake, px, shape (n_frames,); 0 at rest."""
-    shake_px = np.zeros(n_frames)
     stored_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
-    shake_px[: stored_px.size] = stored_px
-    return shake_px
+    return np.pad(stored_px, (0, n_frames - stored_px.size))
 
 
 def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
@@ -224,7 +222,19 @@ def track_file(
     try:
         recording = inspect_recording(_recording_path(path))
         rate = _capture_fps(recording, capture_fps)
-        recording_facts = _recording_facts(recording, rate)
+        n_frames = recording.declared_frames
+        recording_facts = {
+            "recording": recording.path,
+            "width_px": recording.width,
+            "height_px": recording.height,
+            "bit_depth": recording.bit_depth,
+            "declared_frames": n_frames,
+            "playback_fps": recording.playback_fps,
+            "capture_fps": rate,
+            "capture_fps_from_file": recording.capture_fps is not None,
+            "exposure_us": math.nan if recording.exposure_s is None else 1e6 * recording.exposure_s,
+            "duration_s": math.nan if n_frames is None else n_frames / rate,
+        }
         for line in _recording_lines(recording_facts):
             say(line)
         trial = Trial(
@@ -299,22 +309,6 @@ def _capture_fps(recording: Recording, given_fps: float) -> float:
             f"{stated_fps:g}; leave --capture-fps out"
         )
     return stated_fps
-
-
-def _recording_facts(recording: Recording, rate: float) -> dict[str, Any]:
-    n_frames = recording.declared_frames
-    return {
-        "recording": recording.path,
-        "width_px": recording.width,
-        "height_px": recording.height,
-        "bit_depth": recording.bit_depth,
-        "declared_frames": n_frames,
-        "playback_fps": recording.playback_fps,
-        "capture_fps": rate,
-        "capture_fps_from_file": recording.capture_fps is not None,
-        "exposure_us": math.nan if recording.exposure_s is None else 1e6 * recording.exposure_s,
-        "duration_s": math.nan if n_frames is None else n_frames / rate,
-    }
 
 
 def _recording_lines(facts: dict[str, Any]) -> list[str]:

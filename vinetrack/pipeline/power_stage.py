@@ -6,6 +6,7 @@ import difflib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,6 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.campaign_power import (
     CampaignDesign,
-    SimulatedDiagnosis,
     design_of_fit,
     fitted_tests,
     planned_tests,
@@ -279,12 +279,8 @@ def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator
     with progress(len(wanted) * len(seeds), "simulating", unit="campaign") as bar:
         for effect, values, predicted_rate in wanted:
             diagnoses = []
-            tasks = [(campaign.design, effect, values, seed) for seed in seeds]
-            for answer in map_unordered(_diagnosed, tasks, request.jobs):
+            work = partial(simulated_diagnosis, campaign.design, effect, values)
+            for answer in map_unordered(work, seeds, request.jobs):
                 diagnoses.append(answer)
                 bar.advance()
             yield rates_of(diagnoses, values[0], predicted_rate)
-
-
-def _diagnosed(task: tuple[CampaignDesign, str, tuple[float, ...], int]) -> SimulatedDiagnosis:
-    return simulated_diagnosis(*task)

@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems, remark
 from vinetrack.core.records import Trial
-from vinetrack.core.tables import STANDARD_OUTPUT, write_csv, write_json
+from vinetrack.core.tables import write_csv
 from vinetrack.core.terminal import progress, table, waiting
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE
@@ -59,10 +59,6 @@ from vinetrack.planning.predictive_inputs import (
     read_sizes,
 )
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
-
-if TYPE_CHECKING:
-    pass
-
 
 # ------------------------------------------------------------------------------
 # Choice of the fit from which predictions are made; a model that the diagnosis refuted is not used silently.
@@ -243,9 +239,8 @@ def predict_conditions(
     at_fraction: float,
     figure: Path | None = None,
     csv: Path | None = None,
-    json: Path | None = None,
-) -> list[str]:
-    """Predict all conditions; write figure, curves and JSON if requested."""
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Predict all conditions; write figure and curves if requested. Returns lines, and JSON content."""
     import pandas as pd
 
     check_figure(figure)
@@ -265,10 +260,7 @@ def predict_conditions(
     if csv is not None:
         write_csv(csv, pd.concat([entry.prediction.curve for entry in entries], ignore_index=True))
         lines.append(f"Curves: {csv}")
-    if json is not None:
-        write_json(json, [_json_entry(entry) for entry in entries])
-        lines.append(f"All numbers: {json}")
-    return [] if json == STANDARD_OUTPUT else lines
+    return lines, [_json_entry(entry) for entry in entries]
 
 
 def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
@@ -447,22 +439,14 @@ def design_vine(
     if figure is not None:
         write_figure(draw_choice(choices), figure)
         lines.append(f"Figure: {figure}")
-    return lines, {"warnings": basis.heading, "films": [_choice_entry(choice) for choice in choices]}
-
-
-def _choice_entry(choice: Choice) -> dict[str, Any]:
-    """Return the fastest vine of one film as JSON content, units in the keys."""
-    trial, final = choice.prediction.inputs.trial, choice.prediction.final
-    speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
-    return {
-        "thickness_um": 1e6 * trial.thickness_m,
-        "diameter_mm": 1e3 * trial.diameter_m,
-        "length_mm": 1e3 * trial.length_m,
-        "pressure_kPa": trial.pressure_Pa / 1e3,
-        "final_speed_m_s": speed,
-        "fastest_in_share_of_draws": choice.odds,
-        "limited_by": list(choice.limits),
-    }
+    entries = []
+    for choice in choices:
+        trial, final = choice.prediction.inputs.trial, choice.prediction.final
+        entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION}
+        speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
+        chosen = {"fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)}
+        entries.append({**entry, "final_speed_m_s": speed, **chosen})
+    return lines, {"warnings": basis.heading, "films": entries}
 
 
 def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:

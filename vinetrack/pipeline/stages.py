@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -53,7 +54,8 @@ class Stage:
     def run(self, job: Job) -> list[str]:
         """Do the job; return lines for the terminal."""
         module, name = self.function.split(":")
-        lines: list[str] = getattr(import_module(f"vinetrack.pipeline.{module}"), name)(job)
+        with compilation_told(job.say):
+            lines: list[str] = getattr(import_module(f"vinetrack.pipeline.{module}"), name)(job)
         return lines
 
 
@@ -119,6 +121,29 @@ STAGES = {
         "report written",
     ),
 }  # fmt: skip
+
+
+COMPILING = "compiling for this machine, once (half a minute)"
+
+
+@contextmanager
+def compilation_told(say: Callable[[str], None]) -> Iterator[None]:
+    """Say so when code is first compiled meanwhile; what was compiled before is kept, so mostly nothing is said."""
+    from numba.core import event
+
+    class Listener(event.Listener):
+        is_told = False
+
+        def on_start(self, _: object) -> None:
+            if not self.is_told:
+                say(COMPILING)
+            self.is_told = True
+
+        def on_end(self, _: object) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Listener()):
+        yield
 
 
 # ------------------------------------------------------------------------------

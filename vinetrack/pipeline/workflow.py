@@ -26,7 +26,7 @@ from vinetrack.core.problems import ExperimentError, Problem, UserError, format_
 from vinetrack.core.tables import is_readable, write_text
 from vinetrack.core.terminal import Progress, progress
 from vinetrack.figures.registry import figures_of
-from vinetrack.pipeline.stages import STAGES, Stage
+from vinetrack.pipeline.stages import COMPILING, STAGES, Stage
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -453,8 +453,8 @@ def check_before_run(paths: RunPaths, say: Say) -> None:
         say(line)
 
 
-def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
-    """Run Snakemake on an experiment; show a progress bar on a terminal, and one line per stage elsewhere."""
+def run_chain(paths: RunPaths, cores: int, say: Say, verbose: bool = False) -> None:
+    """Run Snakemake on an experiment; show a progress bar on a terminal, a line per stage elsewhere, or all it says."""
     if paths.results.is_dir():
         _locked(paths.results).release()  # refused, if another running process writes there
     log = paths.results / "logs" / "run.log"
@@ -464,26 +464,27 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     write_text(config_file, json.dumps({"experiment": str(paths.experiment), "results": str(paths.results)}))
     command = [
         sys.executable, "-m", "snakemake", "--snakefile", str(PACKAGE / "pipeline" / "Snakefile"),
-        "--directory", str(paths.results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--quiet", "all",
-        "--configfile", str(config_file),
+        "--directory", str(paths.results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--configfile",
+        str(config_file), *([] if verbose else ["--quiet", "all"]),
     ]  # fmt: skip
     bar: Progress[None]
     # Its standard output is what the stages say, since Snakemake itself is quiet; in a process of its own it stops its
     # jobs itself when the user interrupts the run.
     with (
-        log.open("w", encoding="utf-8") as errors,
+        open(2, "w", closefd=False) if verbose else log.open("w", encoding="utf-8") as shown,
         subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=errors, env=os.environ | {RUN: "1"}, text=True, encoding="utf-8"
+            command, stdout=subprocess.PIPE, stderr=shown, env=os.environ | {RUN: "1"}, encoding="utf-8"
         ) as process,
         progress(0, "trials") as bar,
     ):
         assert process.stdout is not None
-        finished = {stage.done for stage in STAGES.values()}
+        told = {COMPILING, *(stage.done for stage in STAGES.values())}
         for line in map(str.rstrip, process.stdout):
-            if match := re.fullmatch(r"(\d+) of (\d+) \w+", line):  # what a stage says while it works
-                bar.reach(int(match[1]), int(match[2]))
-            elif line in finished:
+            if match := re.fullmatch(r"(\d+) of (\d+) (\w+)", line):  # what a stage says while it works
+                bar.reach(int(match[1]), int(match[2]), match[3])
+            elif line in told:
                 say(line)
+                told -= {COMPILING}
             else:
                 bar.begin(line)
     if process.returncode:
