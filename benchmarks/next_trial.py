@@ -69,7 +69,6 @@ TIES = (
         rig={"tail_store": "reel"},
         note="reel, same rig",
     ),
-    Tie("leak", {"leak.rate": 0.5}, "reservoir_depletion", pressures_kPa=(28.0,), replicates=8),
     Tie("fold_inertia", {"fold_inertia.eta": 0.4}, "linear_damping"),
 )
 
