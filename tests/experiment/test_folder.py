@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from hand_sheet import GOOD, HEADER, TRACK, one, stopped, two_vines, write
 
 import vinetrack as vt
 from vinetrack.core.problems import Problem, format_problems
-from vinetrack.core.records import Bend, Trial
+from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.experiment.folder import Experiment, check_experiment, read_experiment
 from vinetrack.pipeline.effects_stage import model_problems
 
@@ -28,36 +30,26 @@ def test_a_row_becomes_a_trial_in_si_units(folder: Path) -> None:
         return {name: value for name, value in vars(trial).items() if value == value}  # NaN equals nothing
 
     experiment = read_experiment(folder)
+    a, b = experiment.trials
     expected = Trial(
-        name="a",
-        vine="24mm-200um-280mm",
-        condition="24mm-200um-280mm_28kPa_35.6g",
-        track=folder / "a.csv",
-        diameter_m=0.024,
-        thickness_m=200e-6,
-        length_m=0.28,
-        pressure_Pa=28e3,
-        pressure_sigma_Pa=280.0,
-        yield_pressure_Pa=3e3,
-        yield_pressure_sigma_Pa=200.0,
-        payload_kg=0.0356,
-    )
-    assert known(experiment.trials[0]) == known(expected)
-    assert experiment.trials[1].payload_kg == 0.0
-    assert experiment.problems == ()
-
-
-def test_optional_columns_in_si_units(folder: Path) -> None:
+        name="a", vine="24mm-200um-280mm", condition="24mm-200um-280mm_28kPa_35.6g", track=folder / "a.csv",
+        diameter_m=0.024, thickness_m=200e-6, length_m=0.28, pressure_Pa=28e3, pressure_sigma_Pa=280.0,
+        yield_pressure_Pa=3e3, yield_pressure_sigma_Pa=200.0, payload_kg=0.0356,
+    )  # fmt: skip
+    assert known(a) == known(expected)
+    assert (b.payload_kg, experiment.problems) == (0.0, ())
     cells = {"capture_fps": "1000", "exposure_us": "100", "growth_angle_deg": "90", "chamber_l": "3.7", "inlet_mm": "6"}
     cells |= {"bends": "100:30:20;200:50:25", "film_density_kg_m3": "1180", "mm_per_px": "0.37", "steady": "0.05:0.2"}
-    (trial,) = one(folder, **cells, pressure_sigma_kPa="0.5", yield_pressure_sigma_kPa="0.1").trials
-    optics = (trial.capture_fps, trial.exposure_s, trial.m_per_px)
-    assert optics == pytest.approx((1000, 1e-4, 0.37e-3))
-    supply = (trial.chamber_m3, trial.inlet_m, trial.pressure_sigma_Pa, trial.yield_pressure_sigma_Pa)
-    assert supply == pytest.approx((3.7e-3, 6e-3, 500, 100))
-    assert (trial.growth_angle_rad, trial.film_density_kg_m3) == pytest.approx((math.pi / 2, 1180))
-    assert trial.bends == (Bend(0.1, 0.03, 0.02), Bend(0.2, 0.05, 0.025))
-    assert trial.steady_window_s == (0.05, 0.2)
+    cells |= {"pressure_sigma_kPa": "0.5", "yield_pressure_sigma_kPa": "0.1", "frames_used": "5:15", "order": "9"}
+    cells |= {"axis": "161,40:170,300:151.5,799:20", "specimen": "tube 1", "day": "monday"}
+    expected = replace(
+        expected, capture_fps=1000.0, exposure_s=1e-4, growth_angle_rad=math.pi / 2, chamber_m3=3.7e-3, inlet_m=6e-3,
+        bends=(Bend(0.1, 0.03, 0.02), Bend(0.2, 0.05, 0.025)), film_density_kg_m3=1180.0, m_per_px=0.37e-3,
+        steady_window_s=(0.05, 0.2), pressure_sigma_Pa=500.0, yield_pressure_sigma_Pa=100.0, frames_used=(5, 15),
+        order=9.0, axis=PictureAxis((161.0, 40.0), (151.5, 799.0), 0.02, ((170.0, 300.0),)), specimen="tube 1",
+        day="monday",
+    )  # fmt: skip
+    assert known(one(folder, **cells).trials[0]) == known(expected)
 
 
 def test_shared_settings_fill_blank_cells_and_a_cell_overrides_them(folder: Path) -> None:
@@ -162,14 +154,12 @@ def test_a_video_needs_its_rate_of_capture_but_dng_frames_carry_their_own(folder
     assert (experiment.trials[0].video, experiment.problems) == (folder / "frames", ())
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_a_rate_of_playback_is_suspected(folder: Path, shared: bool) -> None:
+def test_a_rate_of_playback_is_suspected(folder: Path) -> None:
     """30 fps is legal, but nobody films a vine at it."""
-    settings, cell = ("capture_fps: 30\n", "") if shared else ("", "30")
-    experiment = one(folder, settings, track=None, video="a.mp4", capture_fps=cell)
-    assert [trial.capture_fps for trial in experiment.trials] == [30]
-    (problem,) = experiment.problems
-    assert (problem.severity, problem.file) == ("warning", "experiment.yaml" if shared else "trials.csv")
+    for file, settings, cell in (("experiment.yaml", "capture_fps: 30\n", ""), ("trials.csv", "", "30")):
+        experiment = one(folder, settings, track=None, video="a.mp4", capture_fps=cell)
+        assert [trial.capture_fps for trial in experiment.trials] == [30]
+        assert [(problem.severity, problem.file) for problem in experiment.problems] == [("warning", file)]
 
 
 def test_a_falling_ball_needs_a_diameter_only(folder: Path) -> None:
@@ -181,7 +171,7 @@ def test_a_falling_ball_needs_a_diameter_only(folder: Path) -> None:
     assert experiment.problems == ()
 
 
-def test_a_blank_pressure_comes_from_the_track_or_the_trace(folder: Path) -> None:
+def test_a_blank_pressure_comes_from_the_track_or_the_trace_or_fails_the_trial(folder: Path) -> None:
     lines = [line + f",{27.94 - i / 10}" for i, line in enumerate(TRACK.splitlines()[1:])]
     (folder / "b.csv").write_text("time_s,position_m,pressure_kPa\n" + "\n".join(lines))
     (folder / "p.csv").write_text("time_s,pressure_kPa\n0,13.96\n0.1,13\n")
@@ -189,26 +179,16 @@ def test_a_blank_pressure_comes_from_the_track_or_the_trace(folder: Path) -> Non
         (trial,) = one(folder, pressure_kPa="", **cells).trials
         assert (trial.pressure_Pa, trial.pressure_sigma_Pa) == pytest.approx((pressure_Pa, 0.01 * pressure_Pa))
     assert trial.pressure_trace == folder / "p.csv"
-
-
-@pytest.mark.parametrize(
-    "trace", [None, "time_s,pressure_kPa\n0,-3\n", "time_s,pressure_kPa\n", "time_s,pressure_psi\n0,3\n"]
-)
-def test_a_blank_pressure_without_a_measured_one_fails_the_trial(folder: Path, trace: str | None) -> None:
-    if trace:
+    assert list(one(folder, pressure_kPa="").failed) == ["a"]
+    for trace in ("time_s,pressure_kPa\n0,-3\n", "time_s,pressure_kPa\n", "time_s,pressure_psi\n0,3\n"):
         (folder / "p.csv").write_text(trace)
-    assert list(one(folder, pressure_kPa="", pressure_trace="p.csv" if trace else "").failed) == ["a"]
+        assert list(one(folder, pressure_kPa="", pressure_trace="p.csv").failed) == ["a"], trace
 
 
-@pytest.mark.parametrize(
-    ("setting", "expected_m"),
-    [("", math.nan), ("position_systematic_mm: 0.25", 2.5e-4), ("position_systematic_mm: 0", 0)],
-)
-def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_stated(
-    folder: Path, setting: str, expected_m: float
-) -> None:
-    (folder / "experiment.yaml").write_text(setting + "\n")
-    assert read_experiment(folder).trials[0].position_systematic_m == pytest.approx(expected_m, nan_ok=True)
+def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_stated(folder: Path) -> None:
+    for setting, expected_m in (("", math.nan), ("_systematic_mm: 0.25", 2.5e-4), ("_systematic_mm: 0", 0)):
+        trial = one(folder, f"position{setting}\n" if setting else "").trials[0]
+        assert trial.position_systematic_m == pytest.approx(expected_m, nan_ok=True)
 
 
 @pytest.mark.slow
@@ -253,11 +233,18 @@ def test_check_names_the_trial_whose_track_is_wrong(folder: Path, content: str |
     assert (problem.severity, problem.trial, problem.column) == ("error", "b", "track")
 
 
+def filmed(folder: Path, videos: dict[str, str], files: Iterable[str], settings: str = "", aside: str = "") -> Path:
+    """A sheet of recordings by trial, that one put aside, and the files that are there."""
+    for name in files:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"film")
+    rows = [f"{name},{video},24,200,280,28,3,,{'no' * (name == aside)}\n" for name, video in videos.items()]
+    return write(folder, f"{HEADER.replace('track', 'video')},use\n{''.join(rows)}", settings)
+
+
 def test_check_looks_at_videos_and_calls_who_can_open_them(folder: Path) -> None:
-    (folder / "a.mp4").write_bytes(b"film")
+    filmed(folder, {name: f"{name}.mp4" for name in "abc"}, ["a.mp4"], "capture_fps: 1000\n")
     (folder / "b.mp4").write_bytes(b"")
-    rows = "".join(f"{name},{name}.mp4,24,200,280,28,3,\n" for name in "abc")
-    write(folder, f"{HEADER.replace('track', 'video')}\n{rows}", "capture_fps: 1000\n")
     opened: list[str] = []
 
     def open_videos(experiment: Experiment, trials: list[Trial]) -> list[Problem]:
@@ -275,44 +262,33 @@ def test_check_looks_at_videos_and_calls_who_can_open_them(folder: Path) -> None
 
 
 def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder: Path) -> None:
-    for name in ("d12_24kPa_1.mp4", "d12_24kPa_2.MP4", "notes.txt"):
-        (folder / name).write_bytes(b"film")
-    rows = "a,d12_24kPa_1.mp4,24,200,280,28,3,\nb,d12_24kP_2.mp4,24,200,280,28,3,\nc,other.avi,24,200,280,28,3,\n"
-    write(folder, f"{HEADER.replace('track', 'video')}\n{rows}", "capture_fps: 1000\n")
+    videos = {"a": "d12_24kPa_1.mp4", "b": "d12_24kP_2.mp4", "c": "other.avi"}
+    filmed(folder, videos, ("d12_24kPa_1.mp4", "d12_24kPa_2.MP4", "notes.txt"), "capture_fps: 1000\n")
     remedies = {problem.trial: problem.remedy for problem in check_experiment(folder) if problem.trial}
     assert remedies == {"b": "did you mean d12_24kPa_2.MP4?", "c": "check the path and its upper and lower case"}
 
 
 def test_a_recording_that_no_row_names_is_named(folder: Path) -> None:
-    burst = [f"burst/{i}.png" for i in range(5)]
-    for name in ("a.mp4", "left.mov", "day 2/extra.avi", "calibration/board.mp4", "target.mp4", *burst):
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_bytes(b"film")
-    rows = "a,./a.mp4,24,200,280,28,3,,\nb,left.mov,24,200,280,28,3,,no\n"
+    files = ["a.mp4", "left.mov", "day 2/extra.avi", "calibration/board.mp4", "target.mp4"]
+    files += [f"burst/{i}.png" for i in range(5)]
     target = "calibration: {kind: checkerboard, image: target.mp4, squares: [5, 5], square_mm: 5}\n"
-    write(folder, f"{HEADER.replace('track', 'video')},use\n{rows}", "capture_fps: 1000\n" + target)
+    videos = {"a": "./a.mp4", "b": "left.mov"}
+    filmed(folder, videos, files, "capture_fps: 1000\n" + target, aside="b")
     (problem,) = check_experiment(folder)
     assert (problem.severity, problem.file, problem.column) == ("warning", "trials.csv", "video")
     assert problem.message.endswith(" burst, day 2/extra.avi")
-    more = "c,burst/0.png,24,200,280,28,3,,\nd,day 2/extra.avi,24,200,280,28,3,,\n"
-    write(folder, f"{HEADER.replace('track', 'video')},use\n{rows}{more}")
+    filmed(folder, videos | {"c": "burst/0.png", "d": "day 2/extra.avi"}, files, "capture_fps: 1000\n" + target, "b")
     assert check_experiment(folder) == []
 
 
 def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(folder: Path) -> None:
-    for name in "ab":
-        (folder / f"{name}.mp4").write_bytes(b"film")
-    rows = "".join(f"{name},{name}.mp4,24,200,280,28,3,\n" for name in "ab")
-    write(folder, f"{HEADER.replace('track', 'video')}\n{rows}", "capture_fps: 60\n")
+    filmed(folder, {"a": "a.mp4", "b": "b.mp4"}, ("a.mp4", "b.mp4"), "capture_fps: 60\n")
 
     def slow(_experiment: Experiment, trials: list[Trial]) -> list[Problem]:
         return [Problem("playback", "is the rate of playback", "capture_fps", trial=trial.name) for trial in trials]
 
     found = check_experiment(folder, slow)
-    assert [(problem.file, problem.line, problem.trial) for problem in found] == [
-        ("experiment.yaml", 0, "a"),
-        ("experiment.yaml", 0, "b"),
-    ]
+    assert [(one.file, one.line, one.trial) for one in found] == [("experiment.yaml", 0, name) for name in "ab"]
     assert format_problems(found) == ["error: experiment.yaml, trial a and 1 more: capture_fps is the rate of playback"]
 
 
@@ -324,20 +300,13 @@ def test_a_missing_column_stops_the_experiment_with_one_problem(folder: Path, co
     assert [problem.code for problem in stopped(folder) if problem.column == column] == ["missing"]
 
 
-@pytest.mark.parametrize(
-    ("settings", "column", "code"),
-    [
-        ("calibration: {kind: checkerboard, image: c.png, squares: [5, 5], square_mm: 5}\n", "calibration.image", True),
-        ("calibration: {kind: checkerboard, image: ../a.png, squares: [5, 5], square_mm: 5}", "", False),
-        ("effects: [/home/me/drag.py]", "", False),
-    ],
-)
-def test_files_of_the_settings_are_there_and_inside(folder: Path, settings: str, column: str, code: bool) -> None:
-    write(folder, GOOD, settings)
-    (problem,) = check_experiment(folder)
-    assert problem.file == "experiment.yaml"
-    assert not column or (problem.column, problem.code) == (column, "no_file")
-    assert code or stopped(folder)
+def test_files_of_the_settings_are_there_and_inside(folder: Path) -> None:
+    target = "calibration: {kind: checkerboard, image: %s, squares: [5, 5], square_mm: 5}\n"
+    (problem,) = check_experiment(write(folder, GOOD, target % "c.png"))
+    assert (problem.file, problem.column, problem.code) == ("experiment.yaml", "calibration.image", "no_file")
+    for settings in (target % "../a.png", "effects: [/home/me/drag.py]"):
+        (problem,) = check_experiment(write(folder, GOOD, settings))
+        assert (problem.file, stopped(folder)) == ("experiment.yaml", (problem,))
 
 
 def test_all_problems_of_sheet_and_settings_come_at_once(folder: Path) -> None:
@@ -359,18 +328,16 @@ BASE = "pressure_drive, gravity, eversion_damping, yield_pressure"
 
 
 @pytest.mark.parametrize(
-    ("settings", "column"),
+    ("settings", "columns"),
     [
-        ("", ""),
-        (f"model: [{BASE}, air_drag]\n", ""),
-        (f"model: [{BASE}, air_drg]\n", "model"),
-        ("candidates: [leek]\n", "candidates"),
-        (f"model: [{BASE}, reservoir_depletion]\n", "model"),  # it needs `chamber_l`
-        ("effects: [not_there.py]\n", ""),
-        ("modle: [gravity]\n", ""),
+        (f"model: [{BASE}, air_drag]\n", []),
+        (f"model: [{BASE}, air_drg]\n", ["model"]),
+        ("candidates: [leek]\n", ["candidates"]),
+        (f"model: [{BASE}, reservoir_depletion]\n", ["model"]),  # it needs `chamber_l`
+        ("effects: [not_there.py]\n", []),
+        ("modle: [gravity]\n", []),
     ],
 )
-def test_names_in_the_settings_are_looked_up(folder: Path, settings: str, column: str) -> None:
-    (folder / "experiment.yaml").write_text(settings, encoding="utf-8")
-    found = [(problem.file, problem.column) for problem in model_problems(folder)]
-    assert found == ([("experiment.yaml", column)] if column else [])
+def test_names_in_the_settings_are_looked_up(folder: Path, settings: str, columns: list[str]) -> None:
+    found = [(problem.file, problem.column) for problem in model_problems(write(folder, GOOD, settings))]
+    assert found == [("experiment.yaml", column) for column in columns]

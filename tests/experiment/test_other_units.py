@@ -14,25 +14,18 @@ from vinetrack.experiment.schema import COLUMNS, Column
 PSI = 6894.757293168361
 
 
-def test_psi_bar_and_inches_become_kpa_and_millimetres(tmp_path: Path) -> None:
-    own = {"diameter_in": "1", "pressure_psi": "4", "yield_pressure_bar": "0.03", "payload_oz": "2"}
-    read = one(tmp_path, diameter_mm=None, pressure_kPa=None, yield_pressure_kPa=None, payload_g=None, **own)
+def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path: Path) -> None:
+    own = {"diameter_in": "1", "pressure_psi": "4", "payload_oz": "2", "diameter_mm": None, "pressure_kPa": None}
+    read = one(tmp_path, "yield_pressure_psi: 0.435\n", yield_pressure_kPa=None, payload_g=None, **own)
     (trial,) = read.trials
     assert trial.diameter_m == pytest.approx(0.0254, rel=1e-14)
-    assert trial.pressure_Pa == pytest.approx(4 * PSI, rel=1e-14)
-    assert trial.yield_pressure_Pa == pytest.approx(3000, rel=1e-14)
     assert trial.payload_kg == pytest.approx(0.05669904625, rel=1e-14)
+    assert (trial.pressure_Pa, trial.yield_pressure_Pa) == pytest.approx((4 * PSI, 0.435 * PSI), rel=1e-12)
     said = {problem.column: problem for problem in read.problems}
     assert {(problem.code, problem.severity) for problem in said.values()} == {("unit", "warning")}
+    assert said.keys() == {"diameter_in", "pressure_psi", "payload_oz", "yield_pressure_psi"}
     assert "6.89476" in said["pressure_psi"].message
-
-
-def test_a_key_of_the_settings_in_another_unit_is_converted_and_said(tmp_path: Path) -> None:
-    read = one(tmp_path, "yield_pressure_psi: 0.435\n", yield_pressure_kPa=None)
-    assert read.trials[0].yield_pressure_Pa == pytest.approx(0.435 * PSI, rel=1e-12)
-    (problem,) = read.problems
-    assert (problem.code, problem.file, problem.line) == ("unit", "experiment.yaml", 1)
-    assert problem.column == "yield_pressure_psi"
+    assert (said["yield_pressure_psi"].file, said["yield_pressure_psi"].line) == ("experiment.yaml", 1)
 
 
 def test_the_bounds_hold_after_conversion_and_of_two_units_that_with_a_value_counts(tmp_path: Path) -> None:

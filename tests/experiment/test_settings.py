@@ -11,7 +11,6 @@ from pydantic import BaseModel
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import read_yaml
-from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.experiment.reference import reference_content, reference_page, setting_entries
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import ExperimentSettings, RunSettings, read_experiment_settings, run_settings
@@ -29,13 +28,6 @@ def draft_problems(tmp_path: Path, text: str) -> tuple[Problem, ...]:
     with pytest.raises(ExperimentError) as caught:
         read(tmp_path, text)
     return caught.value.problems
-
-
-def test_no_file_gives_the_defaults(tmp_path: Path) -> None:
-    settings = read_experiment_settings(tmp_path / "experiment.yaml")
-    assert settings.model == ("pressure_drive", "gravity", "eversion_damping", "yield_pressure") == BASE_EFFECTS
-    assert (settings.ambient_pressure_kPa, settings.tail_slack, settings.mass_loss) == (101.325, "taut", "geometric")
-    assert (settings.candidates, settings.strict, settings.calibration) == (None, False, None)
 
 
 def test_settings_cover_exactly_the_columns_of_the_sheet() -> None:
@@ -124,11 +116,6 @@ def test_the_shipped_config_holds_every_key_at_its_default() -> None:
     content = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
     shipped = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in content.items()}
     assert shipped == _keys(RunSettings)
-
-
-def test_a_run_may_override_one_key() -> None:
-    settings = run_settings({"experiment": 2024, "damping": {"seed": 7}})
-    assert (settings.experiment, settings.damping.seed, settings.damping.resamples) == ("2024", 7, 2000)
 
 
 @pytest.mark.parametrize(
