@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 from collections.abc import Iterator
@@ -31,12 +32,10 @@ from vinetrack.video.curved_axis import axis_through
 
 
 def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    names = (
-        "run 10.mp4,run 2.MOV,notes.txt,.hidden.mp4,board.png,calibration/board.mp4,two/1.png,two/2.png,monday/a.avi"
-    )
-    names += ",trials.csv,corrections.csv,p 10.csv,p 2.csv,traces/a.csv"
-    results = "results/provenance.json", "results/overlay.mp4", "results/trials.csv"
-    for name in (*names.split(","), *results, *(f"burst/{i:03d}.png" for i in range(5))):
+    names = "run 10.mp4,run 2.MOV,notes.txt,.hidden.mp4,board.png,calibration/board.mp4,two/1.png,two/2.png"
+    names += ",monday/a.avi,trials.csv,corrections.csv,p 10.csv,p 2.csv,traces/a.csv"
+    names += ",results/provenance.json,results/overlay.mp4,results/trials.csv"
+    for name in (*names.split(","), *(f"burst/{i:03d}.png" for i in range(5))):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
     assert list_recordings(tmp_path) == ["burst", "monday/a.avi", "run 2.MOV", "run 10.mp4"]
@@ -44,31 +43,27 @@ def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of
     assert list_tables(tmp_path) == ["p 2.csv", "p 10.csv", "traces/a.csv"]
 
 
-@pytest.mark.parametrize(
-    ("name", "cells"),
-    [
-        ("d12_24kPa_1.mp4", {"diameter_mm": "12", "pressure_kPa": "24"}),
-        ("D12 24KPA run 3.mov", {"diameter_mm": "12", "pressure_kPa": "24"}),
-        ("24mm-200um-280mm_30.5kPa_20g.mp4", {
-            "diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30.5", "payload_g": "20",
-        }),
-        ("d0p5in_4psi.mp4", {"diameter_in": "0.5", "pressure_psi": "4"}),
-        ("p36_m20_l280_t100_2.avi", {
-            "pressure_kPa": "36", "payload_g": "20", "length_mm": "280", "thickness_um": "100",
-        }),
-        ("l28cm 1000fps.mp4", {"length_cm": "28", "capture_fps": "1000"}),
-        ("d12/24kPa/1.mp4", {"diameter_mm": "12", "pressure_kPa": "24"}),
-        ("d12/d24_1.mp4", {"diameter_mm": "24"}),
-        ("GX010042.mp4", {}),
-        ("2024-05-01 17.22.mp4", {}),
-        ("day3_tube2.mp4", {"day": "3", "specimen": "2"}),
-    ],
-)  # fmt: skip
-def test_a_name_says(name: str, cells: dict[str, str]) -> None:
-    assert columns_from_names([name]) == [cells]
+NAMES = {
+    "d12_24kPa_1.mp4": {"diameter_mm": "12", "pressure_kPa": "24"},
+    "D12 24KPA run 3.mov": {"diameter_mm": "12", "pressure_kPa": "24"},
+    "24mm-200um-280mm_30.5kPa_20g.mp4": {
+        "diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30.5", "payload_g": "20",
+    },
+    "d0p5in_4psi.mp4": {"diameter_in": "0.5", "pressure_psi": "4"},
+    "p36_m20_l280_t100_2.avi": {
+        "pressure_kPa": "36", "payload_g": "20", "length_mm": "280", "thickness_um": "100",
+    },
+    "l28cm 1000fps.mp4": {"length_cm": "28", "capture_fps": "1000"},
+    "d12/24kPa/1.mp4": {"diameter_mm": "12", "pressure_kPa": "24"},
+    "d12/d24_1.mp4": {"diameter_mm": "24"},
+    "GX010042.mp4": {},
+    "2024-05-01 17.22.mp4": {},
+    "day3_tube2.mp4": {"day": "3", "specimen": "2"},
+}  # fmt: skip
 
 
-def test_a_unit_that_all_names_share_is_kept_and_mixed_ones_are_converted() -> None:
+def test_a_name_says_cells_and_a_unit_that_all_share_is_kept_while_mixed_ones_are_converted() -> None:
+    assert {name: columns_from_names([name]) for name in NAMES} == {name: [cells] for name, cells in NAMES.items()}
     assert columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
     assert columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
 
@@ -77,35 +72,29 @@ SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
 SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def test_a_folder_of_recordings_gets_both_files_with_blanks_and_a_sheet_that_is_there_keeps_its_cells(
+    tmp_path: Path,
+) -> None:
     for name in ("a.mp4", "d12_30kPa_1.mp4"):
         (tmp_path / name).write_bytes(b"x")
-    return tmp_path
-
-
-def test_a_folder_of_recordings_gets_both_files_with_blanks(folder: Path) -> None:
+    sheet, settings = tmp_path / "trials.csv", tmp_path / "experiment.yaml"
     lines: list[str] = []
-    write_templates(folder, lines.append)
-    rows = read_table(folder / "trials.csv").rows
-    assert [(row["diameter_mm"], row["pressure_kPa"]) for row in rows] == [("", ""), ("12", "30")]
-    assert (folder / "experiment.yaml").read_text() == first_settings()
+    write_templates(tmp_path, lines.append)
+    assert [(row["diameter_mm"], row["pressure_kPa"]) for row in read_table(sheet).rows] == [("", ""), ("12", "30")]
+    assert settings.read_text() == first_settings()
     assert any("capture_fps" in line and "calibration" in line for line in lines if line.startswith("To fill in"))
 
-
-def test_a_sheet_that_is_there_keeps_every_cell_and_gains_a_row(folder: Path) -> None:
-    (folder / "trials.csv").write_text(SHEET)
-    (folder / "experiment.yaml").write_text(SETTINGS)
-    write_templates(folder, lambda _line: None)
-    text = (folder / "trials.csv").read_text()
+    sheet.write_text(SHEET)
+    settings.write_text(SETTINGS)
+    write_templates(tmp_path, lines.append)
+    text = sheet.read_text()
     assert text.startswith("trial;video;pressure_kPa;note")
     assert "old;a.mp4;24,5;keep me" in text
     assert "d12_30kPa_1;d12_30kPa_1.mp4;30" in text
-    assert (folder / "experiment.yaml").read_text() == SETTINGS
-    # Cells without a column would be lost.
-    (folder / "trials.csv").write_text("trial,video\nold,a.mp4,stray\n")
+    assert settings.read_text() == SETTINGS
+    sheet.write_text("trial,video\nold,a.mp4,stray\n")  # cells without a column would be lost
     with pytest.raises(ExperimentError):
-        open_draft(folder)
+        open_draft(tmp_path)
 
 
 def test_shared_values_are_set_in_place_and_in_the_unit_chosen() -> None:
@@ -237,13 +226,11 @@ def server(clips: Path) -> Iterator[SetupServer]:
 def ask(
     server: SetupServer, path: str, body: Any = None, headers: dict[str, str] = OURS, secret: str | None = None
 ) -> tuple[int, bytes, str]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)
-    request = ("GET", None) if body is None else ("POST", json.dumps(body))
-    connection.request(request[0], (server.secret if secret is None else secret) + path, request[1], headers)
-    answer = connection.getresponse()
-    made = answer.status, answer.read(), answer.getheader("Content-Type") or ""
-    connection.close()
-    return made
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)) as connection:
+        method, data = ("GET", None) if body is None else ("POST", json.dumps(body))
+        connection.request(method, (server.secret if secret is None else secret) + path, data, headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read(), answer.getheader("Content-Type") or ""
 
 
 def test_the_page_frames_and_the_axis_along_the_tube_are_served(server: SetupServer) -> None:
@@ -256,9 +243,7 @@ def test_the_page_frames_and_the_axis_along_the_tube_are_served(server: SetupSer
     axis = json.loads(ask(server, "/api/clip?recording=d15%2024kPa%201.mp4")[1])["axis"]
     assert axis["to_px"][0] - axis["from_px"][0] > 300
     assert [axis["from_px"][1], axis["to_px"][1]] == pytest.approx([80, 80], abs=1.5)
-
-
-def test_a_curve_is_drawn_as_the_tracker_lays_it(server: SetupServer) -> None:
+    # A curve is drawn as the tracker lays it.
     made = json.loads(ask(server, "/api/curve?points=20,80;200,90;440,80")[1])
     along, across = axis_through([(20, 80), (200, 90), (440, 80)]).along_and_across(np.array(made["path_px"]))
     assert np.abs(across).max() < 0.01
@@ -294,14 +279,11 @@ def test_saving_writes_two_files_and_no_file_that_changed_meanwhile(server: Setu
     assert (clips / "experiment.yaml").read_text() == "chamber_l: 2\n"
 
 
-@pytest.mark.parametrize("headers", [{"Host": "elsewhere.example"}, {**OURS, "Origin": "http://elsewhere.example"}])
-def test_requests_from_other_pages_are_refused(server: SetupServer, clips: Path, headers: dict[str, str]) -> None:
-    assert ask(server, "/api/save", sent(clips), headers)[0] == 403
+def test_other_pages_names_and_requests_without_the_secret_get_nothing(server: SetupServer, clips: Path) -> None:
+    for headers in ({"Host": "elsewhere.example"}, {**OURS, "Origin": "http://elsewhere.example"}):
+        assert ask(server, "/api/save", sent(clips), headers)[0] == 403
     assert not (clips / "trials.csv").exists()
-
-
-@pytest.mark.parametrize("path", ["/", "/setup.js", "/api/state", "/api/frame?recording=a.mp4&frame=0"])
-def test_nothing_is_served_under_another_name_or_without_the_secret(server: SetupServer, path: str) -> None:
     assert len(server.secret) > 20
-    assert ask(server, path, headers={"Host": f"evil.example:{server.server_port}"})[0] == 403
-    assert ask(server, path, secret="")[0] == 403
+    for path in ("/", "/setup.js", "/api/state", "/api/frame?recording=a.mp4&frame=0"):
+        assert ask(server, path, headers={"Host": f"evil.example:{server.server_port}"})[0] == 403
+        assert ask(server, path, secret="")[0] == 403
