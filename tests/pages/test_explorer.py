@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
@@ -122,28 +123,19 @@ def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
     assert abs(int(np.argmax(film.picture(10)[48] < 120)) - 100) <= 1
 
 
-def view(angle: float = 0.0) -> RecordingView:
+def test_edges_stand_across_the_axis_where_the_track_and_the_shake_put_them() -> None:
     frames = np.arange(20.0)
     edge_px = np.where(frames < 15, 10 + 5 * frames, np.nan)
-    return RecordingView(
-        path=Path("a.mp4"),
-        axis=Axis((100.0, 50.0), (100.0 + 300 * float(np.cos(angle)), 50.0 + 300 * float(np.sin(angle)))),
-        half_width_px=10.0,
-        time_s=frames / 1000,
-        edge_px=edge_px,
-        lead_position_m=1e-3 * (edge_px - 10),
-        shake_px=np.where(frames == 3, 2.0, 0.0),
-        by_hand=frames == 4,
-    )
-
-
-def test_edges_stand_across_the_axis_where_the_track_and_the_shake_put_them() -> None:
-    one = view()
+    one = RecordingView(
+        Path("a.mp4"), Axis((100.0, 50.0), (400.0, 50.0)), 10.0, frames / 1000, edge_px, 1e-3 * (edge_px - 10),
+        shake_px=np.where(frames == 3, 2.0, 0.0), by_hand=frames == 4,
+    )  # fmt: skip
     along = one.along_px(np.array([0.0, 0.0125, 0.1, -0.01]))
     np.testing.assert_allclose(along, [10.0, 22.5, 110.0, 0.0], atol=1e-9)
     assert one.across(20.0, 4) == ((120.0, 120.0), (60.0, 40.0))
     assert one.across(20.0, 3) == one.across(22.0, 4)
-    np.testing.assert_allclose(view(angle=np.pi / 2).across(20.0, 4), ((90.0, 110.0), (70.0, 70.0)))
+    upright = replace(one, axis=Axis((100.0, 50.0), (100.0, 350.0)))
+    np.testing.assert_allclose(upright.across(20.0, 4), ((90.0, 110.0), (70.0, 70.0)))
 
 
 def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campaign, tmp_path: Path) -> None:
@@ -185,56 +177,39 @@ def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign,
     assert open_campaign(tmp_path / "results", campaign.experiment.folder).conditions == campaign.conditions
 
 
-async def _origin_of_elsewhere(address: str) -> None:
-    request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Origin": "http://example.org"})
-    with pytest.raises(HTTPClientError, match="403"):
-        await websocket_connect(request)
-
-
 @pytest.mark.slow
 def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign: Campaign) -> None:
+    async def from_elsewhere() -> None:
+        request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Origin": "http://example.org"})
+        with pytest.raises(HTTPClientError, match="403"):
+            await websocket_connect(request)
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        own = "127.0.0.2"  # without a listener, where this machine has no other address
+        with contextlib.suppress(OSError):
+            probe.connect(("192.0.2.1", 9))
+            own = str(probe.getsockname()[0])
     with Served(campaign.folder, "--port", "0") as served:
         address = served.address
         with urllib.request.urlopen(address, timeout=60) as answer:
-            page = answer.read().decode("utf-8")
-        assert "vinetrack explorer" in page
-        port = urlsplit(address).port
-        with pytest.raises(OSError, match="refused"), socket.create_connection((_own_address(), port), timeout=5):
-            pass
-        IOLoop(make_current=False).run_sync(lambda: _origin_of_elsewhere(address))
+            assert "vinetrack explorer" in answer.read().decode("utf-8")
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection((own, urlsplit(address).port), timeout=5)
+        IOLoop(make_current=False).run_sync(from_elsewhere)
         assert served.interrupt() == 0
     assert served.lines[-1] == "Explorer ended."
     assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
 
 
-async def _answers(address: str, host: str) -> int:
-    client = AsyncHTTPClient()
-    return (await client.fetch(HTTPRequest(address, headers={"Host": host}), raise_error=False)).code
+def test_no_route_answers_under_another_name_or_without_the_secret() -> None:
+    def status(address: str, host: str) -> int:
+        request = HTTPRequest(address, headers={"Host": host})
+        return server.io_loop.run_sync(lambda: AsyncHTTPClient().fetch(request, raise_error=False)).code
 
-
-@pytest.fixture
-def bare_server():
     server = start_server(None, 0)
-    yield server
+    port = server.port
+    for route in ("", "ws", "autoload.js?bokeh-autoload-element=a", "static/js/bokeh.min.js", "metadata"):
+        for name in ("evil.example", f"evil.example:{port}", "127.0.0.1", f"localhost.evil.example:{port}"):
+            assert status(where(server) + route, name) == 403
+        assert status(f"http://127.0.0.1:{port}/{route}", f"127.0.0.1:{port}") == 404
     server.stop()
-
-
-@pytest.mark.parametrize(
-    "route", ["", "ws", "autoload.js?bokeh-autoload-element=a", "static/js/bokeh.min.js", "metadata"]
-)
-def test_no_route_answers_under_another_name_or_without_the_secret(bare_server, route: str) -> None:
-    port, answer = bare_server.port, bare_server.io_loop.run_sync
-    for name in ("evil.example", f"evil.example:{port}", "127.0.0.1", f"localhost.evil.example:{port}"):
-        assert answer(lambda name=name: _answers(where(bare_server) + route, name)) == 403
-    own = f"127.0.0.1:{port}"
-    assert answer(lambda: _answers(f"http://{own}/{route}", own)) == 404
-
-
-def _own_address() -> str:
-    """An address of this machine other than the loopback address, or else one without a listener."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))
-        except OSError:
-            return "127.0.0.2"
-        return str(probe.getsockname()[0])
