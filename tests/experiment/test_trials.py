@@ -190,9 +190,9 @@ def test_a_yield_pressure_that_is_not_given_is_not_known() -> None:
 
 
 def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path: Path) -> None:
-    header, *rows = GOOD.splitlines()
-    more = [rows[0].replace("a,a.csv", "c,c.csv"), rows[1].replace("b,b.csv", "d,d.csv")]
-    sheet = "\n".join([header + ",use", *(row + "," for row in (*rows, more[0])), more[1] + ",no"]) + "\n"
+    header, a, b = GOOD.splitlines()
+    more = a.replace("a,a", "c,a"), b.replace("b,b.csv,24", "d,b.csv,30")
+    sheet = f"{header},use\n{a},\n{b},\n{more[0]},\n{more[1]},no\n"
     trials = planned_sheet(write(two_vines(tmp_path), sheet)).trials
     assert [trial.name for trial in trials] == ["a", "b"]
 

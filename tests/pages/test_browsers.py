@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,17 +26,12 @@ ROW = "48 * 960, 49 * 960"  # the middle of the bar in the picture
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def visitor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visitor]:
     folder = tmp_path_factory.mktemp("browser")
     experiment = make_experiment(folder / "vines")
     results = make_results(experiment, folder / "results" / "vines")
     film_of(experiment, results, FILMED)
-    return experiment, results
-
-
-@pytest.fixture(scope="module")
-def visitor(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visitor]:
-    with Served(folders[1], "--port", "0") as served, Chrome(tmp_path_factory.mktemp("chrome")) as chrome:
+    with Served(results, "--port", "0") as served, Chrome(folder / "chrome") as chrome:
         opened = Visitor(chrome, served.address)
         yield opened
         assert chrome.complaints == []
@@ -46,33 +40,31 @@ def visitor(folders: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
         assert all(request.startswith(("http://127.0.0.1:", "ws://127.0.0.1:")) for request in asked)
 
 
-def errors(visitor: Visitor, column: str = "now") -> np.ndarray:
-    return np.array(visitor.value("error_bars", f"data.{column}"), dtype=float)
-
-
-def test_dragging_a_slider_moves_the_curves_continuously(visitor: Visitor) -> None:
+def test_dragging_a_slider_moves_the_curves_continuously_and_a_refit_brings_the_error_down(visitor: Visitor) -> None:
     """Each of thirty moves is drawn before the release; `benchmarks/explorer_speed.py` measures the delay."""
+
+    def errors(column: str = "now") -> np.ndarray:
+        return np.array(visitor.value("error_bars", f"data.{column}"), dtype=float)
+
     visitor.until("$numbers.text.includes('<table>')", "the fit of the model in use", 300)
-    before = errors(visitor)
+    before = errors()
     visitor.time_redraws(SIZE)
     visitor.drag(SIZE, [*np.linspace(-0.03, -0.6, 20), *np.linspace(-0.57, -0.3, 10)], visitor.one_redraw)
     assert len(visitor.redraws_ms()) > 20
     assert visitor.value("tick_reservoir_depletion", "active")
-    assert np.abs(errors(visitor) - before).max() > 0.1
+    assert np.abs(errors() - before).max() > 0.1
     assert "reservoir depletion" in visitor.text("headline")
 
-
-def test_an_effect_ticked_and_refitted_brings_the_error_down(visitor: Visitor) -> None:
     visitor.click("as_fitted")
     visitor.until("!$tick_reservoir_depletion.active", "what was dragged to go")
     visitor.until("!$headline.text.includes('reservoir depletion')", "the model in use to be drawn again")
-    before = errors(visitor)
+    before = errors()
     visitor.click("tick_reservoir_depletion", "input")
     visitor.until("$status.text.includes('refitting')", "progress", 20)
     visitor.until("$refit.label === 'Refit' && $numbers.text.includes('1 parameter more')", "the fit", 240)
     # Of the mean square error that replicates do not explain, a tenth is left at most.
-    floor = np.mean(errors(visitor, "floor") ** 2)
-    assert np.mean(errors(visitor) ** 2) - floor < 0.1 * (np.mean(before**2) - floor)
+    floor = np.mean(errors("floor") ** 2)
+    assert np.mean(errors() ** 2) - floor < 0.1 * (np.mean(before**2) - floor)
     assert "vinetrack add reservoir_depletion" in visitor.text("commands")
 
 
@@ -161,29 +153,18 @@ class Person:
         self.said("#status", said)
 
 
-@contextmanager
-def at_the_page(address: str, folder: Path) -> Iterator[Person]:
-    with Chrome(folder / "chrome") as chrome:
-        yield Person(chrome, address)
+@pytest.fixture(params=[pytest.param(False, id="here")])
+def person(clips: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Person]:
+    """A page served by this process, so that the server is not restarted for every test, or else by the command."""
+    serving = Served(clips, "--port", "0", command="setup") if request.param else served_here(clips)
+    with serving as server, Chrome(tmp_path / "chrome") as chrome:
+        yield Person(chrome, server.address)
         assert [text for text in chrome.complaints if "422" not in text] == []
 
 
-@pytest.fixture
-def person(clips: Path, tmp_path: Path) -> Iterator[Person]:
-    """A page served by this process, so that the server is not restarted for every test."""
-    with served_here(clips) as server, at_the_page(server.address, tmp_path) as made:
-        yield made
-
-
-@pytest.fixture
-def person_who_typed_the_command(clips: Path, tmp_path: Path) -> Iterator[Person]:
-    with Served(clips, "--port", "0", command="setup") as served, at_the_page(served.address, tmp_path) as made:
-        yield made
-
-
-def test_a_folder_of_clips_becomes_an_experiment(person_who_typed_the_command: Person, clips: Path) -> None:
+@pytest.mark.parametrize("person", [True], indirect=True)
+def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) -> None:
     """The whole way: four shared values, two ruler marks, one length, a check, a track, and a save."""
-    person = person_who_typed_the_command
     for column, value in SHARED.items():
         person.fill(column, "shared", value)
     person.press("input[name=tool][value=scale]")
@@ -256,7 +237,7 @@ def test_a_frame_is_corrected_and_the_file_contains_the_correction(person: Perso
     person.said("#moved-points", "to the former axis")
 
 
-def test_every_control_is_reached_by_tab_and_has_a_name(person: Person) -> None:
+def test_every_control_is_reached_by_tab_and_eight_hundred_pixels_are_enough_in_both_schemes(person: Person) -> None:
     seen = set()
     for count in range(160):
         if count % 10 == 0:
@@ -268,16 +249,13 @@ def test_every_control_is_reached_by_tab_and_has_a_name(person: Person) -> None:
     named = ("Save", "capture fps, all trials", "pressure, d15_24kPa_1", "Start of the growth axis", "Track this one")
     assert all(words in joined for words in named)
     assert "INPUT" not in seen
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_eight_hundred_pixels_are_enough_in_both_schemes(person: Person, scheme: str) -> None:
-    person.chrome.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-    person.chrome.size(800, 900)
-    assert person.chrome.run("document.documentElement.scrollWidth") <= 800
-    back = person.chrome.run("getComputedStyle(document.body).backgroundColor")
-    brightness = sum(int(part) for part in str(back).strip("rgb()").split(",")[:3]) / 3
-    assert brightness > 200 if scheme == "light" else brightness < 60
+    for scheme in ("light", "dark"):
+        person.chrome.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        person.chrome.size(800, 900)
+        assert person.chrome.run("document.documentElement.scrollWidth") <= 800
+        back = person.chrome.run("getComputedStyle(document.body).backgroundColor")
+        brightness = sum(map(int, back.strip("rgb()").split(",")[:3])) / 3
+        assert brightness > 200 if scheme == "light" else brightness < 60
 
 
 def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(person: Person) -> None:

@@ -15,9 +15,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from bokeh.document import Document
+from bokeh.events import ButtonClick
+from chrome import until
 from explorer_campaign import DEMO, SETTINGS, SMALL, make_experiment, make_results, run, write_diagnosis
 from own_effect import write_effect
-from page_browser import Browser
 
 from vinetrack.diagnosis.ladder import compare
 from vinetrack.effects import remember
@@ -25,13 +27,43 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_data import FitError
 from vinetrack.pages import controls
 from vinetrack.pages.campaign import BackgroundFit, Campaign
-from vinetrack.pages.page import open_campaign
+from vinetrack.pages.page import Page, open_campaign
 from vinetrack.pages.plots import RecordingView
 from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
 from vinetrack.video.axis import Axis
 
 GAMMA = "size_reservoir_depletion.gamma"
+
+
+class Browser:
+    """In place of a browser: a document whose callbacks are run by hand."""
+
+    def __init__(self, background: BackgroundFit, reopen: Callable[[BackgroundFit], None] | None = None) -> None:
+        self.document = Document()
+        self.page = Page(background, self.document, reopen)
+        self.turn()
+
+    def model(self, name: str) -> Any:
+        found = self.document.get_model_by_name(name)
+        assert found is not None, name
+        return found
+
+    def text(self, name: str) -> str:
+        return str(self.model(name).text)
+
+    def turn(self) -> None:
+        """Run all pending callbacks once."""
+        for callback in list(self.document.session_callbacks):
+            if type(callback).__name__ != "PeriodicCallback":
+                self.document.callbacks.remove_session_callback(callback)
+                callback.callback()
+
+    def until(self, asked: Callable[[], bool], seconds: float = 240) -> None:
+        until(lambda: asked() or self.turn(), "the page", seconds)
+
+    def click(self, name: str) -> None:
+        self.model(name)._trigger_event(ButtonClick(self.model(name)))
 
 
 def fitted(campaign: Campaign) -> BackgroundFit:
@@ -51,10 +83,6 @@ def browser(background: BackgroundFit) -> Iterator[Browser]:
     opened = Browser(background)
     yield opened
     opened.page.close()
-
-
-def error_of(browser: Browser) -> list[float]:
-    return list(browser.model("error_bars").data["now"])
 
 
 def test_a_slider_adds_its_effect_and_moves_the_curves(browser: Browser) -> None:
@@ -88,14 +116,14 @@ def test_conditions_and_trials_can_be_chosen(browser: Browser) -> None:
 
 
 def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) -> None:
-    before, said = error_of(browser), browser.text("headline")
+    before, said = list(browser.model("error_bars").data["now"]), browser.text("headline")
     browser.model("tick_reservoir_depletion").active = True
     browser.turn()
     assert browser.text("headline") == said
     assert browser.model("refit").label == "Stop"
     browser.until(lambda: browser.model("refit").label == "Refit")
     browser.turn()
-    assert all(now < was for now, was in zip(error_of(browser), before, strict=True))
+    assert all(now < was for now, was in zip(browser.model("error_bars").data["now"], before, strict=True))
     found = browser.text("found_reservoir_depletion.gamma")
     gamma, *sigma = re.findall(r"[\d.]+", found)[:2]
     # 1.4 is what the trials were grown with, and the largest that a gas can have.
@@ -134,12 +162,12 @@ def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: Backgroun
 def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
     browser: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = error_of(browser)
+    before = list(browser.model("error_bars").data["now"])
     monkeypatch.setattr("vinetrack.pages.page.predict_choice", Mock(side_effect=FitError("Trial a: too hard.")))
     browser.model(GAMMA).value = 1.1
     browser.turn()
     assert "too hard" in browser.text("status")
-    assert error_of(browser) == before
+    assert list(browser.model("error_bars").data["now"]) == before
 
 
 def test_a_recording_that_cannot_be_decoded_is_named_beside_the_positions(
@@ -161,18 +189,14 @@ SIZE = f"size_{EFFECT}.mu_w"
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def numbers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """The page of trials with measured pressures and an effect that is not in the model."""
     folder = tmp_path_factory.mktemp("traced")
     nature = yaml.safe_load(DEMO.read_text(encoding="utf-8"))
     nature |= {"effects": [*nature["effects"], EFFECT], "trace_sigma_kPa": 0.1}
     (folder / "nature.yaml").write_text(yaml.safe_dump(nature), encoding="utf-8")
     experiment = make_experiment(folder / "vines", SMALL, SETTINGS, folder / "nature.yaml")
-    return make_results(experiment, folder / "results" / "vines")
-
-
-@pytest.fixture(scope="module")
-def numbers(results: Path) -> Iterator[Browser]:
-    opened = Browser(fitted(open_campaign(results)))
+    opened = Browser(fitted(open_campaign(make_results(experiment, folder / "results" / "vines"))))
     yield opened
     opened.page.close()
 
@@ -213,8 +237,8 @@ def slide(numbers: Browser, size: float) -> None:
 
 
 @pytest.mark.slow
-def test_every_step_of_a_user_shows_the_errors_of_a_comparison(numbers: Browser, results: Path) -> None:
-    opened = pd.read_csv(results / "comparison.csv")
+def test_every_step_of_a_user_shows_the_errors_of_a_comparison(numbers: Browser) -> None:
+    opened = pd.read_csv(numbers.page.campaign.folder / "comparison.csv")
     assert_shows(numbers, opened, 1e-6)
 
     numbers.model(f"tick_{EFFECT}").active = True
@@ -238,8 +262,9 @@ def test_every_step_of_a_user_shows_the_errors_of_a_comparison(numbers: Browser,
 
 @pytest.mark.slow
 def test_add_finds_what_the_page_finds_and_until_the_next_run_the_page_says_which_model_it_shows(
-    numbers: Browser, results: Path
+    numbers: Browser,
 ) -> None:
+    results = numbers.page.campaign.folder
     numbers.model(f"tick_{EFFECT}").active = True
     settled(numbers)
     on_page = bars_mm(numbers, "now")
@@ -261,8 +286,8 @@ def test_add_finds_what_the_page_finds_and_until_the_next_run_the_page_says_whic
 
 
 @pytest.fixture
-def unexplained(campaign: Campaign, tmp_path: Path) -> Campaign:
-    """A copy of the experiment and its results, diagnosed as `unexplained`."""
+def opened(campaign: Campaign, tmp_path: Path) -> Iterator[tuple[Browser, list[BackgroundFit]]]:
+    """A page of a copy of experiment and results, diagnosed as `unexplained`, and the pages opened in its place."""
     experiment, folder = tmp_path / "vines", tmp_path / "results"
     shutil.copytree(campaign.experiment.folder, experiment)
     shutil.copytree(campaign.folder, folder)
@@ -270,27 +295,21 @@ def unexplained(campaign: Campaign, tmp_path: Path) -> Campaign:
     rounds = [{"model": [], "verdict": "unexplained", "ranking": []}]
     known = {**json.loads(path.read_text()), "verdict": "unexplained", "answer_set": [], "rounds": rounds}
     path.write_text(json.dumps(known), encoding="utf-8")
-    return open_campaign(folder, experiment)
-
-
-@pytest.fixture
-def opened(unexplained: Campaign) -> Iterator[tuple[Browser, list[BackgroundFit]]]:
-    """A page of it, and the pages opened in its place."""
     reopened: list[BackgroundFit] = []
-    browser = Browser(fitted(unexplained), reopened.append)
+    browser = Browser(fitted(open_campaign(folder, experiment)), reopened.append)
     yield browser, reopened
     browser.page.close()
 
 
 @pytest.mark.slow
 def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
-    opened: tuple[Browser, list[BackgroundFit]], unexplained: Campaign, monkeypatch: pytest.MonkeyPatch
+    opened: tuple[Browser, list[BackgroundFit]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser, reopened = opened
-    folder, going_on = unexplained.experiment.folder, threading.Event()
+    folder, going_on = tmp_path / "vines", threading.Event()
 
     def search(experiment: Any, results: Path, to: Path | None, told: Callable[[str], None]) -> WrittenProposal:
-        assert (experiment.folder, results, to) == (folder, unexplained.folder, None)
+        assert (experiment.folder, results, to) == (folder, tmp_path / "results", None)
         told("learning the missing force as a table")
         assert going_on.wait(60)
         path = write_effect(folder)
@@ -299,7 +318,7 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
 
     monkeypatch.setattr(controls, "propose_effect", search)
     assert browser.model("propose_panel").visible
-    assert f"vinetrack propose {unexplained.folder.as_posix()}" in browser.text("proposal")
+    assert f"vinetrack propose {(tmp_path / 'results').as_posix()}" in browser.text("proposal")
     browser.click("propose")
     browser.until(lambda: (browser.page._update_status(), "learning the missing force" in browser.text("proposal"))[1])
     assert browser.model("propose").label == "Stop"
