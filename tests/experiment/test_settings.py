@@ -116,6 +116,7 @@ def test_the_shipped_config_holds_every_key_at_its_default() -> None:
     content = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
     shipped = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in content.items()}
     assert shipped == _keys(RunSettings)
+    assert run_settings({"experiment": 2024}).experiment == "2024"
 
 
 @pytest.mark.parametrize(

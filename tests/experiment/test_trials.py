@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -14,14 +13,7 @@ from hand_sheet import GOOD, HEADER, TRACK, one, two_vines, write
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
-from vinetrack.experiment.folder import (
-    check_experiment,
-    corrections_text,
-    order_pressure_correlation,
-    read_corrections,
-    read_experiment,
-    trial_order,
-)
+from vinetrack.experiment import folder
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.sheet import planned_sheet, planned_trial
 from vinetrack.tracks.importers import TrackError, load_track, read_track
@@ -38,14 +30,14 @@ def corrected(folder: Path, text: str) -> Path:
 
 def test_corrections_reach_their_trial_and_are_written_as_they_are_read(tmp_path: Path) -> None:
     corrected(tmp_path, "trial,frame,action,edge_px\na,12,move,310.5\na,3,drop,\na,40,confirm,\n")
-    trial = read_experiment(tmp_path).trial("a")
+    trial = folder.read_experiment(tmp_path).trial("a")
     assert [(one.frame, one.action) for one in trial.corrections] == [(3, "drop"), (12, "move"), (40, "confirm")]
     assert trial.corrections[1].edge_px == 310.5
     given = {"a": (Correction(3, "drop"), Correction(12, "move", 310.5))}
-    (tmp_path / "corrections.csv").write_text(corrections_text(given))
-    found, problems = read_corrections(tmp_path)
+    (tmp_path / "corrections.csv").write_text(folder.corrections_text(given))
+    found, problems = folder.read_corrections(tmp_path)
     assert problems == []
-    assert corrections_text(found) == corrections_text(given)
+    assert folder.corrections_text(found) == folder.corrections_text(given)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +46,7 @@ def test_corrections_reach_their_trial_and_are_written_as_they_are_read(tmp_path
 def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path, line: str) -> None:
     corrected(tmp_path, f"trial,frame,action,edge_px\n{line}\n")
     with pytest.raises(ExperimentError) as stopped:
-        read_experiment(tmp_path)
+        folder.read_experiment(tmp_path)
     assert "corrections.csv" in {problem.file for problem in stopped.value.problems}
 
 
@@ -153,14 +145,14 @@ def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10
 
 def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path: Path) -> None:
     cells = tuple(f",tube {i % 2},monday,{10 - i}" for i in range(10))
-    trials = read_experiment(written(tmp_path, ",specimen,day,order", cells)).trials
-    ranks, stated = trial_order(trials)
+    trials = folder.read_experiment(written(tmp_path, ",specimen,day,order", cells)).trials
+    ranks, stated = folder.trial_order(trials)
     assert (stated, ranks.tolist()) == (True, list(range(9, -1, -1)))
     assert len({trial.condition for trial in trials}) == 5, "they are replicates all the same"
-    trials = read_experiment(written(tmp_path)).trials
-    ranks, stated = trial_order(trials)
+    trials = folder.read_experiment(written(tmp_path)).trials
+    ranks, stated = folder.trial_order(trials)
     assert (stated, ranks.tolist()) == (False, list(range(10)))
-    assert order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
+    assert folder.order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -176,17 +168,11 @@ def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path: Path) -> N
 def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(
     tmp_path: Path, column: str, cells: tuple[str, ...], codes: list[str]
 ) -> None:
-    found = check_experiment(written(tmp_path, f",{column}" if column else "", cells))
+    found = folder.check_experiment(written(tmp_path, f",{column}" if column else "", cells))
     assert [problem.code for problem in found if problem.column == (column or "order")] == codes
 
 
 VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
-
-
-def test_a_yield_pressure_that_is_not_given_is_not_known() -> None:
-    assert math.isnan(planned_trial(VINE).trials[0].yield_pressure_Pa)
-    given = planned_trial({**VINE, "yield_pressure_kPa": "3"}).trials[0]
-    assert (given.yield_pressure_Pa, given.yield_pressure_sigma_Pa) == (3e3, 200.0)
 
 
 def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path: Path) -> None:

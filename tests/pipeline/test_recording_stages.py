@@ -17,16 +17,6 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge, draw_strip
 from vinetrack.pipeline import overlays_stage
-from vinetrack.pipeline.overlays_stage import (
-    MARGIN_FRAMES,
-    chosen_trials,
-    draw_overlays,
-    edges_to_draw,
-    frames_to_show,
-    overlay_one,
-    playback_rate,
-    position_to_px,
-)
 from vinetrack.pipeline.stages import Job
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video.track import Tracking
@@ -80,10 +70,7 @@ def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_pa
     assert np.allclose(table["position_m"], 0.25e-3 * table["edge_px"])
     assert np.allclose(table["sigma_m"], 0.25e-3 * table["edge_sigma_px"])
     assert np.allclose(table["systematic_m"], 0.25e-3 * table["edge_systematic_px"])
-
-
-@pytest.mark.slow
-def test_scale_is_that_of_the_settings_of_an_experiment(clip: Path, tmp_path: Path) -> None:
+    # Or the scale is that of the settings of an experiment.
     (tmp_path / "experiment.yaml").write_text(
         "calibration: {kind: two_points, from_px: [10, 20], to_px: [410, 20], length_mm: 200}\n"
     )
@@ -155,11 +142,11 @@ def campaign(folder: Path, diagnosed: bool = True) -> tuple[Path, Path]:
 
 def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path: Path) -> None:
     _, results = campaign(tmp_path)
-    path = overlay_one(results, "a")
+    path = overlays_stage.overlay_one(results, "a")
     assert path == results / "overlays" / "a.mp4"
     with av.open(str(path)) as container:
         pictures = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
-    shown = frames_to_show(read_result(Results(results).track("a")))
+    shown = overlays_stage.frames_to_show(read_result(Results(results).track("a")))
     assert len(pictures) == len(shown)
     frame = 35
     picture = pictures[frame - shown.start]
@@ -178,7 +165,7 @@ def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_only_whe
         results = Results(campaign(tmp_path / str(diagnosed), diagnosed)[1])
         if diagnosed:
             pd.read_csv(results.predictions("a")).iloc[5:40].to_csv(results.predictions("a"), index=False)
-        edges, release_s = edges_to_draw("a", results, read_result(results.track("a")))
+        edges, release_s = overlays_stage.edges_to_draw("a", results, read_result(results.track("a")))
         assert [edge.name for edge in edges][: None if not diagnosed else 1] == ["tracked edge"]
         assert release_s == pytest.approx(0.020 if diagnosed else 0.021)
     assert np.flatnonzero(np.isfinite(edges[1].along_px)).tolist() == list(range(5, 40))
@@ -193,46 +180,45 @@ def test_edges_go_along_with_a_shaken_picture(tmp_path: Path, monkeypatch: pytes
         return np.repeat(picture[:, :, None], 3, axis=2)
 
     monkeypatch.setattr("vinetrack.pipeline.overlays_stage.compose", seen)
-    overlay_one(results, "a", seconds=2)
+    overlays_stage.overlay_one(results, "a", seconds=2)
     path, shake_px = results / "analysed" / "a.json", 2.0 * np.sin(np.arange(N))
     content = json.loads(path.read_text())
     content["axis"]["shake_px"] = shake_px.tolist()
     path.write_text(json.dumps(content))
-    overlay_one(results, "a", seconds=2)
+    overlays_stage.overlay_one(results, "a", seconds=2)
     still, shaken = np.split(np.array(drawn), 2)
-    shown = frames_to_show(read_result(Results(results).track("a")))
+    shown = overlays_stage.frames_to_show(read_result(Results(results).track("a")))
     np.testing.assert_allclose(shaken - still, np.tile(shake_px[shown, None], 3), atol=1e-9)
 
 
 def test_metres_turn_into_pixels_through_lens_and_tilt() -> None:
     edge = np.linspace(10, 900, 200)
     metres = 2.4e-4 * edge * (1 + 5e-5 * edge)
-    track = pd.DataFrame({"edge_px": edge, "lead_position_m": metres})
-    track.loc[3:9, "edge_px"] = math.nan
-    assert position_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
+    seen = np.where((np.arange(200) < 3) | (np.arange(200) > 9), edge, math.nan)
+    track = pd.DataFrame({"edge_px": seen, "lead_position_m": metres})
+    assert overlays_stage.position_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
 
 
 def test_one_recording_a_condition_is_drawn_and_one_that_cannot_be_does_not_stop_the_others(tmp_path: Path) -> None:
     experiment, results = campaign(tmp_path)
     read = read_experiment(experiment)
-    chosen = {of: chosen_trials(read, Results(results), of) for of in ("one_per_condition", "all", "none")}
+    chosen = {
+        of: overlays_stage.chosen_trials(read, Results(results), of) for of in ("one_per_condition", "all", "none")
+    }
     assert chosen == {"one_per_condition": ["a", "c"], "all": ["a", "b", "c"], "none": []}
     (results / "analysed" / "a.json").write_text(json.dumps({"row": {"mm_per_px": 0.5}}))
     settings = run_settings({"overlays": {"seconds": 1, "width_px": 320}})
-    (said,) = draw_overlays(Job(read, results, settings))
+    (said,) = overlays_stage.draw_overlays(Job(read, results, settings))
     assert said.startswith("  a: no clip: ")
     assert [path.name for path in (results / "overlays").iterdir()] == ["c.mp4"]
 
 
-def test_a_clip_begins_a_little_before_the_motion_and_ends_a_little_after() -> None:
-    shown = frames_to_show(pd.DataFrame({"edge_px": edge_px()}))
-    assert shown.start == 21 - MARGIN_FRAMES
-    assert 49 + MARGIN_FRAMES <= shown.stop <= 51 + MARGIN_FRAMES
-
-
-@pytest.mark.parametrize("n_frames", [10, 30, 200, 1000, 20_000])
-def test_a_clip_lasts_about_as_long_as_asked_and_plays_at_a_rate_that_players_know(n_frames: int) -> None:
-    play_fps, stride = playback_rate(n_frames, 6.0)
-    assert 4 <= play_fps <= 30
-    lasts_s = n_frames / stride / play_fps
-    assert lasts_s == pytest.approx(6, rel=0.2) or (n_frames < 24 and lasts_s < 6)
+def test_a_clip_goes_from_before_to_after_the_motion_about_as_long_as_asked_at_a_rate_that_players_know() -> None:
+    shown, margin = overlays_stage.frames_to_show(pd.DataFrame({"edge_px": edge_px()})), overlays_stage.MARGIN_FRAMES
+    assert shown.start == 21 - margin
+    assert 49 + margin <= shown.stop <= 51 + margin
+    for n_frames in (10, 30, 200, 1000, 20_000):
+        play_fps, stride = overlays_stage.playback_rate(n_frames, 6.0)
+        assert 4 <= play_fps <= 30
+        lasts_s = n_frames / stride / play_fps
+        assert lasts_s == pytest.approx(6, rel=0.2) or (n_frames < 24 and lasts_s < 6)

@@ -17,6 +17,7 @@ from vinetrack.pipeline.stages import STAGES
 from vinetrack.pipeline.workflow import (
     RunError,
     RunPaths,
+    WorkflowPlan,
     begin_run,
     check_before_run,
     check_folder,
@@ -45,6 +46,10 @@ def filmed(folder: Path) -> None:
     (folder / "trials.csv").write_text(SHEET.replace("track", "video,capture_fps") + "a,a.mp4,1000,12,100,300,20,3,\n")
 
 
+def planned(folder: Path, **config: object) -> WorkflowPlan:
+    return make_plan({"experiment": str(folder), **config}, folder.parent)
+
+
 def test_results_are_named_after_the_last_part_of_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = experiment(tmp_path / "2024")
     monkeypatch.chdir(tmp_path)
@@ -55,97 +60,78 @@ def test_results_are_named_after_the_last_part_of_the_path(tmp_path: Path, monke
 def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_there_are(tmp_path: Path) -> None:
     rows = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,100,300,20,3,no\nc,gone.csv,12,100,300,9999,3,\n"
     folder = experiment(tmp_path / "v", rows)
-    plan = make_plan({"experiment": str(folder)}, tmp_path)
-    assert plan.trials == ("a", "c")
-    assert plan.inputs == (folder / "trials.csv", folder / "a.csv")
+    assert (planned(folder).trials, planned(folder).inputs) == (("a", "c"), (folder / "trials.csv", folder / "a.csv"))
+    # A module that an own effect may import is an input too.
+    (folder / "experiment.yaml").write_text("effects: [brush.py]\n")
+    for name in ("brush.py", "beside.py"):
+        (folder / name).write_text("")
+    stated = planned(folder).files("<experiment>")
+    assert stated[2:] == [(folder / name).as_posix() for name in ("brush.py", "beside.py")]
+    # A name with a brace, which Snakemake would take for a wildcard, is analysed, and watched by its time.
+    folder = experiment(tmp_path / "w", "a,a{1}.csv,12,100,300,20,3,\n")
+    (folder / "a.csv").rename(folder / "a{1}.csv")
+    before = planned(folder)
+    assert (before.trials, before.inputs) == (("a",), (folder / "trials.csv",))
+    os.utime(folder / "a{1}.csv", (1, 1))
+    assert planned(folder).unwatched != before.unwatched
 
 
-def test_the_shipped_demonstration_is_found_wherever_snakemake_is_run(
+def test_shipped_experiments_are_found_wherever_snakemake_is_run_with_their_own_ground_truth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     experiment(tmp_path / "house" / "data" / "demo")
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path)
     plan = make_plan({"experiment": "data/demo"}, tmp_path / "house")
     assert plan.ground_truth
-    assert plan.ground_truth.name == "demo.yaml"
-    assert plan.results == Path("results/demo")
+    assert (plan.ground_truth.name, plan.results) == ("demo.yaml", Path("results/demo"))
     assert plan.files("<measurements>") == [str(tmp_path / "house" / "data" / "demo" / "a.csv")]
-
-
-def test_every_shipped_experiment_has_its_own_ground_truth(tmp_path: Path) -> None:
     for name in ("demo", "paper"):
         plan = make_plan({"experiment": f"data/{name}", "results": str(tmp_path)}, ROOT)
         assert plan.ground_truth == ROOT / "vinetrack" / "laboratory" / f"{name}.yaml"
         assert plan.published is (name == "paper")
-        assert all(
-            Path(path).parent.name in ("videos", "calibration", "tracks") for path in plan.files("<measurements>")
-        )
+        folders = {Path(path).parent.name for path in plan.files("<measurements>")}
+        assert folders <= {"videos", "calibration", "tracks"}
 
 
 def test_a_stage_depends_on_its_own_settings_alone(tmp_path: Path) -> None:
-    folder = str(experiment(tmp_path / "v"))
-    before = make_plan({"experiment": folder}, tmp_path)
-    after = make_plan({"experiment": folder, "damping": {"seed": 99}}, tmp_path)
+    folder = experiment(tmp_path / "v")
+    before, after = planned(folder), planned(folder, damping={"seed": 99})
     changed = {name for name, stage in STAGES.items() if before.settings_of(stage) != after.settings_of(stage)}
     assert changed == {"damping", "model", "report"}
 
 
 def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_path: Path) -> None:
     folder = experiment(tmp_path / "v")
-    assert "overlays" not in make_plan({"experiment": str(folder)}, tmp_path).stages
+    assert "overlays" not in planned(folder).stages
     filmed(folder)
-    plan = make_plan({"experiment": str(folder)}, tmp_path)
-    assert "overlays" in plan.stages
-    assert plan.files("<made of overlays>") == ["results/v/overlays"]
-    assert "overlays" not in make_plan({"experiment": str(folder), "overlays": {"of": "none"}}, tmp_path).stages
+    assert "overlays" in planned(folder).stages
+    assert planned(folder).files("<made of overlays>") == ["results/v/overlays"]
+    assert "overlays" not in planned(folder, overlays={"of": "none"}).stages
 
 
-def test_a_track_with_a_brace_in_its_name_is_analysed_and_watched_by_its_time(tmp_path: Path) -> None:
-    folder = experiment(tmp_path / "v", "a,a{1}.csv,12,100,300,20,3,\n")
-    (folder / "a.csv").rename(folder / "a{1}.csv")
-    before = make_plan({"experiment": str(folder)}, tmp_path)
-    assert before.trials == ("a",)
-    assert before.inputs == (folder / "trials.csv",)
-    os.utime(folder / "a{1}.csv", (1, 1))
-    assert make_plan({"experiment": str(folder)}, tmp_path).unwatched != before.unwatched
-
-
-@pytest.mark.parametrize("name", ["a{b}", "<b>x"])
-def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).mkdir()
-    (tmp_path / name / "trials.csv").write_text("trial\n")
-    assert "Snakemake cannot handle" in check_folder(tmp_path / name).problems[0].message
+def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path: Path) -> None:
+    for name in ("a{b}", "<b>x"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "trials.csv").write_text("trial\n")
+        assert "Snakemake cannot handle" in check_folder(tmp_path / name).problems[0].message
     assert path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
 
 
 def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path: Path) -> None:
     names = [f"t{i}" for i in range(2 * workflow.TRIALS_PER_JOB + 1)]
-    folder = experiment(tmp_path / "v", "".join(f"{name},{name}.csv,12,100,300,20,3,\n" for name in names))
-    plan = make_plan({"experiment": str(folder)}, tmp_path)
+    plan = planned(experiment(tmp_path / "v", "".join(f"{name},{name}.csv,12,100,300,20,3,\n" for name in names)))
     assert [name for name in plan.jobs if name.startswith("trials")] == ["trials_1", "trials_2", "trials_3"]
     parts = [part for stage, _, part in plan.jobs.values() if stage == "trials"]
     assert [name for part in parts for name in part] == names
     assert [path for part in parts for path in plan.files("<tracks>", part)] == plan.files("<tracks>")
-    assert list(make_plan({"experiment": str(experiment(tmp_path / "w"))}, tmp_path).jobs) == [
-        "trials", "damping", "model", "figures", "report",
-    ]  # fmt: skip
-
-
-def test_a_module_that_an_own_effect_may_import_is_an_input_too(tmp_path: Path) -> None:
-    folder = experiment(tmp_path / "v")
-    (folder / "experiment.yaml").write_text("effects: [brush.py]\n")
-    for name in ("brush.py", "beside.py"):
-        (folder / name).write_text("")
-    stated = make_plan({"experiment": str(folder)}, tmp_path).files("<experiment>")
-    assert stated[2:] == [(folder / name).as_posix() for name in ("brush.py", "beside.py")]
+    assert [*planned(experiment(tmp_path / "w")).jobs] == ["trials", "damping", "model", "figures", "report"]
 
 
 def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path: Path) -> None:
     folder = experiment(tmp_path / "v")
     filmed(folder)
     (folder / "experiment.yaml").write_text("published: measured\n")
-    plan = make_plan({"experiment": str(folder)}, tmp_path)
+    plan = planned(folder)
     known = set(plan.files("<inputs>"))
     for stage in plan.stages.values():
         assert {path for group in stage.reads for path in plan.files(group)} <= known
@@ -160,14 +146,11 @@ def test_results_lie_where_snakemake_puts_them_or_under_the_folder_named_and_are
     monkeypatch.chdir(tmp_path)
     assert run_paths(folder, None) == RunPaths(folder, tmp_path / make_plan({"experiment": folder}, tmp_path).results)
     assert run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "my vines"
-    given = folder.relative_to(tmp_path)
-    for base, command in (
-        (None, "vinetrack run 'week/my vines'"),
-        (Path("out"), "vinetrack run 'week/my vines' --results out"),
-    ):
+    given, command = folder.relative_to(tmp_path), "vinetrack run 'week/my vines'"
+    for base, options in ((None, ""), (Path("out"), " --results out")):
         results = run_paths(given, base).results
-        assert command_for_results(given, results) == command
-        assert command_for_results(given, Path(os.path.relpath(results))) == command
+        for there in (results, Path(os.path.relpath(results))):
+            assert command_for_results(given, there) == command + options
     elsewhere = command_for_results(given, Path("results/other"))
     assert elsewhere == "snakemake --config 'experiment=week/my vines' results=results/other"
 
@@ -177,13 +160,12 @@ def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keep
     begin_run(tmp_path / "out" / "vines", first).release()
     with pytest.raises(ExperimentError) as refused:
         run_paths(second, tmp_path / "out")
-    assert str(first) in str(refused.value)
-    assert str(second) in str(refused.value)
+    assert all(str(folder) in str(refused.value) for folder in (first, second))
     with pytest.raises(ExperimentError):
-        make_plan({"experiment": str(second), "results": str(tmp_path / "out" / "vines")}, tmp_path)
+        planned(second, results=str(tmp_path / "out" / "vines"))
     assert run_paths(first, tmp_path / "out").experiment == first
     moved = first.rename(tmp_path / "else") / "."
-    assert make_plan({"experiment": str(moved), "results": str(tmp_path / "out" / "vines")}, tmp_path).trials == ("a",)
+    assert planned(moved, results=str(tmp_path / "out" / "vines")).trials == ("a",)
 
 
 @pytest.mark.slow

@@ -23,21 +23,7 @@ from vinetrack.figures.registry import diagnosis_figures
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
 from vinetrack.paper.rows import SIMULATED, as_table
-from vinetrack.report import build as report_trials
-from vinetrack.report.build import (
-    Clip,
-    ReportContent,
-    ReportFigure,
-    ReportSection,
-    ReportTable,
-    TrackedRecording,
-    build_report,
-    inline_picture,
-    moved_table,
-    paper_section,
-    speed_sparkline,
-    upper_limits,
-)
+from vinetrack.report import build
 
 # The report, from tables written by hand: its first screen, a single file, and no external requests.
 EVIL = "<script>alert('x')</script>&\"'"
@@ -88,7 +74,7 @@ PROVENANCE = {
 def page(**changes: object) -> str:
     content = {"name": "vines", "trials": trials("a"), "windows": windows("a"), "damping": damping("v")}
     content |= {"provenance": PROVENANCE, "kinematics": curves("a")}
-    return build_report(ReportContent(**{**content, **changes}))  # type: ignore[arg-type]
+    return build.build_report(build.ReportContent(**{**content, **changes}))  # type: ignore[arg-type]
 
 
 class Tags(HTMLParser):
@@ -112,93 +98,64 @@ class Tags(HTMLParser):
             self.wrong.append(tag)
 
 
-def assert_escaped(html: str) -> None:
-    assert EVIL not in html
-    assert not [tag for tag, _ in Tags(html).tags if tag == "script"]
-    assert "&lt;script&gt;" in html
-
-
-def downloaded(href: str | None) -> str:
-    """The file in a data URI."""
-    head, _, data = (href or "").partition(",")
-    assert head.startswith("data:")
-    return base64.b64decode(data).decode() if head.endswith("base64") else unquote(data)
-
-
-def test_every_trial_stands_with_status_and_reason() -> None:
-    html = page(trials=trials("a", "b", status="failed", reason="fewer than 5 points"), windows=windows())
-    # Each in the table of numbers, and in the list that opens.
-    assert html.count('class="status status-failed"') == 4
-    assert html.count("fewer than 5 points") == 2
-
-
-@pytest.mark.parametrize("place", ["trials", "damping", "others"])
-def test_whatever_a_user_wrote_is_escaped(place: str) -> None:
-    fit = damping(EVIL, refused=EVIL if place == "damping" else None)
-    fit["both_axes"] |= {"left_out": {EVIL: EVIL}}
+def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped() -> None:
+    fit, unfitted = damping(EVIL), damping(EVIL, refused=EVIL)
+    for one in (fit, unfitted):
+        one["both_axes"] |= {"left_out": {EVIL: EVIL}}
     written = {"vinetrack": EVIL, "model": [EVIL], "settings": {EVIL: EVIL}, "inputs": {EVIL: "abc"}}
-    changes = {
-        "trials": {"trials": trials(EVIL, reason=EVIL), "windows": windows(EVIL).assign(rule=EVIL, reason=EVIL)},
-        "damping": {"damping": fit},
-        "others": {
-            "name": EVIL,
-            "damping": fit,
-            "provenance": PROVENANCE | written,
-            "figures": [ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL)],
-            "clips": {"a": "overlays/a.mp4"},
-            "clip": Clip("a", b"film", EVIL, b"frame"),
+    table = build.ReportTable(EVIL, (EVIL,), [(EVIL,)])
+    content = diagnosis("ambiguous", where=[EVIL], notes=[EVIL], answer_set=[EVIL], effects=[EVIL], explanation=EVIL)
+    content["drift"][0]["sentence"] = content["next_experiment"]["text"] = EVIL
+    content["next_experiment"]["calibration"] = content["rounds"][0]["explanation"] = EVIL
+    content["rounds"][0]["ranking"][0] |= {"reason": EVIL, "effect": EVIL}
+    pages = (
+        page(trials=trials(EVIL, reason=EVIL), windows=windows(EVIL).assign(rule=EVIL, reason=EVIL)),
+        page(damping=unfitted),
+        page(
+            name=EVIL,
+            damping=fit,
+            provenance=PROVENANCE | written,
+            figures=[build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL)],
+            clips={"a": "overlays/a.mp4"},
+            clip=build.Clip("a", b"film", EVIL, b"frame"),
             **result(messages=[EVIL], warnings=[EVIL]),
-            "sections": [ReportSection("paper", EVIL, [EVIL], [ReportTable(EVIL, (EVIL,), [(EVIL,)])], [])],
-        },
-    }
-    assert_escaped(page(**changes[place]))
+            sections=[build.ReportSection("paper", EVIL, [EVIL], [table], [])],
+        ),
+        shown(content),
+    )
+    for html in pages:
+        assert EVIL not in html
+        assert not [tag for tag, _ in Tags(html).tags if tag == "script"]
+        assert "&lt;script&gt;" in html
 
 
 def test_the_page_is_one_file_with_the_numbers_of_its_figures_that_asks_for_nothing_from_elsewhere() -> None:
-    html = page(figures=[ReportFigure("law", "Law", "caption", SVG, "points.csv", "µ,b\n1,2\n")])
-    for _, attributes in Tags(html).tags:
+    """With a further section before the trials, each with status and reason."""
+    table = build.ReportTable("Numbers", ("what", "value"), [("n", "0.37")], frozenset({1}), "by hand")
+    figure = build.ReportFigure("own", "Own", "caption", SVG, "o.csv", "a\n1\n")
+    html = page(
+        figures=[build.ReportFigure("law", "Law", "caption", SVG, "points.csv", "µ,b\n1,2\n")],
+        sections=[build.ReportSection("paper", "The paper", ["Beside it."], [table], [figure])],
+        trials=trials("a", "b", status="failed", reason="fewer than 5 points"),
+        windows=windows(),
+    )
+    tags = Tags(html)
+    assert not tags.wrong
+    for _, attributes in tags.tags:
         for name in ("src", "href", "xlink:href"):
             target = attributes.get(name) or ""
             assert target.startswith(("#", "data:")) or not target
     assert "@import" not in html
     assert "url(http" not in html
-    link = next(a for tag, a in Tags(html).tags if tag == "a" and a.get("download") == "points.csv")
-    assert downloaded(link["href"]) == "µ,b\n1,2\n"
-
-
-def test_a_further_section_comes_before_the_trials() -> None:
-    table = ReportTable("Numbers", ("what", "value"), [("n", "0.37")], frozenset({1}), "by hand")
-    figure = ReportFigure("own", "Own", "caption", SVG, "o.csv", "a\n1\n")
-    html = page(sections=[ReportSection("paper", "The paper", ["Beside it."], [table], [figure])])
+    (link,) = [attributes["href"] for _, attributes in tags.tags if attributes.get("download") == "points.csv"]
+    head, _, data = str(link).partition(",")
+    assert (base64.b64decode(data).decode() if head.endswith("base64") else unquote(data)) == "µ,b\n1,2\n"
     assert html.index('<h2 id="paper">The paper</h2>') < html.index('<h2 id="trials">')
-    assert '<td class="number">0.37</td>' in html
-    assert 'href="#paper"' in html
-    assert 'id="figure-own"' in html
-    assert not Tags(html).wrong
-
-
-def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions() -> None:
-    svg = inline_picture(SVG, "law", 'a "law"')
-    assert svg.startswith("<svg")
-    assert "currentColor" in svg
-    assert "var(--blue)" in svg
-    assert 'viewBox="0 0 504 360"' in svg
-    assert 'id="law-p1"' in svg
-    assert "url(#law-p1)" in svg
-    assert 'aria-label="a &quot;law&quot;"' in svg
-    for gone in ("<?xml", "<!--", "<metadata", "<style", 'height="360pt"'):
-        assert gone not in svg
-
-
-def test_a_sparkline_marks_the_steady_window() -> None:
-    time_s = np.linspace(0, 1, 50)
-    svg = speed_sparkline(pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": np.ones(50)}), (0.5, 1.0))
-    steady = re.search(r'class="steady" points="([^"]+)"', svg)
-    assert steady is not None
-    x = [float(pair.split(",")[0]) for pair in steady[1].split()]
-    # Half of the 130 px between the margins.
-    assert min(x) == pytest.approx(1 + 130 / 2, abs=3)
-    assert max(x) == pytest.approx(131, abs=0.1)
+    for part in ('<td class="number">0.37</td>', 'href="#paper"', 'id="figure-own"'):
+        assert part in html
+    # Each trial in the table of numbers, and in the list that opens.
+    assert html.count('class="status status-failed"') == 4
+    assert html.count("fewer than 5 points") == 2
 
 
 def png() -> bytes:
@@ -207,21 +164,36 @@ def png() -> bytes:
     return file.getvalue()
 
 
+def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short_coordinates() -> None:
+    data = base64.b64encode(png()).decode()
+    placed = f'<image xlink:href="data:image/png;base64,{data}" transform="matrix(0.123456 0 0 1 0 0)"/></svg>'
+    given = SVG.replace("M 0 0 L 5 5", "M 0.123456 0 L 5 5").replace("</svg>", placed)
+    svg = build.inline_picture(given, "law", 'a "law"')
+    assert svg.startswith("<svg")
+    for kept in ("currentColor", "var(--blue)", 'viewBox="0 0 504 360"', 'id="law-p1"', "url(#law-p1)"):
+        assert kept in svg
+    for made in ('aria-label="a &quot;law&quot;"', "M 0.12 0 L 5 5", "matrix(0.123456 0", "data:image/webp"):
+        assert made in svg
+    for gone in ("<?xml", "<!--", "<metadata", "<style", 'height="360pt"', data):
+        assert gone not in svg
+
+
+def test_a_sparkline_marks_the_steady_window() -> None:
+    time_s = np.linspace(0, 1, 50)
+    svg = build.speed_sparkline(pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": np.ones(50)}), (0.5, 1.0))
+    steady = re.search(r'class="steady" points="([^"]+)"', svg)
+    assert steady is not None
+    x = [float(pair.split(",")[0]) for pair in steady[1].split()]
+    # Half of the 130 px between the margins.
+    assert min(x) == pytest.approx(1 + 130 / 2, abs=3)
+    assert max(x) == pytest.approx(131, abs=0.1)
+
+
 def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn() -> None:
-    html = page(figures=[ReportFigure("law", "Law", "caption", png())], trial_figures={"a": png()})
+    html = page(figures=[build.ReportFigure("law", "Law", "caption", png())], trial_figures={"a": png()})
     images = [attributes for tag, attributes in Tags(html).tags if tag == "img"]
     assert [image["style"] for image in images] == ["--wide:192px"] * 2  # 2 in of 96 px
     assert all(str(image["src"]).startswith("data:image/webp;base64,") for image in images)
-
-
-def test_coordinates_are_shortened_and_images_keep_the_decimals_that_place_them() -> None:
-    data = base64.b64encode(png()).decode()
-    placed = f'<image xlink:href="data:image/png;base64,{data}" transform="matrix(0.123456 0 0 1 0 0)"/></svg>'
-    svg = inline_picture(SVG.replace("M 0 0 L 5 5", "M 0.123456 0 L 5 5").replace("</svg>", placed), "s", "s")
-    assert "M 0.12 0 L 5 5" in svg
-    assert "matrix(0.123456 0" in svg
-    assert "data:image/webp" in svg
-    assert data not in svg
 
 
 # The section on the diagnosis, for every verdict, for a refused diagnosis, and without one.
@@ -257,20 +229,20 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
 
 
 def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit() -> None:
-    found = [list(row) for row in moved_table(moved()).rows]
+    found = [list(row) for row in build.moved_table(moved()).rows]
     assert found == [["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"], ["γ", "–", "1.1700 ± 0.0040"]]
     found = [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))]
-    assert upper_limits(found, {}) == [("leak", "k", "2.50 kPa")]
+    assert build.upper_limits(found, {}) == [("leak", "k", "2.50 kPa")]
     unfitted = candidate("pressure_drive", 1.0, numbers=[], largest={"pressure_drive.k": 1.0})
-    assert upper_limits([Candidate.from_json(unfitted)], catalogue()) == [("pressure drive", "k", "1.00 SI")]
+    assert build.upper_limits([Candidate.from_json(unfitted)], catalogue()) == [("pressure drive", "k", "1.00 SI")]
     (kappa,) = catalogue()["moving_average"].parameters
     unfitted = candidate("moving_average", 1.0, numbers=[], largest={f"moving_average.{kappa.name}": 2.0})
-    (limit,) = upper_limits([Candidate.from_json(unfitted)], catalogue())
+    (limit,) = build.upper_limits([Candidate.from_json(unfitted)], catalogue())
     assert limit[1] == kappa.symbol
 
 
 def test_pictures_stand_in_the_parts_they_belong_to() -> None:
-    figures = [ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in diagnosis_figures()]
+    figures = [build.ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in diagnosis_figures()]
     html = page(diagnosis=replace(read(diagnosis()), ladder=ladder("", "a")), figures=figures)
     order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-missing_force"]
     order += ['id="candidates"', "figure-candidates", 'id="tied"', "figure-cosines", 'id="drift"', "figure-drift"]
@@ -278,15 +250,6 @@ def test_pictures_stand_in_the_parts_they_belong_to() -> None:
     assert places == sorted(places)
     for key in diagnosis_figures():
         assert f'download="{key}.csv"' in html
-
-
-def test_whatever_stands_in_the_file_is_escaped() -> None:
-    content = diagnosis("ambiguous", where=[EVIL], notes=[EVIL], answer_set=[EVIL], effects=[EVIL], explanation=EVIL)
-    content["drift"][0]["sentence"] = content["next_experiment"]["text"] = EVIL
-    content["next_experiment"]["calibration"] = EVIL
-    content["rounds"][0]["explanation"] = EVIL
-    content["rounds"][0]["ranking"][0] |= {"reason": EVIL, "effect": EVIL}
-    assert_escaped(shown(content))
 
 
 def test_the_page_says_what_the_trials_could_have_seen() -> None:
@@ -349,7 +312,7 @@ def test_table_two_sets_departures_beside_the_errors() -> None:
     named = zip(DEPARTURES, (0.057, 0.069, 0.095, 0.110, 0.114), strict=True)
     departures = [("Fig. 4", 7.0, one.name, size, math.nan, math.nan) for one, size in named]
     table = pd.DataFrame(departures, columns=list(DEPARTURE_COLUMNS))
-    positions, speeds = paper_section(as_table([row]), table, []).tables[1:3]
+    positions, speeds = build.paper_section(as_table([row]), table, []).tables[1:3]
     assert positions.rows[0] == ("7", "1.9", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
     assert positions.rows[1] == ("14", "0.29", "–", "–", "–", "–")
     assert [row[:2] for row in speeds.rows] == [("14", "0.27"), ("28", "0.56"), ("41", "1.35")]
@@ -357,38 +320,32 @@ def test_table_two_sets_departures_beside_the_errors() -> None:
 
 
 # Recordings and calibrations in the report, from entries written by hand.
-def recording() -> TrackedRecording:
+def recording() -> build.TrackedRecording:
     board = {"kind": "charuco", "image": "calibration/board.png", "mm_per_px": 0.2407, "scale_rel_sigma": 9e-5}
     board |= {"reprojection_px": 0.031, "n_corners": 52, "n_pictures": 1}
     board |= {"notes": ["the target spans only 40 % of the picture"]}
-    return TrackedRecording(SVG, ["before_release", "", "", "doubtful"], board)
+    return build.TrackedRecording(SVG, ["before_release", "", "", "doubtful"], board)
 
 
-def test_strip_and_motion_stand_side_by_side_and_the_calibration_is_listed_with_its_error() -> None:
-    html = page(recordings={"a": recording()}, trial_figures={"a": SVG})
-    assert html.count('<div class="pair">') == 1
-    assert html.count('aria-label="Strip of a with its tracked edge"') == 1
-    assert html.count('aria-label="Motion of a"') == 1
-    assert 'id="trial-a"' in html
-    assert 'href="#trial-a"' in html
+def test_strip_and_motion_stand_side_by_side_with_calibration_and_clips() -> None:
+    clips = {"clips": {"a": "overlays/a.mp4"}, "clip": build.Clip("a", b"film", "caption", b"frame")}
+    html = page(recordings={"a": recording()}, trial_figures={"a": SVG}, **clips)
+    for once in ('<div class="pair">', 'aria-label="Strip of a with its tracked edge"', 'aria-label="Motion of a"'):
+        assert html.count(once) == 1
     assert not Tags(html).wrong
     for words in ("ChArUco board", "calibration/board.png", "0.240700", "0.0090 %", "0.031 px", "52 in 1", "40 %"):
         assert words in html
+    assert html.count("data:image/webp;base64,ZnJhbWU=") == 2  # the frame in front of the clip that plays
+    links = ('id="trial-a"', 'href="#trial-a"', '<a href="overlays/a.mp4">', 'src="data:video/mp4;base64,ZmlsbQ=="')
+    assert all(link in html for link in links)
 
 
 def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("a", "b", "c")
     recordings = {name: recording() for name in names}
-    weight = len(inline_picture(SVG, "s-a", "Strip of a with its tracked edge"))
-    monkeypatch.setattr(report_trials, "MAX_TRIAL_FIGURES_BYTES", 2 * weight)
+    weight = len(build.inline_picture(SVG, "s-a", "Strip of a with its tracked edge"))
+    monkeypatch.setattr(build, "MAX_TRIAL_FIGURES_BYTES", 2 * weight)
     html = page(trials=trials(*names), recordings=recordings)
     assert html.count('aria-label="Strip of') == 2
     assert "The figures of 1 trials are left out here" in html
     assert html.count("4 frames: 1 before release, 1 doubtful") == 3
-
-
-def test_a_clip_beside_the_page_is_linked_and_one_plays_in_it() -> None:
-    html = page(clips={"a": "overlays/a.mp4"}, clip=Clip("a", b"film", "caption", b"frame"))
-    assert html.count("data:image/webp;base64,ZnJhbWU=") == 2
-    assert '<a href="overlays/a.mp4">Clip (separate file)</a>' in html
-    assert 'src="data:video/mp4;base64,ZmlsbQ=="' in html
