@@ -14,7 +14,7 @@ import pytest
 from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, one_round, refused
 
 from vinetrack.core import published
-from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.figures.diagnosis_figures import (
@@ -34,17 +34,16 @@ from vinetrack.pipeline.predict_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 
+
 # The fit and the diagnosis of a results folder, read back as they were written.
-OPEN = math.nan
-
-
-def fit() -> FitSummary:
-    damping = Number("eversion_damping.B", "v", "B", "N·(s/m)ⁿ", 6.4, 0.1, 6.2, 6.6, OPEN, "linear")
-    onset = Number("yield_pressure.P_y", "", "P_y", "Pa", 3000.0, OPEN, OPEN, OPEN, OPEN, "none", 0.0)
-    return FitSummary(
+def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_sentence(tmp_path: Path) -> None:
+    free = math.nan
+    damping = Number("eversion_damping.B", "v", "B", "N·(s/m)ⁿ", 6.4, 0.1, 6.2, 6.6, free, "linear")
+    onset = Number("yield_pressure.P_y", "", "P_y", "Pa", 3000.0, free, free, free, free, "none", 0.0)
+    fit = FitSummary(
         names=("gravity", "eversion_damping"),
         numbers=(damping, onset),
-        covariance=np.array([[0.01, 0.0], [0.0, OPEN]]),
+        covariance=np.array([[0.01, 0.0], [0.0, free]]),
         spreads={"B": BetweenTrialSpread(0.03, True)},
         noise_m=1e-4,
         noise_correlation=0.4,
@@ -57,42 +56,32 @@ def fit() -> FitSummary:
         trials={"t": TrialEstimates(*(0.1 * i for i in range(8)))},
         between=np.array([[0.04, 0.0], [0.0, 0.0]]),
     )
-
-
-def test_a_fit_comes_back_as_it_was_written(tmp_path: Path) -> None:
     results = Results(tmp_path)
-    write_json(results.fit, fit().to_json())
+    write_json(results.fit, fit.to_json())
     back = read_fit(results)
     write_json(tmp_path / "again.json", back.to_json())
     assert (tmp_path / "again.json").read_text() == results.fit.read_text()
-    assert back["B"].value == 6.4
-    assert back.between[0, 0] == 0.04
+    assert (back["B"].value, back.between[0, 0]) == (6.4, 0.04)
     assert back.fitted_values == {"eversion_damping.B": {"v": 6.4}, "yield_pressure.P_y": 3000.0}
     assert [trial.release_sigma_s for trial in back.trials.values()] == [0.1]
-    assert str(back) == str(fit())
+    assert str(back) == str(fit)
+    for content in ("[]", '{"model": 3}', '{"numbers": [1]}'):
+        results.fit.write_text(content, encoding="utf-8")
+        with pytest.raises(ResultsError, match="delete it and run snakemake again"):
+            read_fit(results)
 
 
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_a_diagnosis_comes_back_as_it_was_written(verdict: str) -> None:
-    written = json.loads(json.dumps(Diagnosis.from_json(diagnosis(verdict)).to_json(), default=float))
-    again = json.loads(json.dumps(Diagnosis.from_json(written).to_json(), default=float))
-    assert json.dumps(again) == json.dumps(written)
-    kept = ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")
-    assert {key: again[key] for key in kept} == {key: diagnosis(verdict)[key] for key in kept}
-
-
-def test_a_refused_diagnosis_says_why_and_has_no_verdict(tmp_path: Path) -> None:
+def test_a_diagnosis_comes_back_as_it_was_written_and_a_refused_one_has_no_verdict(tmp_path: Path) -> None:
+    for verdict in VERDICTS:
+        written = json.loads(json.dumps(Diagnosis.from_json(diagnosis(verdict)).to_json(), default=float))
+        again = json.loads(json.dumps(Diagnosis.from_json(written).to_json(), default=float))
+        assert json.dumps(again) == json.dumps(written)
+        kept = ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")
+        assert {key: again[key] for key in kept} == {key: diagnosis(verdict)[key] for key in kept}
     write_json(Results(tmp_path).diagnosis, refused("no trial moves"))
     back = read_diagnosis(Results(tmp_path))
     assert back is not None
     assert (back.verdict, back.final_verdict, back.refused) == ("", "", "no trial moves")
-
-
-@pytest.mark.parametrize("content", ["[]", '{"model": 3}', '{"numbers": [1]}'])
-def test_a_fit_that_is_none_of_ours_is_one_sentence(tmp_path: Path, content: str) -> None:
-    Results(tmp_path).fit.write_text(content, encoding="utf-8")
-    with pytest.raises(ResultsError, match="delete it and run snakemake again"):
-        read_fit(Results(tmp_path))
 
 
 # What a diagnosis left in a results folder, read back for pictures and page: whole, in parts, and not there.
@@ -102,8 +91,8 @@ TRIALS = {"a": "slow", "b": "slow", "c": "fast"}
 
 def conditions() -> pd.DataFrame:
     labels = {"slow": "12 mm, 24 kPa", "fast": "12 mm, 60 kPa"}
-    rows = [{"trial": t, "vine": "v", "condition": c, "condition_label": labels[c]} for t, c in TRIALS.items()]
-    return pd.DataFrame(rows)
+    rows = [(trial, "v", condition, labels[condition]) for trial, condition in TRIALS.items()]
+    return pd.DataFrame(rows, columns=["trial", "vine", "condition", "condition_label"])
 
 
 def prediction(off_m: float, after: bool) -> pd.DataFrame:
@@ -136,17 +125,18 @@ def folder(path: Path, content: dict | None, after: bool = True, compared: bool 
     return results
 
 
-@pytest.mark.parametrize("compared", [True, False])
-def test_predictions_count_from_release_and_origin(tmp_path: Path, compared: bool) -> None:
-    trials = predicted_trials(folder(tmp_path / "r", diagnosis(), compared=compared), conditions())
-    one = trials[trials["trial"] == "a"]
-    # Without the comparison the release is the first frame that moves: a frame or two late.
-    assert one["time_s"].iloc[0] == pytest.approx(-0.02, abs=1e-9 if compared else 2.5e-3)
-    assert one["lead_position_m"].iloc[-1] == pytest.approx(0.2)
+def test_predictions_count_from_release_and_origin(tmp_path: Path) -> None:
+    for compared in (True, False):
+        trials = predicted_trials(folder(tmp_path / str(compared), diagnosis(), compared=compared), conditions())
+        one = trials[trials["trial"] == "a"]
+        # Without the comparison the release is the first frame that moves: a frame or two late.
+        assert one["time_s"].iloc[0] == pytest.approx(-0.02, abs=1e-9 if compared else 2.5e-3)
+        assert one["lead_position_m"].iloc[-1] == pytest.approx(0.2)
 
 
 def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(tmp_path: Path) -> None:
-    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
+    results = folder(tmp_path / "r", diagnosis())
+    found = read_diagnosis_tables(results, conditions())
     assert found is not None
     assert found.worst == "12 mm, 24 kPa"
     assert set(found.before_after["trial"]) == {"a", "b"}
@@ -157,10 +147,7 @@ def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(
     assert slow["misfit_after_m"].to_numpy() == pytest.approx(np.zeros(len(slow)), abs=1e-12)
     assert set(found.where["condition_label"]) == {"12 mm, 24 kPa", "12 mm, 60 kPa"}
     assert slow["n_trials"].tolist() == [2] * len(slow)
-
-
-def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: Path) -> None:
-    results = folder(tmp_path / "r", diagnosis())
+    # Misfits that the diagnosis found are taken with their errors.
     row = {"vine": "v", "condition": "slow", "from_m": 0.1, "to_m": 0.2, "lead_position_m": 0.15}
     row |= {"mean_residual_m": 0.011, "sigma_m": 0.001, "z": 11.0, "n_trials": 2}
     pd.DataFrame([row, row | {"condition": ""}]).to_csv(results.diagnosed("along_position.csv"), index=False)
@@ -172,20 +159,18 @@ def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: 
     assert slow["misfit_after_m"] == pytest.approx(0, abs=1e-12)
 
 
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_every_verdict_has_a_picture_of_what_it_has_a_table_of(tmp_path: Path, verdict: str) -> None:
-    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis(verdict), after=verdict == "missing"), conditions())
-    assert found is not None
-    drawn = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
-    assert set(drawn) == {"ladder", "before_after", "where", "candidates", "cosines"}
-    for name, figure in drawn.items():
-        assert render(figure, ["svg"])["svg"]
-        assert len(getattr(found, diagnosis_figures()[name].data)) > 0
-
-
-@pytest.mark.parametrize("content", [None, refused()], ids=["none", "refused"])
-def test_without_a_verdict_there_is_nothing_to_draw(tmp_path: Path, content: dict | None) -> None:
-    assert read_diagnosis_tables(folder(tmp_path / "r", content), conditions()) is None
+def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path: Path) -> None:
+    for verdict in VERDICTS:
+        results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
+        found = read_diagnosis_tables(results, conditions())
+        assert found is not None
+        drawn = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
+        assert set(drawn) == {"ladder", "before_after", "where", "candidates", "cosines"}
+        for name, figure in drawn.items():
+            assert render(figure, ["svg"])["svg"]
+            assert len(getattr(found, diagnosis_figures()[name].data)) > 0
+    for name, content in (("none", None), ("refused", refused())):
+        assert read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
     assert not any(draw(name, DiagnosisTables()) for name in diagnosis_figures())
 
 
@@ -203,11 +188,8 @@ def test_what_the_last_model_says_joins_the_comparison_where_something_was_added
 def test_ties_stand_in_the_order_of_the_ranking() -> None:
     cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
     cells = cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
-    assert cells.to_numpy().tolist() == [
-        ["leak", "air_drag", 0.3],
-        ["time_base", "air_drag", 0.2],
-        ["time_base", "leak", 0.1],
-    ]
+    leak, time_base = ["leak", "air_drag", 0.3], ["time_base", "air_drag", 0.2]
+    assert cells.to_numpy().tolist() == [leak, time_base, ["time_base", "leak", 0.1]]
     assert cosine_cells(Round.from_json({"verdict": ""})).empty
 
 
@@ -241,30 +223,23 @@ def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted
 
 
 # What recordings and speeds contradict in the sheet stands beside the verdict, for it passes for physics.
-PSI = 6.894757
-VINE = Trial(
-    name="a", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, pressure_Pa=30e3, yield_pressure_Pa=3e3,
-    capture_fps=1000,
-)  # fmt: skip
-
-
-def steady(trial: Trial) -> Track:
-    """A track at the steady speed of F = B·ẋⁿ with the B that tubes of this size have."""
-    force_N = (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
-    tail_m_s = (force_N / damping_prior(trial.diameter_m, trial.thickness_m)) ** (1 / published.EXPONENT)
-    return plain_track(np.arange(40) / 1000, np.arange(40) / 1000 * tail_m_s / 2)
-
-
 def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tmp_path: Path) -> None:
+    size = {"diameter_m": 0.012, "thickness_m": 1e-4, "length_m": 0.14, "capture_fps": 1000}
+    vine = Trial(name="a", pressure_Pa=30e3, yield_pressure_Pa=3e3, **size)
+    # A track at the steady speed of F = B·ẋⁿ with the B that tubes of this size have.
+    force_N = (vine.pressure_Pa - vine.yield_pressure_Pa) * vine.area_m2
+    tail_m_s = (force_N / damping_prior(vine.diameter_m, vine.thickness_m)) ** (1 / published.EXPONENT)
+    steady = plain_track(np.arange(40) / 1000, np.arange(40) / 1000 * tail_m_s / 2)
     results, made = Results(tmp_path), Diagnosis.from_json(diagnosis("missing"))
-    right = [(replace(VINE, name=name), steady(VINE)) for name in "ab"]
+    right = [(replace(vine, name=name), steady) for name in "ab"]
     for name in "ab":
         write_json(results.analysed(name), {"row": {}, "contradictions": []})
     assert sheet_contradictions(results, right) == {}
     assert with_contradictions(made, results, right) == made
 
-    typed = replace(VINE, pressure_Pa=VINE.pressure_Pa / PSI, yield_pressure_Pa=VINE.yield_pressure_Pa / PSI)
-    pairs = [(replace(typed, name=name), steady(VINE)) for name in "ab"]
+    psi = 6.894757
+    typed = replace(vine, pressure_Pa=vine.pressure_Pa / psi, yield_pressure_Pa=vine.yield_pressure_Pa / psi)
+    pairs = [(replace(typed, name=name), steady) for name in "ab"]
     narrow = {"column": "diameter_mm", "reason": "diameter_mm '12' differs: the tube is 9.6 mm wide, a factor 1.25"}
     for name in "ab":
         write_json(results.analysed(name), {"row": {}, "contradictions": [narrow]})
@@ -275,17 +250,17 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tm
     assert set(seen.values()) <= set(with_contradictions(made, results, pairs).notes)
 
 
-# Which file of a figure the page shows, for every choice of `figures.formats`.
-@pytest.mark.parametrize(
-    ("formats", "limit", "shown"),
-    [(("png", "svg"), 9, "<svg/>"), (("png", "svg"), 5, b"png"), (("svg",), 9, "<svg/>"), (("pdf",), 9, b"")],
-)
 def test_a_figure_is_shown_from_the_files_there_are_and_a_large_svg_gives_way_to_its_png(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formats: tuple[str, ...], limit: int, shown: object
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = partial(Results(tmp_path).figure, "ladder")
-    path(".svg").parent.mkdir()
-    for form in formats:
-        path(f".{form}").write_text({"svg": "<svg/>"}.get(form, form))
-    monkeypatch.setattr(report_stage, "MAX_SVG_BYTES", limit)
-    assert report_stage._picture(path) == shown
+    def shown(name: str, limit: int, **files: str) -> str | bytes:
+        path = partial(Results(tmp_path).figure, name)
+        path(".svg").parent.mkdir(exist_ok=True)
+        for form, content in files.items():
+            path(f".{form}").write_text(content)
+        monkeypatch.setattr(report_stage, "MAX_SVG_BYTES", limit)
+        return report_stage._picture(path)
+
+    assert shown("both", 9, png="png", svg="<svg/>") == shown("alone", 9, svg="<svg/>") == "<svg/>"
+    assert shown("both", 5) == b"png"
+    assert shown("neither", 9, pdf="pdf") == b""
