@@ -153,11 +153,10 @@ FIVE = {f"t{k}": LEVEL for k in range(5)}
     ("axes", "failed"),
     [
         (FIVE | {"t2": DOOR}, {"t2"}),
-        (FIVE | {"t4": LEVEL | {"via_px": [(150.0, 80.0)]}}, {"t4"}),
-        (FIVE | {"t5": DOWN, "t6": DOWN}, set()),
-        ({"t0": LEVEL, "t1": DOOR, "t2": LEVEL, "t3": DOOR}, set()),
+        (FIVE | {"t4": LEVEL | {"via_px": [(150.0, 80.0)]}}, {"t4"}),  # a curve
+        (FIVE | {"t5": DOWN, "t6": DOWN}, set()),  # another way of growth
+        ({"t0": LEVEL, "t1": DOOR, "t2": LEVEL, "t3": DOOR}, set()),  # no majority
     ],
-    ids=["along a door", "a curve", "another way of growth", "no majority"],
 )
 def test_a_recording_along_another_axis_than_most_fails_with_its_remedy_and_enters_no_fit(
     tracked: tuple[Path, Path], tmp_path: Path, axes: Mapping[str, Mapping[str, object]], failed: set[str]

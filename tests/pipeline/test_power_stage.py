@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from commanded import succeed
 
-from vinetrack.diagnosis.campaign_power import CampaignDesign, SimulatedDiagnosis
+from vinetrack.diagnosis.campaign_power import SimulatedDiagnosis
 from vinetrack.pipeline import power_stage
 from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
 
@@ -19,12 +19,15 @@ SHEET = (
 SETTINGS = "candidates: [leak, air_drag, payload_drag]\n"
 
 
+def planned(folder: Path, more: str = "") -> Path:
+    (folder / "trials.csv").write_text(SHEET)
+    (folder / "experiment.yaml").write_text(SETTINGS + more)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("planned")
-    (path / "trials.csv").write_text(SHEET)
-    (path / "experiment.yaml").write_text(SETTINGS)
-    return path
+    return planned(tmp_path_factory.mktemp("planned"))
 
 
 def test_a_sheet_without_recordings_says_what_was_guessed(folder: Path) -> None:
@@ -49,14 +52,11 @@ def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder
 
 @pytest.mark.slow
 def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "trials.csv").write_text(SHEET)
-    (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, new_vines: no}\n")
+    planned(tmp_path, "limits: {pressure_kPa: 14:40, new_vines: no}\n")
     now = power_of_target(PowerRequest(folder))["leak"]
     rows, size = tmp_path / "more.csv", f"leak={0.7 * now.size_at(0.9):.4g}"
     assert "of campaigns" in succeed("power", tmp_path, "--effect", size, "--reach", "0.9", "--sheet", rows)
-    (tmp_path / "trials.csv").write_text(
-        pd.concat([pd.read_csv(folder / "trials.csv"), pd.read_csv(rows)]).to_csv(index=False)
-    )
+    pd.concat([pd.read_csv(folder / "trials.csv"), pd.read_csv(rows)]).to_csv(tmp_path / "trials.csv", index=False)
     again = power_of_target(PowerRequest(tmp_path))["leak"]
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88
 
@@ -64,12 +64,7 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
 def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked_for: list[tuple[str, int]] = []
 
-    def answered(
-        design: CampaignDesign,  # noqa: ARG001
-        effect: str,
-        values: tuple[float, ...],  # noqa: ARG001
-        seed: int,
-    ) -> SimulatedDiagnosis:
+    def answered(_design: object, effect: str, _values: object, seed: int) -> SimulatedDiagnosis:
         asked_for.append((effect, seed))
         verdict, names = ("missing", ("leak",)) if effect and seed % 2 else ("adequate", ())
         return SimulatedDiagnosis(effect, verdict, names)
@@ -83,9 +78,9 @@ def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, mon
 
 @pytest.mark.slow
 def test_the_trials_that_would_reveal_most_are_recommended(tmp_path: Path) -> None:
-    (tmp_path / "trials.csv").write_text(SHEET)
-    (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, trials: 2}\n")
-    power = power_of_target(PowerRequest(tmp_path, recommend=True))
+    power = power_of_target(
+        PowerRequest(planned(tmp_path, "limits: {pressure_kPa: 14:40, trials: 2}\n"), recommend=True)
+    )
     assert power.recommended is not None
     assert sum(trial["replicates"] for trial in power.to_json()["recommended_trials"]) == 2
     assert any(power.recommended.then[name].size_at(0.9) < power[name].size_at(0.9) for name in ("leak", "air_drag"))

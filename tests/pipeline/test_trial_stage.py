@@ -24,7 +24,6 @@ from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import Tracking, in_metres
 
-ROOT = Path(__file__).parents[2]
 SHEET: dict[str, object] = {
     "capture_fps": 1000, "diameter_mm": 13.2, "thickness_um": 100, "length_mm": 190, "pressure_kPa": 30,
     "yield_pressure_kPa": 3, "mm_per_px": 0.3,
@@ -140,14 +139,15 @@ def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked: tuple
     folder, results = tracked
     write_sheet(folder)
     command = [sys.executable, "-m", "vinetrack.cli.main", "trials", str(folder), str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     ends = time.monotonic() + 120
-    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)}) as first:
+    with subprocess.Popen(command, env=environment) as first:
         while not list((tmp_path / ".kept").glob("[!.]*.npz")) and time.monotonic() < ends:
             time.sleep(0.005)
         first.send_signal(signal.SIGKILL)
     kept = {path: path.stat().st_ino for path in (tmp_path / ".kept").glob("[!.]*.npz")}
     assert kept
-    subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+    subprocess.run(command, env=environment, check=True)
     assert {path: path.stat().st_ino for path in kept} == kept
     analyse_trials(Job(read_experiment(folder), results, PNG))
     for name in ("a", "b"):
@@ -157,7 +157,6 @@ def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked: tuple
 
 
 # Workers of a pool: they answer in any order, and end with the process that started them, however it ends.
-
 PARENT = """
 import os, sys, time
 from vinetrack.pipeline.stages import map_unordered
@@ -171,12 +170,16 @@ for _ in map_unordered(task, range(8), 2):
 """
 
 
-def test_every_item_is_answered() -> None:
-    assert sorted(map_unordered(abs, range(-19, 1), 2)) == list(range(20))
-
-
 @pytest.mark.skipif(not Path("/proc").exists(), reason="which processes are there is read from /proc")
-def test_workers_of_a_killed_run_end_too(tmp_path: Path) -> None:
+def test_every_item_is_answered_and_workers_of_a_killed_run_end_too(tmp_path: Path) -> None:
+    def is_alive(process: int) -> bool:
+        """Whether a process is there, and not only waiting to be counted."""
+        try:
+            return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        except (ProcessLookupError, FileNotFoundError):
+            return False
+
+    assert sorted(map_unordered(abs, range(-19, 1), 2)) == list(range(20))
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
     workers: set[int] = set()
@@ -186,15 +189,6 @@ def test_workers_of_a_killed_run_end_too(tmp_path: Path) -> None:
             workers.add(int(parent.stdout.readline()))
         parent.send_signal(signal.SIGKILL)
     ends = time.monotonic() + 60
-    while any(map(_is_alive, workers)) and time.monotonic() < ends:
+    while any(map(is_alive, workers)) and time.monotonic() < ends:
         time.sleep(0.05)
-    assert not any(map(_is_alive, workers))
-
-
-def _is_alive(process: int) -> bool:
-    """Whether a process is there, and not only waiting to be counted."""
-    try:
-        os.kill(process, 0)
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (ProcessLookupError, FileNotFoundError):
-        return False
+    assert not any(map(is_alive, workers))
