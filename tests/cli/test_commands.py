@@ -64,33 +64,30 @@ def test_effects_lists_every_effect_with_its_formula_and_units() -> None:
     assert "N·(s/m)ⁿ" in output
 
 
-@pytest.mark.parametrize(("settings", "status"), [("{}", 1), ("seed=3", 2), ('{"damping": {"resamples": 3}}', 1)])
-def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path, settings: str, status: int) -> None:
-    """Without its input, with settings that are no JSON, with a setting out of bounds."""
-    done = run("damping", experiment(tmp_path / "v"), tmp_path, "--settings", settings)
-    assert done.exit_code == status
-    assert "Traceback" not in done.output
+def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path) -> None:
+    folder = experiment(tmp_path / "v")
+    without_input, no_json, out_of_bounds = "{}", "seed=3", '{"damping": {"resamples": 3}}'
+    for settings, status in ((without_input, 1), (no_json, 2), (out_of_bounds, 1)):
+        done = run("damping", folder, tmp_path, "--settings", settings)
+        assert done.exit_code == status
+        assert "Traceback" not in done.output
+    for command in (("diagnose",), ("add", "air_drag"), ("check",)):
+        assert run(*command, "nowhere").exit_code == 1
 
 
-def test_a_fault_of_the_program_is_one_sentence_and_its_traceback_is_in_the_log(
+def test_an_unforeseen_fault_fails_its_trial_alone_or_is_one_sentence_and_its_traceback_is_in_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    broken = Mock(side_effect=RuntimeError("the bottom fell out"))
-    monkeypatch.setattr("vinetrack.pipeline.trials.gather", broken)
-    done = run("damping", experiment(tmp_path / "v"), tmp_path, "--log", tmp_path / "logs" / "d.log")
+    folder, log = experiment(tmp_path / "v"), tmp_path / "logs" / "a.log"
+    monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen")))
+    succeed("trials", folder, tmp_path / "r", "--log", log)
+    assert "ZeroDivisionError: unforeseen" in log.read_text()
+    assert "1 trials, 1 failed" in run("damping", folder, tmp_path / "r").output
+    monkeypatch.setattr("vinetrack.pipeline.trials.gather", Mock(side_effect=RuntimeError("the bottom fell out")))
+    done = run("damping", folder, tmp_path / "r", "--log", log)
     assert done.exit_code == 1
     assert "Traceback" not in done.output
-    assert "RuntimeError: the bottom fell out" in (tmp_path / "logs" / "d.log").read_text()
-
-
-def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    broken = Mock(side_effect=ZeroDivisionError("unforeseen"))
-    monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", broken)
-    folder = experiment(tmp_path / "v")
-    done = run("trials", folder, tmp_path / "r", "--log", tmp_path / "t.log")
-    assert done.exit_code == 0
-    assert "1 trials, 1 failed" in run("damping", folder, tmp_path / "r").output
-    assert "ZeroDivisionError: unforeseen" in (tmp_path / "t.log").read_text()
+    assert "RuntimeError: the bottom fell out" in log.read_text()
 
 
 # `vinetrack diagnose` and `vinetrack add` from a folder of tracks to files and sentences.
@@ -131,17 +128,18 @@ def test_straight_from_a_folder_of_tracks_to_one_file_and_no_other(experiment_co
     assert sorted(experiment_commands.rglob("*")) == before
 
 
-def ladder(results: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
-
-
 @pytest.mark.slow
-def test_the_stage_writes_the_contract(results: Path) -> None:
+def test_the_stage_writes_the_contract_an_effect_put_in_by_hand_joins_it_and_one_that_is_saved_stands_in_the_model(
+    results: Path, experiment_commands: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ladder() -> list[dict[str, str]]:
+        return list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
+
     answer = json.loads((results / "diagnosis.json").read_text())
     keys = "effects answer_set explanation rounds final_verdict parameters cosines drift next_experiment"
     assert answer["verdict"] == "missing"
     assert set(keys.split()) <= set(answer)
-    rows = ladder(results)
+    rows = ladder()
     assert ",".join(rows[0]) == LADDER
     assert [row["added"] for row in rows] == ["", "reservoir_depletion"]
     assert float(rows[1]["rms_left_out_m"]) < 0.5 * float(rows[0]["rms_left_out_m"])
@@ -149,57 +147,37 @@ def test_the_stage_writes_the_contract(results: Path) -> None:
     assert len(paths) == 6
     assert paths[0].read_text().splitlines()[0] == "time_s,lead_position_m,model_before_m,model_after_m"
 
-
-@pytest.mark.slow
-def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
-    results: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     added = []
     monkeypatch.setattr(model_stage, "add", lambda *given: added.append(add(*given)) or added[-1])
     output = succeed("add", "air_drag", results)
     assert re.search(r"Δχ² = -", output) is None
     assert "highest pressure" in output
-    assert [row["added"] for row in ladder(results)] == ["", "reservoir_depletion", "air_drag"]
-    assert {row["partial"] for row in ladder(results)} == {"False"}
-    monkeypatch.setattr(model_stage, "add", lambda *_: added[0])  # the same once more, without the fits
-    succeed("add", "air_drag", results)
-    assert len(ladder(results)) == 3
+    assert [row["added"] for row in ladder()] == ["", "reservoir_depletion", "air_drag"]
+    assert {row["partial"] for row in ladder()} == {"False"}
+    with monkeypatch.context() as again:
+        again.setattr(model_stage, "add", lambda *_: added[0])  # the same once more, without the fits
+        succeed("add", "air_drag", results)
+    assert len(ladder()) == 3
 
-
-@pytest.mark.slow
-def test_saved_it_stands_in_the_model_of_the_experiment(results: Path, experiment_commands: Path) -> None:
     output = succeed("add", "reservoir_depletion", results, "--save")
     assert "reservoir_depletion" in (experiment_commands / "experiment.yaml").read_text()
     assert command_for_results(experiment_commands, results) in output.replace("\n", " ")
     assert run("add", "reservoir_depletion", results).exit_code == 1
 
 
-def test_a_wrong_folder_exits_with_1() -> None:
-    for command in (("diagnose",), ("add", "air_drag"), ("check",)):
-        assert run(*command, "nowhere").exit_code == 1
-
-
 # `vinetrack propose`: from a verdict of `unexplained` to an effect file that `vinetrack add` takes.
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""
-    place = tmp_path_factory.mktemp("lawful")
+@pytest.mark.slow
+def test_a_law_is_written_beside_the_experiment_and_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Vines that feel a force that grows with time, and one candidate, which is not it."""
     values = {"hidden.a": -0.3, "hidden.kind": float(list(FORCES).index("growing"))}
-    virtual = grown(sheet_command((4,), replicates=1), 103, own=[effect_file(place)], values=values)
-    experiment, results = place / "bench", place / "results"
+    virtual = grown(sheet_command((4,), replicates=1), 103, own=[effect_file(tmp_path)], values=values)
+    experiment, results = tmp_path / "bench", tmp_path / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
     for stage in ("trials", "damping", "model"):
         succeed(stage, experiment, results)
     (results / "provenance.json").write_text(json.dumps({"experiment": str(experiment)}))
-    return experiment, results
-
-
-@pytest.mark.slow
-def test_a_law_is_written_beside_the_experiment_and_added(
-    bench: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    experiment, results = bench
-    assert json.loads((results / "diagnosis.json").read_text())["verdict"] == "unexplained"
+    diagnosis = json.loads((results / "diagnosis.json").read_text())
+    assert diagnosis["verdict"] == "unexplained"
     proposals = []
     monkeypatch.setattr(effects_stage, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
     succeed("propose", results)
@@ -210,21 +188,18 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     again = run("propose", results)
     assert again.exit_code == 1
     assert "exists already" in again.output
-    assert run("add", shutil.copy(path, tmp_path), results, "--save").exit_code == 1
+    assert run("add", shutil.copy(path, results), results, "--save").exit_code == 1
     # Without the rest of the catalogue, with which this effect would be compiled once more.
     monkeypatch.setattr("vinetrack.diagnosis.ladder.host_for", lambda model, more: Model((*model.effects, *more)))
     succeed("add", path, results, "--save")
     settings = read_experiment_settings(experiment / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("proposed_time", ("proposed_time.py",))
-
-
-@pytest.mark.slow
-def test_nothing_is_proposed_where_the_verdict_is_another(bench: tuple[Path, Path], tmp_path: Path) -> None:
-    copy = shutil.copytree(bench[1], tmp_path / "results")
-    diagnosis = json.loads((copy / "diagnosis.json").read_text())
+    # Nothing is proposed where the verdict is another.
     for asked in diagnosis["rounds"]:
         asked["verdict"] = "adequate"
-    (copy / "diagnosis.json").write_text(json.dumps(diagnosis | {"verdict": "adequate", "final_verdict": "adequate"}))
-    done = run("propose", copy)
+    other = diagnosis | {"verdict": "adequate", "final_verdict": "adequate"}
+    (results / "diagnosis.json").write_text(json.dumps(other))
+    done = run("propose", results)
     assert done.exit_code == 1
+    assert "exists already" not in done.output
     assert "Traceback" not in done.output

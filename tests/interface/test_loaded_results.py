@@ -23,9 +23,7 @@ def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded: Lo
     assert {"trials", "conditions", "steady", "ladder", "comparison", "diagnosis/moved"} <= set(loaded.tables)
     assert loaded.tables["ladder"].equals(loaded.ladder)
     assert [name for name in loaded.ladder.columns if "rms" in name and not name.endswith("_m")] == []
-
-
-def test_models_carry_fitted_values_and_what_was_added(loaded: LoadedResults) -> None:
+    # Models carry fitted values and what was added.
     assert "reservoir_depletion" in loaded.final_model
     assert "reservoir_depletion" not in loaded.initial_model
     assert loaded.diagnosis is not None
@@ -33,18 +31,12 @@ def test_models_carry_fitted_values_and_what_was_added(loaded: LoadedResults) ->
     assert loaded.final_model.parameters_for("24mm-200um-200mm")[2] == n
 
 
-@pytest.mark.parametrize("name", ["", "overview", "model_comparison", "before_after", "candidates"])
-def test_a_figure_of_the_report_is_a_figure(loaded: LoadedResults, name: str) -> None:
-    assert isinstance(loaded.plot(name), Figure)
-
-
-def test_a_figure_of_one_trial_takes_its_name(loaded: LoadedResults) -> None:
+def test_figures_of_the_report_are_figures_and_what_is_not_there_is_said(loaded: LoadedResults, tmp_path: Path) -> None:
+    for name in ("", "overview", "model_comparison", "before_after", "candidates"):
+        assert isinstance(loaded.plot(name), Figure)
     assert isinstance(loaded.plot("trial_motion", trial="d24_24kPa_1"), Figure)
     with pytest.raises(ResultsError):
         loaded.plot("trial_motion", trial="nobody")
-
-
-def test_what_is_no_results_folder_is_said(tmp_path: Path) -> None:
     with pytest.raises(ResultsError):
         vt.load(tmp_path)
 
@@ -86,12 +78,11 @@ def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_press
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "python.ipynb"
 
 
-def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
-    return [sorted(one.get("data", one)) for one in outputs]
-
-
 @pytest.mark.slow
 def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored() -> None:
+    def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
+        return [sorted(one.get("data", one)) for one in outputs]
+
     shown = [one for outputs in run(NOTEBOOK) for one in outputs]
     cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
     stored = [one for cell in cells for one in cell.get("outputs", [])]
