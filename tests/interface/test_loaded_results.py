@@ -1,22 +1,48 @@
-"""A results folder in memory; the story of the README and the notebook of the documentation run on it."""
+"""A results folder in memory: the same quantity has one value in files, report, command line, explorer and Python; the
+story of the README and the notebook of the documentation run on it."""
 
 from __future__ import annotations
 
+import html
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
 
+import notebook
+import numpy as np
 import pytest
+from explorer_campaign import FEW_CANDIDATES, SETTINGS, SMALL, make_experiment, make_results, run
 from matplotlib.figure import Figure
-from notebook import run
 
 import vinetrack as vt
 from vinetrack.core.problems import ExperimentError
+from vinetrack.core.units import number
 from vinetrack.interface.loaded import LoadedResults
+from vinetrack.narrative.verdict_text import estimate_text, summary_facts
+from vinetrack.pages.page import open_campaign
 from vinetrack.results.folder_layout import ResultsError
 
-README = Path(__file__).parents[2] / "README.md"
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`results/demo` of six trials of one vine: three conditions, two replicates each, with figures and report."""
+    folder = tmp_path_factory.mktemp("small_run")
+    experiment = make_experiment(folder / "demo", SMALL, SETTINGS + FEW_CANDIDATES)
+    results = folder / "results" / "demo"
+    make_results(experiment, results)
+    run("model", experiment, results)
+    run("figures", experiment, results)
+    run("report", experiment, results)
+    return results
+
+
+@pytest.fixture(scope="module")
+def loaded(small_run: Path) -> LoadedResults:
+    return vt.load(small_run)
 
 
 def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded: LoadedResults) -> None:
@@ -44,7 +70,7 @@ def test_figures_of_the_report_are_figures_and_what_is_not_there_is_said(loaded:
 @pytest.mark.slow
 def test_the_story_of_the_readme_runs(small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pattern = r"\n((?:    [^\n]*\n|\n)*    import vinetrack as vt\n(?:    [^\n]*\n|\n)*)"
-    story = re.search(pattern, README.read_text("utf-8"))
+    story = re.search(pattern, (ROOT / "README.md").read_text("utf-8"))
     assert story is not None
     lines = [line.removeprefix("    ") for line in story[1].splitlines() if line.strip()]
     assert len(lines) <= 10
@@ -75,16 +101,14 @@ def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_press
     assert track.pressure_Pa[0] == pytest.approx(24e3)
 
 
-NOTEBOOK = Path(__file__).parents[2] / "docs" / "python.ipynb"
-
-
 @pytest.mark.slow
 def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored() -> None:
     def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
         return [sorted(one.get("data", one)) for one in outputs]
 
-    shown = [one for outputs in run(NOTEBOOK) for one in outputs]
-    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    page = ROOT / "docs" / "python.ipynb"
+    shown = [one for outputs in notebook.run(page) for one in outputs]
+    cells = json.loads(page.read_text(encoding="utf-8"))["cells"]
     stored = [one for cell in cells for one in cell.get("outputs", [])]
     assert kinds(shown) == kinds(stored)
     assert sum("image/png" in kind for kind in kinds(shown)) == 3
@@ -95,3 +119,74 @@ def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored() -> None:
     printed = [["".join(one["text"]) for one in each if "text" in one] for each in (shown, stored)]
     assert printed[0] == printed[1]
     assert "n = 0.369 instead of" in printed[0][0]
+
+
+@pytest.fixture(scope="module")
+def report(small_run: Path) -> str:
+    """The words of the page."""
+    page = (small_run / "report.html").read_text("utf-8")
+    page = re.sub(r"<(script|style|svg)\b.*?</\1>", " ", page, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", page)).split())
+
+
+def test_numbers_of_the_initial_model_are_those_that_the_diagnosis_began_with(loaded: LoadedResults) -> None:
+    moved = loaded.tables["diagnosis/moved"]
+    first = moved[moved["added"] == ""].set_index(["parameter", "vine"])
+    for entry in loaded.fit.numbers:
+        row = first.loc[(entry.key, entry.vine)]
+        assert row["value"] == pytest.approx(entry.value, rel=1e-9)
+        assert row["sigma"] == pytest.approx(entry.sigma, rel=1e-9)
+
+
+def test_errors_and_floor_of_the_ladder_are_those_of_the_comparison(loaded: LoadedResults) -> None:
+    compared = loaded.tables["comparison"]
+    rms_m = math.sqrt(float(np.mean(compared["rms_position_m"] ** 2)))  # as many replicates in every condition
+    assert loaded.ladder["rms_in_sample_m"].iloc[0] == pytest.approx(rms_m, rel=1e-9)
+    floor_m = math.sqrt(float(np.mean(compared["replicate_floor_m"] ** 2)))
+    assert loaded.ladder["floor_m"].tolist() == pytest.approx([floor_m] * len(loaded.ladder), rel=1e-9)
+    located = loaded.tables["diagnosis/conditions"].set_index("condition")
+    for row in compared.itertuples():
+        assert located.loc[str(row.condition), "rms_m"] == pytest.approx(row.rms_position_m, rel=1e-9)
+
+
+def test_the_report_quotes_the_final_model_first_and_says_the_same_as_the_page_in_memory(
+    report: str, loaded: LoadedResults
+) -> None:
+    diagnosis = loaded.diagnosis
+    assert diagnosis is not None
+    last = loaded.ladder.iloc[-1]
+    first_mm, last_mm = (number(1e3 * loaded.ladder["rms_left_out_m"].iloc[k]) for k in (0, -1))
+    assert f"{first_mm} → {last_mm} mm" in report
+    assert f"replicate scatter {number(1e3 * last['floor_m'])} mm" in report
+    for entry in diagnosis.parameters:
+        assert estimate_text(entry).partition(" = ")[2].partition(" (")[0].split(" N·")[0].split(" kPa")[0] in report
+    assert report.index("The final model:") < report.index("The initial model, which the diagnosis refutes")
+    for fact in summary_facts(diagnosis, diagnosis.ladder):
+        assert f"{fact.question} {fact.answer}" in report
+        assert fact.note in report
+
+
+def test_the_command_line_and_the_explorer_give_the_numbers_of_the_files(
+    small_run: Path, loaded: LoadedResults
+) -> None:
+    said, compared = run("compare", small_run), loaded.tables["comparison"]
+    for row in compared.itertuples():
+        line = next(line for line in said.splitlines() if str(row.condition) in line)
+        assert f"{1e3 * row.rms_position_m:.3f}" in line
+        assert f"{1e3 * row.replicate_floor_m:.3f}" in line
+    campaign = open_campaign(small_run)
+    assert dict(campaign.numbers) == {entry.name: entry.value for entry in loaded.fit.numbers}
+    assert dict(campaign.floors_m) == compared.set_index("condition")["replicate_floor_m"].to_dict()
+
+
+def test_the_worst_condition_is_one(loaded: LoadedResults, report: str, small_run: Path) -> None:
+    compared = loaded.tables["comparison"]
+    worst = str(compared.loc[compared["rms_position_m"].idxmax(), "condition"])
+    assert loaded.tables["diagnosis/conditions"]["condition"].iloc[0] == worst
+    pressure = f"{float(worst.partition('kPa')[0].rpartition('_')[2]):g} kPa"
+    assert f"Worst is {worst}" in report
+    assert loaded.diagnosis is not None
+    assert loaded.diagnosis.where[0].startswith(
+        (f"The model fails most at {pressure}", "In no condition does the mean")
+    )
+    assert pressure in (small_run / "figures" / "before_after.svg").read_text("utf-8")
