@@ -17,30 +17,13 @@ import vinetrack
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "vinetrack"
-RULES = PACKAGE / "pipeline" / "Snakefile"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-FLOORS = (
-    {"core"},
-    {"tracks"},
-    {"effects"},
-    {"experiment"},
-    {"video"},
-    {"dynamics"},
-    {"kinematics"},
-    {"inference"},
-    {"planning"},
-    {"diagnosis"},
-    {"narrative"},
-    {"paper"},
-    {"laboratory"},
-    {"results"},
-    {"figures"},
-    {"report"},
-    {"pipeline"},
-    {"interface", "pages"},
-    {"cli"},
+ROOMS = (
+    "core tracks effects experiment video dynamics kinematics inference planning diagnosis narrative paper laboratory "
+    "results figures report pipeline interface|pages cli"
 )
+FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in floor.split("|")}
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
 
 BUDGETS = {
@@ -120,10 +103,6 @@ def rooms_used(path: Path) -> set[str]:
     return {name.split(".")[1] for name in imports(path) if name.startswith("vinetrack.")}
 
 
-def floor_of(name: str) -> int:
-    return next(i for i, floor in enumerate(FLOORS) if name in floor)
-
-
 def constants(path: Path) -> int:
     """Module-level names in capitals that a file assigns."""
     count = 0
@@ -142,20 +121,17 @@ def test_every_room_stays_within_its_budget() -> None:
             lines = path.read_text(encoding="utf-8").count("\n")
             size[room(path)] = [a + b for a, b in zip(size[room(path)], (lines, 1, constants(path)), strict=True)]
     over = {
-        name: tuple(size[name]) for name in size if any(a > b for a, b in zip(size[name], BUDGETS[name], strict=True))
+        name: found for name, found in size.items() if any(a > b for a, b in zip(found, BUDGETS[name], strict=True))
     }
     assert not over, "rooms over their budget of lines, files, constants: take something out"
 
 
-def test_a_file_uses_its_own_floor_and_those_below() -> None:
-    above = {
-        (str(path.relative_to(PACKAGE)), used)
-        for path in FILES
-        if path != PACKAGE / "__init__.py"
-        for used in rooms_used(path)
-        if floor_of(used) > floor_of(room(path))
-    }
+def test_a_file_uses_its_own_floor_and_those_below_and_nothing_but_itself_uses_the_laboratory() -> None:
+    rooms = {path: rooms_used(path) - {room(path)} for path in FILES}
+    top = len(FLOORS)  # where the package's own __init__.py stands
+    above = [(path, one) for path, used in rooms.items() for one in used if FLOORS[one] > FLOORS.get(room(path), top)]
     assert not above
+    assert not [path for path, used in rooms.items() if "laboratory" in used]
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
@@ -171,19 +147,9 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert not users
 
 
-def test_nothing_but_itself_uses_the_laboratory() -> None:
-    users = {path for path in FILES if "laboratory" in rooms_used(path) and room(path) != "laboratory"}
-    assert not users
-
-
 def test_a_room_that_does_not_compute_starts_without_heavy_libraries() -> None:
-    late = {
-        (str(path.relative_to(PACKAGE)), name)
-        for path in FILES
-        if room(path) not in HEAVY_AT_IMPORT
-        for name in imports(path, at_import_only=True)
-        if name.split(".")[0] in HEAVY
-    }
+    quick = [path for path in FILES if room(path) not in HEAVY_AT_IMPORT]
+    late = [(path, name) for path in quick for name in imports(path, True) if name.split(".")[0] in HEAVY]
     assert not late
 
 
@@ -212,19 +178,20 @@ def test_the_page_on_the_architecture_lists_the_rooms_from_the_bottom_to_the_top
     table = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").partition("## Data flow")[0]
     rows = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.splitlines() if line.startswith("| `")]
     listed = [name for row in rows for name in row]
-    assert sorted(listed) == sorted(name for floor in FLOORS for name in floor)
-    assert [floor_of(name) for name in listed] == sorted(floor_of(name) for name in listed)
+    assert sorted(listed) == sorted(FLOORS)
+    assert listed == sorted(listed, key=FLOORS.__getitem__)
 
 
 def test_a_snakefile_has_rules_only() -> None:
-    text = RULES.read_text(encoding="utf-8")
+    text = (PACKAGE / "pipeline" / "Snakefile").read_text(encoding="utf-8")
     assert not [line for line in text.splitlines() if line.startswith(("def ", "class ", "    def "))]
 
 
-def test_no_two_test_files_share_a_name() -> None:
+def test_no_two_modules_and_no_two_test_files_share_a_name() -> None:
     """Pytest imports test files by their name alone: the second of two would not be run. It knows each conftest.py."""
-    names = [path.name for path in (ROOT / "tests").rglob("*.py") if path.name != "conftest.py"]
-    assert sorted(names) == sorted(set(names))
+    for paths in (FILES, (ROOT / "tests").rglob("*.py")):
+        names = Counter(path.stem for path in paths if path.stem != "conftest" and not path.stem.startswith("__"))
+        assert not [name for name, times in names.items() if times > 1]
 
 
 def test_a_benchmark_finds_what_it_imports() -> None:
@@ -255,23 +222,14 @@ def test_a_name_of_the_python_interface_is_documented(name: str) -> None:
 
 
 def test_a_module_takes_no_private_name_of_another_room() -> None:
-    private = [
-        (str(path.relative_to(PACKAGE)), f"{node.module}.{alias.name}")
-        for path in FILES
-        for node in ast.walk(parsed(path))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vinetrack.")
-        if str(node.module).split(".")[1] != room(path)
-        for alias in node.names
-        if any(
-            part.startswith("_") and not part.startswith("__") for part in (*str(node.module).split("."), alias.name)
-        )
-    ]
+    private = []
+    for path in FILES:
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vinetrack."):
+                parts = [*str(node.module).split("."), *(alias.name for alias in node.names)]
+                if parts[1] != room(path) and any(re.match("_[^_]", part) for part in parts):
+                    private.append((path, parts))
     assert not private
-
-
-def test_no_two_modules_share_a_name() -> None:
-    names = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
-    assert not [name for name, times in names.items() if times > 1]
 
 
 def test_every_deliberate_fault_still_finds_the_text_that_it_alters() -> None:
