@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 import typer.main
-import yaml
 from commanded import run, succeed
 from doc_commands import Shown, pieces, printed
 from own_effect import PAGE as OWN_EFFECT
@@ -61,8 +60,11 @@ def test_commands_on_the_page_exist_with_their_options(page: Path) -> None:
         assert asked - {"--help"} <= known, line
 
 
-def test_every_page_of_the_docs_is_reached_from_the_readme() -> None:
-    assert {page.name for page in PAGES[1:]} <= {Path(link).name for link in links(PAGES[0])}
+def test_every_page_of_the_docs_is_reached_from_the_readme_and_is_in_the_navigation_once() -> None:
+    names = [page.name for page in PAGES[1:]]
+    assert set(names) <= {Path(link).name for link in links(PAGES[0])}
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    assert sorted(re.findall(r"[\w-]+\.md\b", navigation)) == sorted(names)
 
 
 def test_the_readme_is_short_and_shows_a_result_and_every_command_a_person_gives() -> None:
@@ -81,20 +83,6 @@ def test_the_citation_and_the_changelog_name_the_version_of_the_package() -> Non
     assert released[:1] == [vinetrack.__version__]
 
 
-# The site of the documentation leaves no page out, and the reference names only what exists.
-def pages(entry: object) -> list[str]:
-    """Files that an entry of the site's navigation names, nested ones included."""
-    if isinstance(entry, str):
-        return [entry]
-    parts = entry.values() if isinstance(entry, dict) else entry
-    return [page for part in parts for page in pages(part)]  # type: ignore[attr-defined]
-
-
-def test_every_page_is_in_the_navigation_once() -> None:
-    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
-    assert sorted(pages(site["nav"])) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
-
-
 def test_the_reference_holds_all_that_the_package_offers() -> None:
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     offered = set(vinetrack.__all__) - {"__version__", "effects", "FitError"}
@@ -102,10 +90,11 @@ def test_the_reference_holds_all_that_the_package_offers() -> None:
 
 
 # docs/design.md: its commands print what stands below them, its pictures are made by them, its Python runs.
-PAGE = Path(__file__).parents[1] / "docs" / "design.md"
+DESIGN = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-COMMANDS_PAGE = [piece for piece in pieces(PAGE.read_text(encoding="utf-8")) if isinstance(piece, Shown)]
-QUICK = [shown for shown in COMMANDS_PAGE if "campaign" not in shown.arguments and "vine" not in shown.arguments]
+QUICK = [
+    piece for piece in pieces(DESIGN) if isinstance(piece, Shown) and not {"campaign", "vine"} & {*piece.arguments}
+]
 
 
 @pytest.mark.parametrize("shown", QUICK, ids=lambda shown: " ".join(shown.arguments[:4]))
@@ -119,7 +108,7 @@ def test_a_command_prints_what_stands_below_it(shown: Shown, tmp_path: Path, mon
 
 
 def test_the_python_on_the_page_runs() -> None:
-    code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    code = re.search(r"```python\n(.*?)```", DESIGN, re.DOTALL)
     assert code is not None
     known: dict[str, object] = {}
     exec(code[1].replace("vt.predictive_inputs(trial))  ", "vt.predictive_inputs(trial), samples=50)  "), known)
@@ -127,39 +116,28 @@ def test_the_python_on_the_page_runs() -> None:
 
 
 # docs/own_effect.md: its effect and settings work as they stand there.
-SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\na,a.csv,12,100,300,20,3\n"
-
-
-@pytest.fixture
-def experiment(tmp_path: Path) -> Path:
-    """A folder with the effect and the settings as the page writes them."""
-    write_effect(tmp_path)
-    (tmp_path / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
-    (tmp_path / "trials.csv").write_text(SHEET, encoding="utf-8")
-    (tmp_path / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
-    return tmp_path
-
-
-def test_its_effect_goes_through_every_stage_and_stands_in_the_provenance(experiment: Path, tmp_path: Path) -> None:
-    results = tmp_path / "results"
+def test_its_effect_is_printed_as_shown_and_goes_through_every_stage_into_the_provenance(tmp_path: Path) -> None:
+    experiment, results = tmp_path / "mine", tmp_path / "results"
+    experiment.mkdir()
+    write_effect(experiment)
+    (experiment / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
+    columns = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"
+    (experiment / "trials.csv").write_text(f"{columns}\na,a.csv,12,100,300,20,3\n", encoding="utf-8")
+    (experiment / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
+    shown = next(piece for piece in pieces(OWN_EFFECT.read_text(encoding="utf-8")) if isinstance(piece, Shown))
+    assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
+    said = run("effects", "spring_line", "--experiment", experiment).stdout
+    assert said.strip().replace(str(experiment), "my_experiment") == shown.output
     for stage in ("trials", "damping", "model", "figures", "report"):
         succeed(stage, experiment, results, "--settings", '{"figures": {"dpi": 50}}')
     assert "spring_line" in json.loads((results / "fit.json").read_text())["model"]
     assert "spring_line.py" in json.loads((results / "provenance.json").read_text())["inputs"]
 
 
-def test_what_the_page_shows_of_the_effect_is_what_is_printed(experiment: Path) -> None:
-    shown = next(piece for piece in pieces(OWN_EFFECT.read_text(encoding="utf-8")) if isinstance(piece, Shown))
-    assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
-    said = run("effects", "spring_line", "--experiment", experiment).stdout
-    assert said.strip().replace(str(experiment), "my_experiment") == shown.output
-
-
 # Examples in docstrings say what happens, and every name that a user calls from Python has one.
-ROOT_EXAMPLES = Path(vinetrack.__file__).parent
 MODULES = sorted(
-    ".".join(("vinetrack", *path.relative_to(ROOT_EXAMPLES).with_suffix("").parts))
-    for path in ROOT_EXAMPLES.rglob("*.py")
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for path in (ROOT / "vinetrack").rglob("*.py")
     if path.name != "__init__.py" and ">>> " in path.read_text(encoding="utf-8")
 )
 FITTED = ("vinetrack.interface.loaded", "vinetrack.inference.fit", "vinetrack.inference.fit_summary")

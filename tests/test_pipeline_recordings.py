@@ -70,30 +70,25 @@ def film_all(folder: Path, pressures_kPa: dict[str, int], camera: Camera) -> dic
     return {trial.stated.name: film(trial, filming, trial.stated.video, 40 + i) for i, trial in enumerate(grown)}
 
 
-def without_index(path: Path, out: Path) -> None:
-    """The same recording as cameras write it, index last, and cut off before it."""
-    with av.open(str(path)) as source, av.open(str(out), "w") as target:
+def add_bad_ones(videos: Path) -> None:
+    whole, headless = (videos / "p36.mp4").read_bytes(), videos / "beheaded.mp4"
+    (videos / "part.mp4").write_bytes(whole[: int(0.75 * len(whole))])
+    (videos / "letter.mp4").write_text("Dear all, the recording is attached.\n" * 20)
+    # The same recording as cameras write it, index last, and cut off before it.
+    with av.open(str(videos / "p36.mp4")) as source, av.open(str(headless), "w") as target:
         stream = target.add_stream_from_template(source.streams.video[0])
         for packet in source.demux(video=0):
             if packet.dts is not None:
                 packet.stream = stream
                 target.mux(packet)
-    out.write_bytes(out.read_bytes()[: int(0.8 * out.stat().st_size)])
-
-
-def add_bad_ones(folder: Path) -> None:
-    videos = folder / "videos"
-    whole = (videos / "p36.mp4").read_bytes()
-    (videos / "part.mp4").write_bytes(whole[: int(0.75 * len(whole))])
-    without_index(videos / "p36.mp4", videos / "beheaded.mp4")
-    (videos / "letter.mp4").write_text("Dear all, the recording is attached.\n" * 20)
+    headless.write_bytes(headless.read_bytes()[: int(0.8 * headless.stat().st_size)])
 
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
     workdir = tmp_path_factory.mktemp("filmed")
     truth = film_all(workdir / "vines", GOOD, WARPED)
-    add_bad_ones(workdir / "vines")
+    add_bad_ones(workdir / "vines" / "videos")
     write_sheet(workdir / "vines", GOOD | dict.fromkeys(BAD, 36), BOARD + FEW)
     few = ("damping={resamples: 200}", "figures={formats: [svg]}")
     done = snakemake(workdir, "--cores", "2", "--config", "experiment=vines", *few)
@@ -145,18 +140,17 @@ def test_a_good_recording_is_tracked_within_a_third_of_a_pixel_and_a_thousandth_
     assert 0 < float(filmed.rows[name]["scale_rel_sigma"]) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["beheaded", "letter", "gone"])
-def test_a_recording_that_cannot_be_read_fails_with_its_sentence(filmed: Filmed, name: str) -> None:
-    assert filmed.rows[name]["status"] == "failed"
-    assert filmed.rows[name]["reason"].startswith(f"{name}.mp4: ")
-    assert filmed.rows[name]["reason"] in (filmed.results / "report.html").read_text(encoding="utf-8")
-    assert len((filmed.results / "tracks" / f"{name}.csv").read_text().splitlines()) == 1
-
-
-def test_a_recording_without_its_end_gives_what_is_there_and_says_so(filmed: Filmed) -> None:
-    row = filmed.rows["part"]
+def test_a_recording_that_cannot_be_read_fails_with_its_sentence_and_one_without_its_end_gives_what_is_there(
+    filmed: Filmed,
+) -> None:
+    page = (filmed.results / "report.html").read_text(encoding="utf-8")
+    for name in ("beheaded", "letter", "gone"):
+        assert filmed.rows[name]["status"] == "failed"
+        assert filmed.rows[name]["reason"].startswith(f"{name}.mp4: ")
+        assert filmed.rows[name]["reason"] in page
+        assert len((filmed.results / "tracks" / f"{name}.csv").read_text().splitlines()) == 1
+    row, whole = filmed.rows["part"], filmed.truth["p36"]
     assert row["status"] == "warning"
-    whole = filmed.truth["p36"]
     assert 30 < float(row["n_frames"]) < whole.time_s.size
     assert spread_px(errors_px(filmed.results, "part", whole)) < 0.35
 
@@ -186,33 +180,23 @@ def test_check_says_of_the_same_folder_what_is_wrong(filmed: Filmed) -> None:
     assert [line.split(":")[0] for line in lines] == ["error"] * 3 + ["warning"]
 
 
-@pytest.fixture(scope="module")
-def plainly_filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Truth]:
-    """One recording through a camera without distortion or tilt, for scales that know of neither."""
-    folder = tmp_path_factory.mktemp("plain") / "vine"
-    return folder, film_all(folder, {"p36": 36}, PLAIN)["p36"]
-
-
-@pytest.mark.parametrize(
-    ("settings", "rel_sigma"),
-    [
-        ("calibration: {kind: two_points, from_px: [100, 60], to_px: [600, 60], length_mm: 120}\n", 0.5 * 2**0.5 / 500),
+def test_a_scale_that_is_given_serves_as_well(tmp_path: Path) -> None:
+    """Through a camera without distortion or tilt, for scales that know of neither."""
+    folder = tmp_path / "vine"
+    truth = film_all(folder, {"p36": 36}, PLAIN)["p36"]
+    two_points = "{kind: two_points, from_px: [100, 60], to_px: [600, 60], length_mm: 120}"
+    for settings, rel_sigma in (
+        (f"calibration: {two_points}\n", 0.5 * 2**0.5 / 500),
         ("calibration: {kind: mm_per_px, mm_per_px: 0.24}\n", np.nan),
         ("mm_per_px: 0.24\n", np.nan),
-    ],
-    ids=["two_points", "mm_per_px", "column"],
-)
-def test_a_scale_that_is_given_serves_as_well(
-    plainly_filmed: tuple[Path, Truth], tmp_path: Path, settings: str, rel_sigma: float
-) -> None:
-    folder, truth = plainly_filmed
-    write_sheet(folder, {"p36": 36}, settings)
-    for stage in ("trials", "damping"):
-        succeed(stage, folder, tmp_path)
-    row = read_rows(tmp_path / "trials.csv")["p36"]
-    assert float(row["mm_per_px"]) == pytest.approx(0.24, rel=1e-9)
-    assert float(row["scale_rel_sigma"]) == pytest.approx(rel_sigma, rel=1e-9, nan_ok=True)
-    assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35
+    ):
+        write_sheet(folder, {"p36": 36}, settings)
+        for stage in ("trials", "damping"):
+            succeed(stage, folder, tmp_path)
+        row = read_rows(tmp_path / "trials.csv")["p36"]
+        assert float(row["mm_per_px"]) == pytest.approx(0.24, rel=1e-9)
+        assert float(row["scale_rel_sigma"]) == pytest.approx(rel_sigma, rel=1e-9, nan_ok=True)
+        assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35
 
 
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")

@@ -12,12 +12,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-# Setting up from a bare clone, as far as it can be tried without the network: the make targets and the lock.
 from vinetrack.pipeline.stages import STAGES
 
 ROOT = Path(__file__).parents[1]
-LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
-DOCS_LOCK = (ROOT / "requirements-docs.lock").read_text(encoding="utf-8")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 MAKE = shutil.which("make")
@@ -36,21 +33,18 @@ def test_an_installation_that_is_up_to_date_is_left_alone(tmp_path: Path) -> Non
     assert subprocess.run(asked, cwd=tmp_path, env={"PATH": "/usr/bin:/bin"}, check=False).returncode == 1
 
 
-def locked(lock: str = LOCK) -> set[str]:
-    return set(re.findall(r"^([a-z0-9][a-z0-9._-]*)==", lock, flags=re.MULTILINE))
+def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_no_path() -> None:
+    def locked(lock: str) -> set[str]:
+        return set(re.findall(r"^([a-z0-9][a-z0-9._-]*)==", lock, flags=re.MULTILINE))
 
-
-def test_everything_the_project_asks_for_is_locked() -> None:
+    lock, docs = ((ROOT / f"requirements{which}.lock").read_text(encoding="utf-8") for which in ("", "-docs"))
     wanted = [*PROJECT["dependencies"], *(name for extra in EXTRAS.values() for name in extra)]
     names = {re.split(r"[<>=!~\[; ]", requirement)[0].lower().replace("_", "-") for requirement in wanted}
-    assert names - locked() - locked(DOCS_LOCK) == set()
-
-
-def test_every_locked_version_has_hashes_and_the_lock_names_no_index_and_no_path() -> None:
-    entries = re.split(r"^(?=[a-z0-9])", LOCK, flags=re.MULTILINE)[1:]
-    assert len(entries) == len(locked()) > 80
+    assert names - locked(lock) - locked(docs) == set()
+    entries = re.split(r"^(?=[a-z0-9])", lock, flags=re.MULTILINE)[1:]
+    assert len(entries) == len(locked(lock)) > 80
     assert all("--hash=sha256:" in entry for entry in entries)
-    assert not re.search(r"https?://|file:|^--|^-[a-z]|/", LOCK, flags=re.MULTILINE)
+    assert not re.search(r"https?://|file:|^--|^-[a-z]|/", lock, flags=re.MULTILINE)
 
 
 def test_continuous_integration_is_a_sound_script() -> None:
@@ -59,15 +53,10 @@ def test_continuous_integration_is_a_sound_script() -> None:
     subprocess.run(["bash", "-n", str(script)], check=True)
 
 
-# The file for hosted machines and the profiles of Snakemake name what is here: versions, files, targets, options.
-
-
-JOBS = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8"))["jobs"]
-
-
 def test_files_extras_targets_and_the_oldest_python_that_jobs_name_are_there() -> None:
-    assert PROJECT["requires-python"] == f">={JOBS['tests']['strategy']['matrix']['python'][0]}"
-    run = "\n".join(step["run"] for job in JOBS.values() for step in job["steps"] if "run" in step)
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8"))["jobs"]
+    assert PROJECT["requires-python"] == f">={jobs['tests']['strategy']['matrix']['python'][0]}"
+    run = "\n".join(step["run"] for job in jobs.values() for step in job["steps"] if "run" in step)
     for path in re.findall(r"[\w./-]+\.(?:py|lock)\b", run):
         assert (ROOT / path).is_file(), path
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))

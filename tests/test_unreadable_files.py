@@ -6,6 +6,7 @@ import errno
 import json
 import multiprocessing
 import os
+from itertools import product
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -24,12 +25,7 @@ from vinetrack.pipeline.workflow import make_plan
 from vinetrack.video.frames import RecordingError, inspect_recording
 
 HEADER = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
-NO_FILES = {
-    "pipe": "a pipe or a device",
-    "zero": "a pipe or a device",
-    "folder": "a folder",
-    "shut": "permission denied",
-}
+NO_FILES = dict.fromkeys(("pipe", "zero"), "a pipe or a device") | {"folder": "a folder", "shut": "permission denied"}
 
 
 @pytest.fixture
@@ -65,32 +61,17 @@ def test_what_is_no_file_is_named_and_not_watched_and_fails_alone(vines: Path, t
     assert all(words in rows[name]["reason"] for name, words in NO_FILES.items())
 
 
-def test_provenance_says_what_could_not_be_read(vines: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Path, "open", Mock(side_effect=PermissionError(errno.EACCES, "permission denied", "shut")))
-    inputs = describe_run(vines, [vines / "shut", vines / "pipe"], {}, ())["inputs"]
+def test_provenance_says_what_could_not_be_read_and_a_full_disk_is_said_as_such(
+    vines: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as shut:
+        shut.setattr(Path, "open", Mock(side_effect=PermissionError(errno.EACCES, "permission denied", "shut")))
+        inputs = describe_run(vines, [vines / "shut", vines / "pipe"], {}, ())["inputs"]
     assert inputs == {"shut": "unreadable", "pipe": "missing"}
-
-
-def test_a_full_disk_is_said_as_such(vines: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "write_bytes", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     done = run("trials", vines, tmp_path / "out")
     assert done.exit_code == 1
     assert done.output.startswith("The disk is full: ")
-
-
-def _pictures(folder: Path) -> None:
-    """A folder of a few pictures, too few for a recording."""
-    folder.mkdir()
-    for number in range(5):
-        cv2.imwrite(str(folder / f"f{number:04d}.png"), np.full((40, 60), 20 * number, np.uint8))
-
-
-def _no_file(path: Path, kind: str) -> None:
-    """A FIFO, or a link that ends at a device or at itself."""
-    if kind == "pipe":
-        os.mkfifo(path)
-    else:
-        path.symlink_to("/dev/zero" if kind == "device" else path.name)
 
 
 PLACES = {
@@ -107,8 +88,6 @@ PLACES = {
     "settings": ("experiment.yaml", "track,good.csv", ""),
     "sheet": ("trials.csv", "", ""),
 }
-
-
 SOUND = {
     "log.csv": "time_s,pressure_kPa\n0,20\n5,20\n",
     "stick.py": (
@@ -127,8 +106,10 @@ def _experiment(folder: Path, place: str, kind: str) -> None:
     name, recording, setting = PLACES[place]
     column, _, value = recording.partition(",")
     write_track(folder / "good.csv", 12, 20.0, 1)
-    _pictures(folder / "shots")
-    _pictures(folder / "boards")
+    for pictures in ("shots", "boards"):  # of a few pictures, too few for a recording
+        (folder / pictures).mkdir()
+        for number in range(5):
+            cv2.imwrite(str(folder / pictures / f"f{number:04d}.png"), np.full((40, 60), 20 * number, np.uint8))
     rate = "1000" if column == "video" else ""
     trace = name if place == "pressure trace" else ""
     scale = "" if setting.startswith("image") else "0.3"
@@ -140,48 +121,41 @@ def _experiment(folder: Path, place: str, kind: str) -> None:
         (folder / "experiment.yaml").write_text(setting + "\n")
     if kind:
         (folder / name).unlink(missing_ok=True)
-        _no_file(folder / name, kind)
+    if kind == "pipe":
+        os.mkfifo(folder / name)
+    elif kind:
+        (folder / name).symlink_to("/dev/zero" if kind == "device" else (folder / name).name)
     elif name in SOUND:
         (folder / name).write_text(SOUND[name])
 
 
 def _check_all(root: Path) -> None:
     """What `vinetrack check` says of every experiment, beside each."""
-    for place in PLACES:
-        for kind in KINDS:
-            folder = root / kind / place
-            done = CliRunner().invoke(app, ["check", str(folder)])
-            ended = done.exception is None or isinstance(done.exception, SystemExit)
-            said = " ".join(done.output.split()) if ended else repr(done.exception)
-            folder.with_name(f"{place}.txt").write_text(f"{done.exit_code} {said}")
-
-
-@pytest.fixture(scope="module")
-def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every experiment checked, in a process that is ended where it waits for a pipe."""
-    root = tmp_path_factory.mktemp("places")
-    for place in PLACES:
-        for kind in KINDS:
-            _experiment(root / kind / place, place, kind)
-    process = multiprocessing.get_context("spawn").Process(target=_check_all, args=(root,))
-    process.start()
-    process.join(LONGEST_S)
-    process.kill()
-    return root
+    for place, kind in product(PLACES, KINDS):
+        done = CliRunner().invoke(app, ["check", str(root / kind / place)])
+        ended = done.exception is None or isinstance(done.exception, SystemExit)
+        said = " ".join(done.output.split()) if ended else repr(done.exception)
+        (root / kind / f"{place}.txt").write_text(f"{done.exit_code} {said}")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("place", PLACES)
-def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(checked: Path, place: str, kind: str) -> None:
-    answer = checked / kind / f"{place}.txt"
-    assert answer.exists(), "it waits for the pipe, or for one before it"
-    status, _, said = answer.read_text().partition(" ")
-    assert "Error(" not in said
-    # A link that leads to itself is a file that is missing, and a picture may be.
-    if kind != "itself":
-        assert "it is a pipe or a device, not a file" in said
-    assert int(status) == (0 if (place, kind) == ("picture of a recording", "itself") else 1)
+def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(tmp_path: Path) -> None:
+    for place, kind in product(PLACES, KINDS):
+        _experiment(tmp_path / kind / place, place, kind)
+    # In a process that is ended where it waits for a pipe.
+    process = multiprocessing.get_context("spawn").Process(target=_check_all, args=(tmp_path,))
+    process.start()
+    process.join(LONGEST_S)
+    process.kill()
+    for place, kind in product(PLACES, KINDS):
+        answer = tmp_path / kind / f"{place}.txt"
+        assert answer.exists(), f"it waits for {place}, {kind}"
+        status, _, said = answer.read_text().partition(" ")
+        assert "Error(" not in said
+        # A link that leads to itself is a file that is missing, and a picture may be.
+        if kind != "itself":
+            assert "it is a pipe or a device, not a file" in said, (place, kind)
+        assert int(status) == (0 if (place, kind) == ("picture of a recording", "itself") else 1), (place, kind)
 
 
 @pytest.mark.parametrize("place", ["track of a vine", "picture of a recording", "pressure trace", "effect"])
