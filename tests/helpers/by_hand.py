@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,25 +58,15 @@ class Vine:
         return 0.5 * (self.P - self.P_y) * self.A + self.m(x) * G * self.down - 0.5 * self.B * max(v, 0.0) ** N
 
     def trial(self, **others: object) -> Trial:
-        fields: dict[str, object] = {
-            "name": "t",
-            "vine": "v",
-            "diameter_m": self.D,
-            "thickness_m": self.t,
-            "length_m": self.L,
-            "pressure_Pa": self.P,
-            "yield_pressure_Pa": self.P_y,
-            "payload_kg": self.payload,
-            "growth_angle_rad": math.acos(self.down),
-            "chamber_m3": 3.7e-3,
-            "inlet_m": 6e-3,
-        }
+        sizes = {"diameter_m": self.D, "thickness_m": self.t, "length_m": self.L, "payload_kg": self.payload}
+        supply = {"pressure_Pa": self.P, "yield_pressure_Pa": self.P_y, "chamber_m3": 3.7e-3, "inlet_m": 6e-3}
+        fields = {"name": "t", "vine": "v", "growth_angle_rad": math.acos(self.down), **sizes, **supply}
         return Trial(**{**fields, **others})  # type: ignore[arg-type]
 
 
 LOADED = Vine(D=24e-3, t=200e-6, L=0.28, P=28e3, P_y=3e3, B=6.44, payload=35.6e-3)
 BARE = Vine(D=12e-3, t=100e-6, L=0.30, P=40e3, P_y=5e3, B=1.83)
-LEVEL = Vine(D=24e-3, t=200e-6, L=0.28, P=28e3, P_y=3e3, B=6.44, payload=35.6e-3, down=0.0)
+LEVEL = replace(LOADED, down=0.0)
 
 
 def whole_catalogue(sizes: Mapping[str, float]) -> Model:

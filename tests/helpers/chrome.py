@@ -57,9 +57,8 @@ class Chrome:
         until(lambda: port_file.exists() and port_file.read_text().count("\n") >= 1, "the browser to start", 60)
         port = port_file.read_text().splitlines()[0]
         until(lambda: self._pages(port) != [], "the first page", 30)
-        self._socket: WebSocketClientConnection = self._loop.run_until_complete(
-            _connect(self._pages(port)[0]["webSocketDebuggerUrl"])
-        )
+        address = self._pages(port)[0]["webSocketDebuggerUrl"]
+        self._socket = self._loop.run_until_complete(_connect(address))
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
         self.size(width, height)
@@ -81,8 +80,7 @@ class Chrome:
     def send(self, method: str, **params: Any) -> dict[str, Any]:
         """One command and its answer."""
         self._count += 1
-        number = self._count
-        return self._loop.run_until_complete(self._exchange(number, method, params))
+        return self._loop.run_until_complete(self._exchange(self._count, method, params))
 
     async def _exchange(self, number: int, method: str, params: dict[str, Any]) -> dict[str, Any]:
         await self._socket.write_message(json.dumps({"id": number, "method": method, "params": params}))
@@ -162,9 +160,7 @@ async def _connect(address: str) -> WebSocketClientConnection:
 def until(asked: Callable[[], Any], what: str, seconds: float = 60) -> Any:
     """Ask until the answer is true; an error that names what was waited for, if it never is."""
     end = time.monotonic() + seconds
-    while True:
-        answer = asked()
-        if answer:
-            return answer
+    while not (answer := asked()):
         assert time.monotonic() < end, f"waited {seconds:g} s for {what}"
         time.sleep(0.05)
+    return answer

@@ -82,13 +82,10 @@ def film_of(experiment: Path, results: Path, trial: str) -> Path:
     analysed = results / "analysed" / f"{trial}.json"
     axis = {"axis": {"from_px": [20, 48], "to_px": [940, 48], "width_px": 30}}
     analysed.write_text(json.dumps(json.loads(analysed.read_text()) | axis))
-    sheet = experiment / "trials.csv"
-    head, *rows = sheet.read_text().splitlines()
-    rows = [
-        f"{row},videos/{trial}.mp4".replace(f"tracks/{trial}.csv", "") if row.startswith(f"{trial},") else f"{row},"
-        for row in rows
-    ]
-    sheet.write_text("\n".join([f"{head},video", *rows]) + "\n")
+    sheet = pd.read_csv(experiment / "trials.csv")
+    filmed = sheet["trial"] == trial
+    sheet = sheet.assign(video=np.where(filmed, f"videos/{trial}.mp4", ""), track=sheet["track"].mask(filmed))
+    sheet.to_csv(experiment / "trials.csv", index=False)
     return path
 
 

@@ -42,30 +42,25 @@ def one_round(verdict: str, *answers: str, model: list[str] | None = None, kind:
     effects = [*answers, "leak", "time_base"]
     n = len(effects)
     matrix = [[1.0 if i == j else 0.97 if {i, j} == {0, 1} else 0.2 for j in range(n)] for i in range(n)]
-    return {
-        "model": model or BASE,
-        "verdict": verdict,
-        "answer_set": list(answers),
-        "explanation": f"In the words of the diagnosis: {verdict}.",
-        "ranking": ranking(*answers, kind=kind),
-        "cosines": {"effects": effects, "matrix": matrix},
-    }
+    told = {"answer_set": list(answers), "explanation": f"In the words of the diagnosis: {verdict}."}
+    found = {"ranking": ranking(*answers, kind=kind), "cosines": {"effects": effects, "matrix": matrix}}
+    return {"model": model or BASE, "verdict": verdict, **told, **found}
+
+
+ANSWERS = {"missing": ["reservoir_depletion"], "ambiguous": ["air_drag", "inlet_loss"], "artefact": ["length_scale"]}
 
 
 def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
     """A whole diagnosis; `missing` has reservoir depletion added and nothing left."""
-    answers = {
-        "missing": ["reservoir_depletion"],
-        "ambiguous": ["air_drag", "inlet_loss"],
-        "artefact": ["length_scale"],
-    }
-    named = answers.get(verdict, [])
+    named = ANSWERS.get(verdict, [])
     rounds = [one_round(verdict, *named, kind="measurement" if verdict == "artefact" else "physical")]
     added = named if verdict == "missing" else []
     parameters = [number("eversion_damping.n", "n", 0.37, 0.004)]
     if added:
         rounds.append(one_round("adequate", model=[*BASE, *added]))
         parameters.append(number("reservoir_depletion.gamma", "γ", 1.17, 0.004))
+    if "final_verdict" in changes:
+        rounds[-1]["verdict"] = changes["final_verdict"]
     content = {
         "verdict": verdict,
         "effects": added,
@@ -82,8 +77,6 @@ def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
         "notes": [],
         "refused": None,
     }
-    if "final_verdict" in changes:
-        rounds[-1]["verdict"] = changes["final_verdict"]
     return content | changes
 
 
@@ -122,12 +115,13 @@ def ladder(*added: str) -> pd.DataFrame:
 
 
 def moved() -> pd.DataFrame:
-    columns = {"model": "m", "vine": "", "symbol": "n", "unit": "1", "parameter": "eversion_damping.n"}
-    rows = [
-        columns | {"added": "", "value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52},
-        columns | {"added": "reservoir_depletion", "value": 0.37, "sigma": 0.004, "low_95": 0.36, "high_95": 0.38},
-        columns
-        | {"added": "reservoir_depletion", "parameter": "reservoir_depletion.gamma", "symbol": "γ"}
-        | {"value": 1.17, "sigma": 0.004, "low_95": 1.16, "high_95": 1.18},
-    ]
-    return pd.DataFrame(rows)
+    n = {"model": "m", "vine": "", "unit": "1", "symbol": "n", "parameter": "eversion_damping.n", "added": ""}
+    after = n | {"added": "reservoir_depletion", "value": 0.37, "sigma": 0.004, "low_95": 0.36, "high_95": 0.38}
+    gamma = after | {"parameter": "reservoir_depletion.gamma", "symbol": "γ"}
+    return pd.DataFrame(
+        [
+            n | {"value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52},
+            after,
+            gamma | {"value": 1.17, "low_95": 1.16, "high_95": 1.18},
+        ]
+    )

@@ -84,9 +84,7 @@ def small_campaign(
 
 
 @lru_cache(maxsize=32)
-def _small_campaign(
-    seed: int, damping: float, pressure: float, rho: float, replicates: int
-) -> tuple[list[tuple[Trial, Track]], list[dict[str, float]]]:
+def _small_campaign(seed: int, damping: float, pressure: float, rho: float, replicates: int) -> tuple[list, list]:
     draw = np.random.default_rng(seed)
     trials = [
         vine_trial(f"D{D:g}_{P:g}_{k}".replace(".", "p"), P, D)
@@ -96,11 +94,9 @@ def _small_campaign(
     ]
     pairs, truth = [], []
     for trial in with_names(trials):
-        factors = {
-            "damping": math.exp(damping * draw.standard_normal()),
-            "pressure": 1 + pressure * draw.standard_normal(),
-        }
-        track, release_s, origin_m = filmed(trial, draw, rho=rho, **factors)
+        B_off = math.exp(damping * draw.standard_normal())
+        P_off = 1 + pressure * draw.standard_normal()
+        track, release_s, origin_m = filmed(trial, draw, damping=B_off, pressure=P_off, rho=rho)
         pairs.append((trial, track))
-        truth.append({**factors, "release_s": release_s, "origin_m": origin_m})
+        truth.append({"damping": B_off, "pressure": P_off, "release_s": release_s, "origin_m": origin_m})
     return pairs, truth

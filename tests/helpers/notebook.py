@@ -23,13 +23,9 @@ DPI = 55
 def run(path: Path) -> list[list[dict[str, Any]]]:
     """Run the code cells of a notebook in one namespace; what each printed and showed, as `nbformat` 4 has it."""
     names: dict[str, Any] = {"__name__": "__main__"}
-    return [_run_cell("".join(cell["source"]), names) for cell in _cells(path)]
-
-
-def _cells(path: Path) -> list[dict[str, Any]]:
     notebook = json.loads(path.read_text(encoding="utf-8"))
     assert notebook["nbformat"] == 4
-    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    return [_run_cell("".join(cell["source"]), names) for cell in notebook["cells"] if cell["cell_type"] == "code"]
 
 
 def _run_cell(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
@@ -41,40 +37,25 @@ def _run_cell(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
         if last is not None:
             value = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
     outputs: list[dict[str, Any]] = []
-    if printed.getvalue():
-        outputs.append({"output_type": "stream", "name": "stdout", "text": _lines(printed.getvalue())})
+    if text := printed.getvalue().splitlines(keepends=True):
+        outputs.append({"output_type": "stream", "name": "stdout", "text": text})
     if value is not None:
-        outputs.append(
-            {"output_type": "execute_result", "execution_count": None, "metadata": {}, "data": _shown(value)}
-        )
+        data: dict[str, Any] = {"text/plain": repr(value).splitlines(keepends=True)}
+        if isinstance(value, Figure):
+            file = io.BytesIO()
+            value.savefig(file, format="png", dpi=DPI, facecolor="white")
+            data = {"text/plain": ["<Figure>"], "image/png": base64.b64encode(file.getvalue()).decode()}
+        elif hasattr(value, "_repr_html_"):
+            data["text/html"] = value._repr_html_().splitlines(keepends=True)
+        outputs.append({"output_type": "execute_result", "execution_count": None, "metadata": {}, "data": data})
     return outputs
 
 
-def _shown(value: Any) -> dict[str, Any]:
-    data: dict[str, Any] = {"text/plain": _lines(repr(value))}
-    if isinstance(value, Figure):
-        file = io.BytesIO()
-        value.savefig(file, format="png", dpi=DPI, facecolor="white")
-        return {"text/plain": ["<Figure>"], "image/png": base64.b64encode(file.getvalue()).decode()}
-    if hasattr(value, "_repr_html_"):
-        data["text/html"] = _lines(value._repr_html_())
-    return data
-
-
-def _lines(text: str) -> list[str]:
-    return text.splitlines(keepends=True)
-
-
-def write_outputs(path: Path) -> None:
-    """Run a notebook and store what it shows."""
-    notebook = json.loads(path.read_text(encoding="utf-8"))
-    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
-    for count, (cell, outputs) in enumerate(zip(code, run(path), strict=True), 1):
-        numbered = [one | {"execution_count": count} if "execution_count" in one else one for one in outputs]
-        cell.update(execution_count=count, outputs=numbered)
-    path.write_text(json.dumps(notebook, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        write_outputs(Path(name))
+    for path in map(Path, sys.argv[1:]):
+        notebook = json.loads(path.read_text(encoding="utf-8"))
+        code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+        for count, (cell, outputs) in enumerate(zip(code, run(path), strict=True), 1):
+            numbered = [one | {"execution_count": count} if "execution_count" in one else one for one in outputs]
+            cell.update(execution_count=count, outputs=numbered)
+        path.write_text(json.dumps(notebook, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

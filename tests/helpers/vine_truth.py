@@ -110,10 +110,5 @@ def record(
     lead_speed = np.where((time_s <= release_s) | (time_s > release_s + duration_s), 0.0, lead_speed)
     offset_s, origin_m = rng.uniform(-3, 3), rng.uniform(-0.1, 0.1)
     noisy = lead + origin_m + ar1(n, noise_m, rho, rng)
-    return Recording(
-        make_track(time_s + offset_s, noisy),
-        lead + origin_m,
-        lead_speed,
-        release_s + offset_s,
-        release_s + duration_s + offset_s,
-    )
+    track = make_track(time_s + offset_s, noisy)
+    return Recording(track, lead + origin_m, lead_speed, release_s + offset_s, release_s + duration_s + offset_s)
