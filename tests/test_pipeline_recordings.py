@@ -124,9 +124,7 @@ def spread_px(found: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_a_good_recording_is_tracked_within_a_third_of_a_pixel_and_a_thousandth_of_scale(
-    filmed: Filmed, name: str
-) -> None:
+def test_a_good_recording_is_right_within_a_third_of_a_pixel(filmed: Filmed, name: str) -> None:
     assert filmed.rows[name]["status"] in ("ok", "warning")
     found = errors_px(filmed.results, name, filmed.truth[name])
     assert spread_px(found) < 0.35
@@ -140,9 +138,7 @@ def test_a_good_recording_is_tracked_within_a_third_of_a_pixel_and_a_thousandth_
     assert 0 < float(filmed.rows[name]["scale_rel_sigma"]) < 1e-3
 
 
-def test_a_recording_that_cannot_be_read_fails_with_its_sentence_and_one_without_its_end_gives_what_is_there(
-    filmed: Filmed,
-) -> None:
+def test_a_recording_that_cannot_be_read_fails_and_one_without_its_end_gives_what_is_there(filmed: Filmed) -> None:
     page = (filmed.results / "report.html").read_text(encoding="utf-8")
     for name in ("beheaded", "letter", "gone"):
         assert filmed.rows[name]["status"] == "failed"

@@ -75,9 +75,7 @@ def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path) -> None:
         assert run(*command, "nowhere").exit_code == 1
 
 
-def test_an_unforeseen_fault_fails_its_trial_alone_or_is_one_sentence_and_its_traceback_is_in_the_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, log = experiment(tmp_path / "v"), tmp_path / "logs" / "a.log"
     monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen")))
     succeed("trials", folder, tmp_path / "r", "--log", log)
@@ -129,7 +127,7 @@ def test_straight_from_a_folder_of_tracks_to_one_file_and_no_other(experiment_co
 
 
 @pytest.mark.slow
-def test_the_stage_writes_the_contract_an_effect_put_in_by_hand_joins_it_and_one_that_is_saved_stands_in_the_model(
+def test_the_stage_writes_the_contract_and_effects_are_added_and_saved(
     results: Path, experiment_commands: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def ladder() -> list[dict[str, str]]:

@@ -193,9 +193,7 @@ def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_st
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("setting", "verdict"), [("", "adequate"), ("position_systematic_mm: 0.1", "unexplained")])
-def test_the_smooth_error_allowed_of_a_drop_of_47_m_is_not_a_tenth_of_a_millimetre(
-    tmp_path: Path, setting: str, verdict: str
-) -> None:
+def test_the_smooth_error_of_a_drop_of_47_m_is_not_0_1_mm(tmp_path: Path, setting: str, verdict: str) -> None:
     """Two balls dropped twice each and filmed at 15 frames a second by a camera that bends the fall by 15 mm."""
     draw, sheet = np.random.default_rng(7), "trial,track,diameter_mm,payload_g,travel_ratio,pressure_kPa\n"
     for k, (diameter_mm, mass_g) in enumerate([(73, 149), (73, 149), (65.5, 58), (65.5, 58)]):

@@ -149,9 +149,7 @@ def test_errors_and_floor_of_the_ladder_are_those_of_the_comparison(loaded: Load
         assert located.loc[str(row.condition), "rms_m"] == pytest.approx(row.rms_position_m, rel=1e-9)
 
 
-def test_the_report_quotes_the_final_model_first_and_says_the_same_as_the_page_in_memory(
-    report: str, loaded: LoadedResults
-) -> None:
+def test_the_report_quotes_the_final_model_first(report: str, loaded: LoadedResults) -> None:
     diagnosis = loaded.diagnosis
     assert diagnosis is not None
     last = loaded.ladder.iloc[-1]
@@ -166,9 +164,7 @@ def test_the_report_quotes_the_final_model_first_and_says_the_same_as_the_page_i
         assert fact.note in report
 
 
-def test_the_command_line_and_the_explorer_give_the_numbers_of_the_files(
-    small_run: Path, loaded: LoadedResults
-) -> None:
+def test_commands_and_explorer_give_the_numbers_of_the_files(small_run: Path, loaded: LoadedResults) -> None:
     said, compared = run("compare", small_run), loaded.tables["comparison"]
     for row in compared.itertuples():
         line = next(line for line in said.splitlines() if str(row.condition) in line)

@@ -7,8 +7,6 @@ import json
 import math
 import shutil
 import socket
-import threading
-import time
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
@@ -26,9 +24,8 @@ from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
 from vinetrack.effects import Parameter
-from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.laboratory.tracks import grow, read_ground_truth
-from vinetrack.pages.campaign import Campaign, Fitted, Job, choice_in_use, commands, predict_choice, slider_range
+from vinetrack.pages.campaign import Campaign, choice_in_use, commands, predict_choice, slider_range
 from vinetrack.pages.page import address as where
 from vinetrack.pages.page import open_campaign, start_server
 from vinetrack.pages.plots import RecordingView, decode, recording_view
@@ -52,9 +49,7 @@ def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> N
     assert prediction.errors_m == pytest.approx(table["rms_position_m"].to_dict(), rel=1e-6)
 
 
-def test_a_fit_that_was_refused_still_shows_the_trials_and_a_folder_without_any_is_refused(
-    campaign: Campaign, tmp_path: Path
-) -> None:
+def test_a_refused_fit_still_shows_the_trials_a_folder_without_any_is_refused(campaign: Campaign, tmp_path: Path):
     folder = tmp_path / "results"
     shutil.copytree(campaign.folder, folder)
     (folder / "fit.json").write_text(json.dumps({"model": [], "refused": "no reason"}))
@@ -93,24 +88,6 @@ def test_the_page_shows_the_command_that_reproduces_it(campaign: Campaign) -> No
     assert commands(campaign, more, fitted=True, save=True) == added
     assert commands(campaign, more, fitted=False) == []
     assert commands(replace(campaign, in_use=(*campaign.in_use, "leak")), start, fitted=True) == []
-
-
-def test_a_cancelled_job_calls_no_callback() -> None:
-    told: list[object] = []
-    started = threading.Event()
-
-    def endless(watch: Watch) -> Fitted:
-        started.set()
-        while True:
-            watch(Step(1, {}, 1.0))
-            time.sleep(0.01)
-
-    job = Job(endless, lambda _: None, lambda *end: told.append(end))
-    started.wait(10)
-    job.cancel()
-    job.wait(10)
-    assert not job._thread.is_alive()
-    assert not told
 
 
 def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:

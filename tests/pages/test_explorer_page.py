@@ -159,9 +159,7 @@ def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: Backgroun
     Browser(own).page.close()  # opens with a diagnosis that is torn
 
 
-def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
-    browser: Browser, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_simulation_is_reported_and_curves_stay(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     before = list(browser.model("error_bars").data["now"])
     monkeypatch.setattr("vinetrack.pages.page.predict_choice", Mock(side_effect=FitError("Trial a: too hard.")))
     browser.model(GAMMA).value = 1.1
@@ -170,9 +168,7 @@ def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
     assert list(browser.model("error_bars").data["now"]) == before
 
 
-def test_a_recording_that_cannot_be_decoded_is_named_beside_the_positions(
-    browser: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_torn_recording_is_named(browser: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Also once the text of the page was updated."""
     (tmp_path / "torn.mp4").write_bytes(b"not a film")
     no = np.zeros(0)
@@ -261,9 +257,7 @@ def test_every_step_of_a_user_shows_the_errors_of_a_comparison(numbers: Browser)
 
 
 @pytest.mark.slow
-def test_add_finds_what_the_page_finds_and_until_the_next_run_the_page_says_which_model_it_shows(
-    numbers: Browser,
-) -> None:
+def test_add_finds_what_the_page_finds_and_the_page_says_which_model_it_shows(numbers: Browser) -> None:
     results = numbers.page.campaign.folder
     numbers.model(f"tick_{EFFECT}").active = True
     settled(numbers)
@@ -285,8 +279,11 @@ def test_add_finds_what_the_page_finds_and_until_the_next_run_the_page_says_whic
     again.page.close()
 
 
+Opened = tuple[Browser, list[BackgroundFit]]
+
+
 @pytest.fixture
-def opened(campaign: Campaign, tmp_path: Path) -> Iterator[tuple[Browser, list[BackgroundFit]]]:
+def opened(campaign: Campaign, tmp_path: Path) -> Iterator[Opened]:
     """A page of a copy of experiment and results, diagnosed as `unexplained`, and the pages opened in its place."""
     experiment, folder = tmp_path / "vines", tmp_path / "results"
     shutil.copytree(campaign.experiment.folder, experiment)
@@ -302,8 +299,8 @@ def opened(campaign: Campaign, tmp_path: Path) -> Iterator[tuple[Browser, list[B
 
 
 @pytest.mark.slow
-def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
-    opened: tuple[Browser, list[BackgroundFit]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_proposed_effect_is_opened_fitted_and_saved(
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser, reopened = opened
     folder, going_on = tmp_path / "vines", threading.Event()
@@ -345,9 +342,7 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
 
 
-def test_a_stopped_or_failed_search_can_be_restarted(
-    opened: tuple[Browser, list[BackgroundFit]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stopped_or_failed_search_can_be_restarted(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     browser, _ = opened
     begun, ended = threading.Event(), threading.Event()
 

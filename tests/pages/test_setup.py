@@ -72,9 +72,7 @@ SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
 SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"
 
 
-def test_a_folder_of_recordings_gets_both_files_with_blanks_and_a_sheet_that_is_there_keeps_its_cells(
-    tmp_path: Path,
-) -> None:
+def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_its_cells(tmp_path: Path) -> None:
     for name in ("a.mp4", "d12_30kPa_1.mp4"):
         (tmp_path / name).write_bytes(b"x")
     sheet, settings = tmp_path / "trials.csv", tmp_path / "experiment.yaml"

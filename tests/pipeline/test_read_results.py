@@ -250,9 +250,7 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tm
     assert set(seen.values()) <= set(with_contradictions(made, results, pairs).notes)
 
 
-def test_a_figure_is_shown_from_the_files_there_are_and_a_large_svg_gives_way_to_its_png(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_figure_is_shown_from_the_files_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def shown(name: str, limit: int, **files: str) -> str | bytes:
         path = partial(Results(tmp_path).figure, name)
         path(".svg").parent.mkdir(exist_ok=True)

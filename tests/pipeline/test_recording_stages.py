@@ -158,9 +158,7 @@ def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path: Path)
         assert np.sort(away, axis=0)[:8].mean(axis=0).argmin() == pytest.approx(place, abs=2), colour
 
 
-def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_only_where_they_were_fitted(
-    tmp_path: Path,
-) -> None:
+def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_where_they_were_fitted(tmp_path: Path) -> None:
     for diagnosed in (False, True):
         results = Results(campaign(tmp_path / str(diagnosed), diagnosed)[1])
         if diagnosed:

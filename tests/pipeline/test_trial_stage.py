@@ -97,9 +97,7 @@ def test_a_changed_cell_tracks_its_film_again_only_where_the_picture_is_read_oth
     assert again(tracked, monkeypatch) == (["a"] if column in RETRACKED else [])
 
 
-def test_changed_settings_track_nothing_again_and_a_film_that_is_replaced_is(
-    tracked: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_replaced_film_is_tracked_again_alone(tracked: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     for settings in KEYS:
         write_sheet(tracked[0], settings)
         assert again(tracked, monkeypatch) == [], settings
@@ -110,9 +108,7 @@ def test_changed_settings_track_nothing_again_and_a_film_that_is_replaced_is(
 
 
 @pytest.mark.slow
-def test_a_changed_scale_gives_the_metres_of_a_film_that_is_tracked_anew(
-    tracked: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_a_changed_scale_gives_the_metres_of_a_new_track(tracked: tuple[Path, Path], tmp_path: Path) -> None:
     folder, results = tracked
     write_sheet(folder, mm_per_px=0.29)
     for place in (results, tmp_path):

@@ -76,9 +76,7 @@ def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_th
     assert planned(folder).unwatched != before.unwatched
 
 
-def test_shipped_experiments_are_found_wherever_snakemake_is_run_with_their_own_ground_truth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shipped_experiments_are_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     experiment(tmp_path / "house" / "data" / "demo")
     monkeypatch.chdir(tmp_path)
     plan = make_plan({"experiment": "data/demo"}, tmp_path / "house")
@@ -139,9 +137,7 @@ def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path: P
 
 
 # `vinetrack run`: the chain from anywhere, its progress, its last lines, and whose results a folder holds.
-def test_results_lie_where_snakemake_puts_them_or_under_the_folder_named_and_are_renewed_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = experiment(tmp_path / "week" / "my vines")
     monkeypatch.chdir(tmp_path)
     assert run_paths(folder, None) == RunPaths(folder, tmp_path / make_plan({"experiment": folder}, tmp_path).results)
@@ -229,9 +225,7 @@ def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp
     begin_run(paths.results, paths.experiment).release()
 
 
-def test_files_that_were_never_finished_are_cleared_but_not_those_that_another_command_may_write_now(
-    tmp_path: Path,
-) -> None:
+def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(tmp_path: Path) -> None:
     folders = tmp_path / "results" / "vines" / "tracks", tmp_path / "vines"
     for folder in folders:
         folder.mkdir(parents=True)
