@@ -1,11 +1,13 @@
-"""What is no readable file fails its own trial, in a sentence; nothing waits for it; a full disk is said as such."""
+"""What is no readable file fails its own trial, in a sentence; nothing waits for it; random bytes raise our errors."""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import multiprocessing
 import os
+import tempfile
 from itertools import product
 from pathlib import Path
 from unittest.mock import Mock
@@ -14,15 +16,25 @@ import cv2
 import numpy as np
 import pytest
 from commanded import run, succeed
+from generated_experiments import is_let_through, run_through, write_experiment
+from hand_sheet import two_vines
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from plain_scene import write_video
 from test_pipeline import write_track
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
+from vinetrack.core.problems import format_problems
+from vinetrack.core.records import Trial
+from vinetrack.core.tables import TableError, parse_number, parse_table, safe_join
 from vinetrack.effects._catalogue import remember
 from vinetrack.experiment.folder import check_experiment
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.pipeline.workflow import make_plan
+from vinetrack.tracks.importers import TrackError, read_pressure_trace, read_track
 from vinetrack.video.frames import RecordingError, inspect_recording
+from vinetrack.video.track import track_recording
 
 HEADER = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
 NO_FILES = dict.fromkeys(("pipe", "zero"), "a pipe or a device") | {"folder": "a folder", "shut": "permission denied"}
@@ -194,3 +206,111 @@ def test_a_link_whose_disk_is_not_there_is_said_and_not_taken_for_a_file_left_ou
     words = [str(problem) for problem in check_experiment(tmp_path / "vines") if problem.severity == "error"]
     assert len(words) == 1
     assert "is a link to something that does not exist: connect the disk" in words[0]
+
+
+# Properties of the intake over random bytes, numbers and hostile paths.
+REPEATABLE = settings(derandomize=True, deadline=None)
+NAMED_FILES = st.sampled_from(["trials.csv", "experiment.yaml", "a.csv", "a.trk"])
+MARKS = "\n,;\"{['%\x00"
+PIECES = [
+    *(mark.encode() for mark in MARKS),
+    *(b"trial,track\n", b"a;a.csv", b"sep=;\n", b"time_s,position_m\n", b"t\tx\n", b"1,5", b"1e400"),
+    *(b"\xff\xfe", b"\xef\xbb\xbf", b"\xe9"),
+    *(b": ", b"&a ", b"*a", b"- ", b"? ", b"<<: ", b"!!python/object:os.system "),
+    *(b"<?xml version='1.0'?>", b"<object class='x.TrackerPanel'>", b"</object>"),
+]
+FRAGMENTS = st.lists(st.sampled_from(PIECES) | st.binary(max_size=8), max_size=30).map(b"".join)
+BOMB = b"a0: &a0 [1]\n" + b"".join(b"a%d: &a%d [*a%d, *a%d]\n" % (i, i, i - 1, i - 1) for i in range(1, 60))
+
+
+@pytest.mark.slow
+@settings(REPEATABLE, max_examples=250)
+@given(name=NAMED_FILES, content=st.binary(max_size=300) | FRAGMENTS)
+@example(name="experiment.yaml", content=b"[" * 5000)
+@example(name="experiment.yaml", content=b"a: &a [*a]")
+@example(name="experiment.yaml", content=BOMB)
+@example(name="experiment.yaml", content=b"<<: 3")
+@example(name="experiment.yaml", content=b"1: 2\n? [a]\n: 3")
+@example(name="experiment.yaml", content=b"ambient_pressure_kPa: 1" + b"0" * 5000)
+@example(name="trials.csv", content=b'trial,track\n"' + b"x" * 200_000 + b'",1')
+@example(name="a.trk", content=b"<object>" * 20_000)
+def test_random_bytes_raise_nothing_but_our_errors(name: str, content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as scratch:  # hypothesis reuses pytest's own folder across examples
+        folder = two_vines(Path(scratch))
+        (folder / "a.csv").unlink()
+        (folder / name).write_bytes(content)
+        problems = check_experiment(folder)
+        assert len(format_problems(problems)) <= 20
+        for path in (folder / "a.csv", folder / "a.trk"):
+            for reader in (read_track, read_pressure_trace):
+                with contextlib.suppress(TrackError):  # they may by chance be a trace of one row
+                    reader(path)
+
+
+@REPEATABLE
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_every_float_is_read_back(value: float) -> None:
+    text = repr(value)
+    assert parse_number(text) == value
+    assert parse_table(f"x;y\n{text.replace('.', ',')};0,5\n").numbers("x")[0] == value
+
+
+@pytest.mark.slow
+@REPEATABLE
+@given(st.text(alphabet=st.sampled_from("ab./\\: C~\x00\n\u2028é"), max_size=14) | st.text(max_size=20))
+def test_no_path_escapes(relative: str) -> None:
+    root = Path("/srv/experiment")
+    try:
+        path = safe_join(root, relative)
+    except TableError:
+        return
+    assert os.path.normpath(path) == str(path)
+    assert Path(os.path.commonpath([root, path])) == root
+    assert path != root
+
+
+# Experiments that `check` lets through reach the end of their run, however odd their motion and their clips.
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [21402, 21403, 31114, 31207])
+def test_a_drawn_experiment_meets_no_fault_of_the_program(tmp_path: Path, seed: int) -> None:
+    write_experiment(tmp_path / "drawn", seed)
+    assert not is_let_through(tmp_path / "drawn") or run_through(tmp_path / "drawn", tmp_path / "out", False) == []
+
+
+@pytest.mark.slow
+def test_a_single_trial_of_a_falling_ball_reaches_the_end(tmp_path: Path) -> None:
+    folder = tmp_path / "ball"
+    folder.mkdir()
+    time_s = np.arange(30) / 240
+    position_m = 0.5 * 9.81 * np.clip(time_s - 0.02, 0, None) ** 2 + np.random.default_rng(1).normal(0, 2e-4, 30)
+    lines = [f"{t:.5f},{y:.6f}" for t, y in zip(time_s, position_m, strict=True)]
+    (folder / "b.csv").write_text("\n".join(["time_s,position_m", *lines, ""]))
+    (folder / "trials.csv").write_text("trial,track,diameter_mm,payload_g,travel_ratio\nb,b.csv,20,30,1\n")
+    (folder / "experiment.yaml").write_text("model: [gravity]\n")
+    assert is_let_through(folder)
+    assert run_through(folder, tmp_path / "out") == []
+
+
+X, Y = np.meshgrid(np.arange(160), np.arange(64))
+WALL = np.random.default_rng(0).integers(60, 120, X.shape)
+TUBE = (Y > 20) & (Y < 40)
+BAD_CLIPS = {
+    "black": [0 * X] * 20,
+    "still": [WALL] * 20,
+    "flash": [np.full(X.shape, 255) if i == 10 else WALL for i in range(20)],
+    "step of light": [WALL if i < 10 else WALL + 90 for i in range(20)],
+    "blinking": [np.where((X > 60) & (X < 100) & TUBE & (i % 2 == 0), 200, WALL) for i in range(20)],
+    "all at once": [np.where(i >= 5, 200, WALL) for i in range(20)],
+    "teleport": [np.where((abs(X - (30 if i < 10 else 130)) < 10) & TUBE, 220, WALL) for i in range(20)],
+    "cut off": [np.where((5 * i > X) & TUBE, 200, WALL) if i < 9 else 0 * X for i in range(19)],
+}
+
+
+@pytest.mark.parametrize("name", BAD_CLIPS)
+def test_a_bad_clip_is_refused_in_a_sentence(tmp_path: Path, name: str) -> None:
+    """Warnings are errors in tests: nothing is computed from an empty stretch on the way."""
+    frames = np.clip(BAD_CLIPS[name], 0, 255).astype(np.uint8)
+    path = write_video(tmp_path / "a.mkv", frames, "ffv1", "gray", playback_fps=30)
+    trial = Trial(name="a", video=path, capture_fps=1000.0, m_per_px=2e-4, diameter_m=0.004, length_m=0.03)
+    with pytest.raises(RecordingError):
+        track_recording(trial)

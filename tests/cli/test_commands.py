@@ -11,9 +11,11 @@ import sys
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
+import pandas as pd
 import pytest
 from commanded import run, succeed
-from explorer_campaign import FEW_CANDIDATES
+from explorer_campaign import FEW_CANDIDATES, SETTINGS, SMALL, make_experiment, make_results
 from grown import FORCES, effect_file, grown
 from grown import sheet as sheet_command
 from hidden_truth import sheet
@@ -201,3 +203,48 @@ def test_a_law_is_written_beside_the_experiment_and_added(tmp_path: Path, monkey
     assert done.exit_code == 1
     assert "exists already" not in done.output
     assert "Traceback" not in done.output
+
+
+# Every command that reads results, on those of films and of tracks, with a trial left out.
+VINE = ("--diameter-mm", "24", "--length-mm", "280", "--pressure-kPa", "30", "--chamber-l", "2")
+COMMANDS = (
+    ("compare", "RESULTS"),
+    ("diagnose", "RESULTS"),
+    ("power", "RESULTS"),
+    ("power", "RESULTS", "--effect", "air_drag"),
+    ("add", "air_drag", "RESULTS"),
+    ("predict", "--fit", "RESULTS", *VINE, "--thickness-um", "200"),
+    ("design", "vine", "--fit", "RESULTS", "--pressure-kPa", "40", "--chamber-l", "2", "--samples", "50"),
+    ("design", "reservoir", "--fit", "RESULTS", *VINE),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["films", "tracks"])
+def test_commands_answer_for_every_kind_of_results(kind: str, tmp_path: Path) -> None:
+    settings = SETTINGS + FEW_CANDIDATES + "model: [pressure_drive, gravity, eversion_damping, yield_pressure, leak]\n"
+    experiment = make_experiment(tmp_path / "vines", SMALL, settings)
+    sheet = pd.read_csv(experiment / "trials.csv")
+    # The second replicate of its condition, so that the condition stays.
+    sheet = sheet.assign(use=np.where(sheet["trial"] == "d24_36kPa_2", "no", ""))
+    sheet.to_csv(experiment / "trials.csv", index=False)
+    results = make_results(experiment, tmp_path / "results" / "vines")
+    if kind == "films":  # say so: their tracks state the slow error of a tracker, which is larger near a door
+        (experiment / "film.mp4").touch()
+        sheet.drop(columns="track").assign(video="film.mp4").to_csv(experiment / "trials.csv", index=False)
+        for path in (results / "tracks").glob("*.csv"):
+            table = pd.read_csv(path)
+            slow_m = np.where(np.arange(len(table)) < 20, 4e-4, 1e-4)
+            table.assign(lead_position_systematic_m=slow_m).to_csv(path, index=False)
+    succeed("model", experiment, results)
+    # A diagnosis asked for again writes all that the run wrote.
+    paths = [results / "diagnosis.json", *(results / "diagnosis").glob("*.csv")]
+    files = {path: path.read_bytes() for path in paths}
+    assert results / "diagnosis" / "damping_laws.csv" in files
+    succeed("diagnose", results)
+    assert {path: path.read_bytes() for path in files} == files
+    written = tmp_path / "answer.json"
+    for command in COMMANDS:
+        succeed(*(results if word == "RESULTS" else word for word in command), "--json", written)
+        assert json.loads(written.read_text()), command
+        written.unlink()

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from commanded import run, succeed
 from lsoda_vine import N_TRUE, small_campaign
+from own_effect import write_effect
 
 import vinetrack as vt
 from vinetrack.core.tables import write_json
@@ -27,15 +28,6 @@ def row(output: str, begins: str) -> list[str]:
     """Cells of the line that begins so."""
     line = next(line for line in output.splitlines() if line.strip().startswith(begins))
     return [cell.strip() for cell in line.split("  ") if cell.strip()]
-
-
-@pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A results folder with the fit of two vines grown by scipy, seed 31."""
-    folder = tmp_path_factory.mktemp("results") / "vines"
-    found = vt.fit(vt.base_model(), small_campaign(seed=31)[0])
-    write_json(folder / "fit.json", summary_of(found).to_json())
-    return folder
 
 
 def test_the_fast_vine_in_a_table_with_units_in_files_and_from_python(tmp_path: Path) -> None:
@@ -80,32 +72,27 @@ def test_a_sheet_is_a_row_a_condition(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:
+def test_a_fit_is_believed_with_its_numbers_and_an_effect_of_an_experiments_own_comes_with_it(tmp_path: Path) -> None:
+    """The fit of two vines grown by scipy, seed 31."""
+    results, experiment = tmp_path / "results", tmp_path / "mine"
+    content = summary_of(vt.fit(vt.base_model(), small_campaign(seed=31)[0])).to_json()
+    write_json(results / "fit.json", content)
     vine = ("--diameter-mm", 24, "--thickness-um", 200, "--length-mm", 280, "--pressure-kPa", 25)
-    output = run("predict", *vine, "--fit", fitted, *FEW).output
+    output = run("predict", *vine, "--fit", results, *FEW).output
     assert float(row(output, "n ")[1]) == pytest.approx(N_TRUE, abs=0.02)
     assert float(row(output, "B ")[1]) == pytest.approx(6.4, rel=0.06)
     assert "guess" not in output
 
-
-@pytest.mark.slow
-def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_path: Path) -> None:
-    own = Path(__file__).parents[2] / "docs" / "own_effect.md"
-    code = own.read_text().split("```python\n")[1].split("```")[0]
-    experiment, results = tmp_path / "mine", tmp_path / "results"
     experiment.mkdir()
-    (experiment / "spring_line.py").write_text(code)
+    write_effect(experiment)
     (experiment / "experiment.yaml").write_text("effects: [spring_line.py]\n")
-    content = json.loads((fitted / "fit.json").read_text())
-    content["model"].append("spring_line")
-    write_json(results / "fit.json", content)
+    write_json(results / "fit.json", content | {"model": [*content["model"], "spring_line"]})
     write_json(results / "provenance.json", {"experiment": experiment.as_posix()})
     values = dict(zip((name[2:].replace("-", "_") for name in FAST[::2]), map(str, FAST[1::2]), strict=True))
     (inputs,) = read_basis(PredictionRequest(cells=values, results=results)).inputs
     assert inputs.model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
-    done = run("predict", *FAST, "--fit", results)
-    assert done.exit_code == 1
+    assert run("predict", *FAST, "--fit", results).exit_code == 1
 
 
 # `vinetrack design …`: what it says, what it writes, and how it refuses.
@@ -114,6 +101,7 @@ FASTEST = ("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60)
 
 
 def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path: Path) -> None:
+    assert read_range("diameter_mm", "5:25") == (0.005, 0.025)
     output = succeed("design", *FASTEST, "--figure", tmp_path / "a.svg")
     film, diameter, length, pressure, hoop, *_ = row(output, "100")
     assert (film, diameter, length, pressure, hoop) == ("100", "25", "400", "62", "7.75")
@@ -161,8 +149,3 @@ def test_what_is_missing_or_wrong_is_refused_with_an_exit_code(arguments: tuple[
     assert done.exit_code == (2 if "loose" in arguments else 1)
     assert "Traceback" not in done.output
     assert "internal error of the program" not in done.output
-
-
-def test_ranges_are_in_si() -> None:
-    assert read_range("diameter_mm", "5:25") == (0.005, 0.025)
-    assert read_range("pressure_kPa", "62") == (62e3, 62e3)

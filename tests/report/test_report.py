@@ -6,6 +6,7 @@ import base64
 import io
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from urllib.parse import unquote
@@ -13,37 +14,34 @@ from urllib.parse import unquote
 import numpy as np
 import pandas as pd
 import pytest
+from chrome import Chrome, find_chrome
 from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, moved, number
 from PIL import Image
 
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.diagnosis.result import Candidate, Diagnosis
 from vinetrack.effects import catalogue
+from vinetrack.figures.diagnosis_figures import draw_before_after, draw_ladder
 from vinetrack.figures.registry import diagnosis_figures
+from vinetrack.figures.style import render
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.paper.motions import DEPARTURE_COLUMNS, DEPARTURES
 from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build
+from vinetrack.video.write import write_clip
 
 # The report, from tables written by hand: its first screen, a single file, and no external requests.
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
 
 
-def law(n_trials: int = 4, B: float = 2.0) -> dict:
-    size = {"diameter_mm": 12.0, "thickness_um": 100.0}
-    return {"B": B, "B_95": [1.9, 2.1], "B_95_total": [1.8, 2.2], "R2": 0.98, "n_trials": n_trials, **size}
-
-
 def damping(*vines: str, refused: str | None = None) -> dict:
-    fit = {
-        "n": None if refused else 0.3712,
-        "n_95": [None, None] if refused else [0.3612, 0.3812],
-        "n_95_total": [None, None] if refused else [0.35, 0.39],
-        "vines": {} if refused else {vine: law() for vine in vines},
-        "refused": refused,
-        "left_out": {},
-    }
+    law = {"B": 2.0, "B_95": [1.9, 2.1], "B_95_total": [1.8, 2.2], "R2": 0.98, "n_trials": 4}
+    law |= {"diameter_mm": 12.0, "thickness_um": 100.0}
+    fit = {"n": 0.3712, "n_95": [0.3612, 0.3812], "n_95_total": [0.35, 0.39], "vines": dict.fromkeys(vines, law)}
+    if refused:
+        fit = {"n": None, "n_95": [None, None], "n_95_total": [None, None], "vines": {}}
+    fit |= {"refused": refused, "left_out": {}}
     return {"log_log": fit, "both_axes": fit}
 
 
@@ -60,8 +58,8 @@ def windows(*names: str) -> pd.DataFrame:
     return pd.DataFrame([{"trial": name, **row} for name in names], columns=["trial", *row])
 
 
-def curves(*names: str, n: int = 300) -> dict[str, pd.DataFrame]:
-    time_s = np.linspace(0, 0.3, n)
+def curves(*names: str) -> dict[str, pd.DataFrame]:
+    time_s = np.linspace(0, 0.3, 300)
     return {name: pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": 1 - np.exp(-time_s / 0.02)}) for name in names}
 
 
@@ -349,3 +347,109 @@ def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: p
     assert html.count('aria-label="Strip of') == 2
     assert "The figures of 1 trials are left out here" in html
     assert html.count("4 frames: 1 before release, 1 doubtful") == 3
+
+
+# The page in a real browser: no errors, no requests, adapts to the colour scheme, and prints.
+def svg_of(figure) -> str:  # type: ignore[no-untyped-def]
+    return render(figure, ["svg"])["svg"].decode()
+
+
+def motion() -> pd.DataFrame:
+    time_s = np.arange(-10, 100) * 1e-3
+    moved_m = np.maximum(time_s, 0)
+    table = pd.DataFrame({"trial": "a", "time_s": time_s, "lead_position_m": moved_m})
+    return table.assign(model_before_m=0.9 * moved_m, model_after_m=moved_m)
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A page with all optional parts."""
+    folder = tmp_path_factory.mktemp("page")
+    steps = ladder("", "reservoir_depletion")
+    pictures = {"ladder": svg_of(draw_ladder(steps)), "before_after": svg_of(draw_before_after("24 kPa", motion(), ""))}
+    write_clip(folder / "a.mp4", [np.full((64, 96, 3), 20 * i, np.uint8) for i in range(12)], 12)
+    names = [f"trial_with_a_rather_long_name_{i}" for i in range(24)]
+    html = page(
+        trials=trials(*names, reason="a reason that is long enough to need a line of its own on any screen"),
+        windows=windows(*names),
+        kinematics=curves(*names),
+        figures=[build.ReportFigure(key, key, "caption", svg, f"{key}.csv", "a\n1\n") for key, svg in pictures.items()],
+        trial_figures=dict.fromkeys(names, pictures["before_after"]),
+        recordings={name: build.TrackedRecording(pictures["ladder"], ["", "doubtful"]) for name in names},
+        clip=build.Clip(names[0], (folder / "a.mp4").read_bytes(), "caption"),
+        diagnosis=replace(Diagnosis.from_json(diagnosis("ambiguous")), ladder=steps),
+        moved=moved(),
+    )
+    path = folder / "report.html"
+    path.write_text(html, encoding="utf-8")
+    return path.as_uri()
+
+
+@pytest.fixture(scope="module")
+def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
+    if find_chrome() is None:
+        pytest.skip("there is no Chromium on this machine")
+    with Chrome(tmp_path_factory.mktemp("browser")) as browser:
+        yield browser
+
+
+def test_the_browser_logs_no_errors_and_makes_no_requests(chrome: Chrome, address: str) -> None:
+    chrome.open(address)
+    assert chrome.complaints == []
+    asked = {request.split(":", 1)[0] for request in chrome.requests if not request.startswith("about:")}
+    assert asked <= {"file", "data"}
+    assert [request for request in chrome.requests if request.startswith("file:")] == [address]
+
+
+@pytest.mark.parametrize("width", [1400, 768, 390])
+def test_nothing_reaches_beyond_the_screen(chrome: Chrome, address: str, width: int) -> None:
+    chrome.size(width, 900)
+    chrome.open(address)
+    assert chrome.run("document.documentElement.scrollWidth") <= width
+    pictures = "[...document.querySelectorAll('header .frame svg')]"
+    assert chrome.run(f"{pictures}.filter(one => one.getBoundingClientRect().right > innerWidth).length") == 0
+
+
+def test_the_verdict_and_how_sure_are_on_a_phones_first_screen(chrome: Chrome, address: str) -> None:
+    chrome.size(390, 844)
+    chrome.open(address)
+    for what in ("h1", ".facts > div"):
+        assert chrome.run(f"document.querySelector('{what}').getBoundingClientRect().bottom") < 844
+
+
+def test_page_and_pictures_follow_a_dark_screen(chrome: Chrome, address: str) -> None:
+    colours = {}
+    for scheme in ("light", "dark"):
+        chrome.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        chrome.open(address)
+        of = {"page": "getComputedStyle(document.body).backgroundColor"}
+        of["text"] = "getComputedStyle(document.querySelector('#figure-ladder text')).fill"
+        of["grid"] = "getComputedStyle(document.querySelector('#figure-ladder path[style*=\"--grid\"]')).stroke"
+        colours[scheme] = {name: chrome.run(script) for name, script in of.items()}
+    chrome.send("Emulation.setEmulatedMedia", features=[])
+    brightness = {
+        scheme: {name: sum(map(int, colour[4:-1].split(","))) for name, colour in found.items()}
+        for scheme, found in colours.items()
+    }
+    assert brightness["light"]["page"] > 700 > 300 > brightness["light"]["text"]
+    assert brightness["dark"]["page"] < 120 < 600 < brightness["dark"]["text"]
+    assert brightness["dark"]["page"] < brightness["dark"]["grid"] < brightness["dark"]["text"]
+
+
+def test_the_clip_can_be_played(chrome: Chrome, address: str) -> None:
+    chrome.open(address)
+    chrome.wait("document.querySelector('video').readyState >= 1", "the clip's header")
+    assert chrome.run("document.querySelector('video').videoWidth") == 96
+    assert chrome.run("document.querySelector('video').duration") == pytest.approx(1.0, abs=0.05)
+
+
+def test_it_prints_in_dark_on_light_whatever_the_screen(chrome: Chrome, address: str) -> None:
+    features = [{"name": "prefers-color-scheme", "value": "dark"}]
+    chrome.send("Emulation.setEmulatedMedia", media="print", features=features)
+    chrome.open(address)
+    assert chrome.run("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    assert chrome.run("getComputedStyle(document.querySelector('#figure-ladder text')).fill") == "rgb(0, 0, 0)"
+    pdf = base64.b64decode(chrome.send("Page.printToPDF", preferCSSPageSize=True)["data"])
+    chrome.send("Emulation.setEmulatedMedia", media="", features=[])
+    assert pdf.startswith(b"%PDF")
+    assert 2 <= pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page/") <= 12
