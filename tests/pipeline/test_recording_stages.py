@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commanded import run, succeed
-from plain_scene import Plan, Scene, plain_scene, write_video
+from plain_scene import Plan, plain_scene, write_video
 
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
@@ -25,20 +25,12 @@ from vinetrack.video.write import write_clip
 # `vinetrack track`: one recording to a table, a strip and a clip; every obvious mistake is one sentence.
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return plain_scene(Plan(seed=20940, width=640, height=160, from_px=(30.0, 80.0), end_px=560.0, radius=22.0))
-
-
-@pytest.fixture(scope="module")
-def clip(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_video(tmp_path_factory.mktemp("films") / "vine.mp4", scene.frames, options={"crf": "12"})
-
-
 @pytest.mark.slow
-def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(
-    scene: Scene, clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_film_gives_pixels_of_the_picture_and_with_rate_and_scale_seconds_and_metres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    scene = plain_scene(Plan(seed=20940, width=640, height=160, from_px=(30.0, 80.0), end_px=560.0, radius=22.0))
+    clip = write_video(tmp_path / "vine.mp4", scene.frames, options={"crf": "12"})
     drawn: list[Tracking] = []
     monkeypatch.setattr(overlays_stage, "draw_strip", lambda *given: drawn.append(given[1]) or draw_strip(*given))
     assert "Capture rate unknown" in succeed("track", clip, "--out", tmp_path / "out")
@@ -56,9 +48,6 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(
     with av.open(str(tmp_path / "out" / "overlay.mp4")) as container:
         assert sum(1 for _ in container.decode(video=0)) > 20
 
-
-@pytest.mark.slow
-def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_path: Path) -> None:
     given = ("--capture-fps", 2000, "--exposure-us", 100, "--mm-per-px", 0.25)
     content = json.loads(run("track", clip, *given, "--out", tmp_path, "--json", "-").stdout)
     assert content["duration_s"] == pytest.approx(len(scene.frames) / 2000)
@@ -78,8 +67,8 @@ def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_pa
     assert json.loads(done.stdout)["mm_per_px"] == pytest.approx(0.5)
 
 
-def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentence(scene: Scene, tmp_path: Path) -> None:
-    still = write_video(tmp_path / "still.mp4", np.repeat(scene.frames[:1], 40, axis=0))
+def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    still = write_video(tmp_path / "still.mp4", np.full((40, 160, 640), 90, np.uint8))
     done = run("track", still, "--out", tmp_path / "out")
     assert (done.exit_code, done.stderr.strip()) == (1, "still.mp4: nothing moves in the picture")
     assert not (tmp_path / "out").exists()
@@ -96,27 +85,21 @@ def edge_px() -> np.ndarray:
     return 40.0 + 10.0 * np.clip(np.arange(N) - 20, 0, 30)
 
 
-def film(path: Path) -> None:
-    pictures = []
-    for edge in edge_px():
-        picture = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
-        picture[40:80, : int(edge)] = 180
-        pictures.append(picture)
-    write_clip(path, pictures, 30)
-
-
 def campaign(folder: Path, diagnosed: bool = True) -> tuple[Path, Path]:
     """An experiment of two filmed replicates, one of another condition and one that failed, and its results."""
     experiment, results = folder / "vines", folder / "out"
-    (experiment / "videos").mkdir(parents=True)
-    film(experiment / "videos" / "a.mp4")
+    experiment.mkdir(parents=True)
+    edge, time_s = edge_px(), np.arange(N) / 1000
+    pictures = np.full((N, HEIGHT, WIDTH, 3), 60, np.uint8)
+    for picture, end_px in zip(pictures, edge, strict=True):
+        picture[40:80, : int(end_px)] = 180
+    write_clip(experiment / "a.mp4", list(pictures), 30)
     rows = ["trial,video,capture_fps,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,mm_per_px"]
     trials = {"a": 24, "b": 24, "c": 30, "torn": 36}
-    rows += [f"{name},videos/a.mp4,1000,20,100,180,{kPa},3,{MM_PER_PX}" for name, kPa in trials.items()]
+    rows += [f"{name},a.mp4,1000,20,100,180,{kPa},3,{MM_PER_PX}" for name, kPa in trials.items()]
     (experiment / "trials.csv").write_text("\n".join(rows) + "\n")
     for part in ("tracks", "analysed", "diagnosis/predictions"):
         (results / part).mkdir(parents=True)
-    edge, time_s = edge_px(), np.arange(N) / 1000
     position_m = 1e-3 * MM_PER_PX * edge
     track = pd.DataFrame({"frame": range(N), "time_s": time_s, "edge_px": edge, "lead_position_m": position_m})
     track = track.assign(lead_position_sigma_m=1e-5, flag="")
@@ -135,8 +118,7 @@ def campaign(folder: Path, diagnosed: bool = True) -> tuple[Path, Path]:
     (results / "provenance.json").write_text(json.dumps(provenance))
     if diagnosed:
         (results / "diagnosis.json").write_text(json.dumps({"effects": ["air_drag"]}))
-        release = {"trials": {"a": {"release_s": 0.02}}}
-        (results / "fit.json").write_text(json.dumps(release))
+        (results / "fit.json").write_text(json.dumps({"trials": {"a": {"release_s": 0.02}}}))
     return experiment, results
 
 
