@@ -218,11 +218,15 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
     (folder / "a.csv").write_text("time_s,position_m\n1,1\n")
     rows = ("a,a.csv,12,100,300,20,3,0\n", "b,b.csv,12,100,300,20,3,0\n", "c,a.csv,12,100,300,9999,3,0\n")
     (folder / "trials.csv").write_text(SHEET + "".join(rows))
-    rows = stages(folder, tmp_path / "results")
+    results = tmp_path / "results"
+    rows = stages(folder, results)
     assert {row["status"] for row in rows.values()} == {"failed"}
-    page = (tmp_path / "results" / "report.html").read_text()
-    assert "3 trials: 3 failed." in page
+    assert "3 trials: 3 failed." in (results / "report.html").read_text()
     assert all(row["reason"] for row in rows.values())
+    assert json.loads((results / "fit.json").read_text())["refused"].startswith("No trial can be fitted")
+    tables = [(results / name).read_text() for name in ("comparison.csv", "model_check.csv", "audit.csv")]
+    assert [len(text.splitlines()) for text in tables] == [1, 1, 1]  # headers alone
+    assert not list((results / "comparison").iterdir())
 
 
 # A workflow that is killed goes on with the same command.

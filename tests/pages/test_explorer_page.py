@@ -184,19 +184,6 @@ EFFECT = "tail_friction"
 SIZE = f"size_{EFFECT}.mu_w"
 
 
-@pytest.fixture(scope="module")
-def numbers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """The page of trials with measured pressures and an effect that is not in the model."""
-    folder = tmp_path_factory.mktemp("traced")
-    nature = yaml.safe_load(DEMO.read_text(encoding="utf-8"))
-    nature |= {"effects": [*nature["effects"], EFFECT], "trace_sigma_kPa": 0.1}
-    (folder / "nature.yaml").write_text(yaml.safe_dump(nature), encoding="utf-8")
-    experiment = make_experiment(folder / "vines", SMALL, SETTINGS, folder / "nature.yaml")
-    opened = Browser(fitted(open_campaign(make_results(experiment, folder / "results" / "vines"))))
-    yield opened
-    opened.page.close()
-
-
 def bars_mm(numbers: Browser, column: str) -> dict[str, float]:
     bars = numbers.model("error_bars").data
     return dict(zip(bars["condition"], map(float, bars[column]), strict=True))
@@ -233,19 +220,26 @@ def slide(numbers: Browser, size: float) -> None:
 
 
 @pytest.mark.slow
-def test_every_step_of_a_user_shows_the_errors_of_a_comparison(numbers: Browser) -> None:
-    opened = pd.read_csv(numbers.page.campaign.folder / "comparison.csv")
+def test_every_step_of_a_user_shows_the_errors_of_a_comparison_and_what_add_finds(tmp_path: Path) -> None:
+    """Trials with measured pressures and an effect that is not in the model."""
+    nature = yaml.safe_load(DEMO.read_text(encoding="utf-8"))
+    nature |= {"effects": [*nature["effects"], EFFECT], "trace_sigma_kPa": 0.1}
+    (tmp_path / "nature.yaml").write_text(yaml.safe_dump(nature), encoding="utf-8")
+    experiment = make_experiment(tmp_path / "vines", SMALL, SETTINGS, tmp_path / "nature.yaml")
+    results = make_results(experiment, tmp_path / "results" / "vines")
+    numbers = Browser(fitted(open_campaign(results)))
+    opened = pd.read_csv(results / "comparison.csv")
     assert_shows(numbers, opened, 1e-6)
 
     numbers.model(f"tick_{EFFECT}").active = True
     with_effect = settled(numbers)
     assert_shows(numbers, with_effect, 1e-9)
 
-    fitted = numbers.model(SIZE).value
+    size = numbers.model(SIZE).value
     slide(numbers, 0.0)
     expected_mm = compared_mm(with_effect, "rms_position_m")
     assert max(abs(bars_mm(numbers, "now")[name] - error_mm) for name, error_mm in expected_mm.items()) > 0.3
-    slide(numbers, fitted)
+    slide(numbers, size)
     assert_shows(numbers, with_effect, 1e-6)
 
     numbers.click("refit")
@@ -255,10 +249,6 @@ def test_every_step_of_a_user_shows_the_errors_of_a_comparison(numbers: Browser)
     assert_shows(numbers, settled(numbers), 1e-9)
     assert bars_mm(numbers, "now") == pytest.approx(compared_mm(opened, "rms_position_m"), rel=0.02)
 
-
-@pytest.mark.slow
-def test_add_finds_what_the_page_finds_and_the_page_says_which_model_it_shows(numbers: Browser) -> None:
-    results = numbers.page.campaign.folder
     numbers.model(f"tick_{EFFECT}").active = True
     settled(numbers)
     on_page = bars_mm(numbers, "now")
@@ -276,7 +266,8 @@ def test_add_finds_what_the_page_finds_and_the_page_says_which_model_it_shows(nu
     assert_shows(again, pd.read_csv(results / "comparison.csv"), 1e-6)
     assert "vinetrack run" in again.text("headline")
     assert "vinetrack run" not in numbers.text("headline")
-    again.page.close()
+    for page in (numbers, again):
+        page.page.close()
 
 
 Opened = tuple[Browser, list[BackgroundFit]]

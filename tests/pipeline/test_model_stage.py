@@ -98,17 +98,6 @@ def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> 
     np.testing.assert_allclose(track.pressure_Pa, 1e3 * brought["pressure_kPa"])
 
 
-def test_where_all_trials_failed_the_run_goes_on_with_headers_alone_and_says_so(tmp_path: Path) -> None:
-    experiment = tmp_path / "vines"
-    experiment.mkdir()
-    (experiment / "a.csv").write_text("time_s,position_m\n0,0\n")
-    (experiment / "trials.csv").write_text(SHEET + "a,a.csv,12,100,300,20,3\n")
-    results = tmp_path / "results"
-    assert fitted(experiment, results)["refused"].startswith("No trial can be fitted")
-    assert {name: (results / name).read_text() for name in HEADERS} == HEADERS
-    assert not list((results / "comparison").iterdir())
-
-
 @pytest.mark.slow
 def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> None:
     """Three balls let go, filmed at 240 frames a second with 0.2 mm of noise; g = 9.80665."""
