@@ -120,25 +120,22 @@ def test_a_broken_cell_is_named_with_file_line_trial_and_column(folder: Path, co
     assert list(experiment.failed) == [problem.trial]
 
 
-@pytest.mark.parametrize(
-    ("column", "cell"),
-    [
-        ("pressure_kPa", "2.5"),  # looks like psi
-        ("pressure_kPa,yield_pressure_kPa", "0.28,0.03"),  # bar
-        ("yield_pressure_kPa", "0"),
-        ("payload_g", "0.0356"),  # kilograms
-        ("thickness_um", "0.2"),  # millimetres
-        ("length_mm", "0.28"),  # metres
-        ("exposure_us,capture_fps", "1200,1000"),  # longer than a frame
-        ("remarks", "nice"),
-    ],
-)
-def test_a_legal_oddity_is_a_warning(folder: Path, column: str, cell: str) -> None:
-    experiment = one(folder, **dict(zip(column.split(","), cell.split(","), strict=True)))
-    (problem,) = experiment.problems
-    assert problem.severity == "warning"
-    assert problem.column.endswith(column.split(",")[0])  # a pressure below the yield pressure is said of that
-    assert len(experiment.trials) == 1
+def test_a_legal_oddity_is_a_warning(folder: Path) -> None:
+    for cells in (
+        {"pressure_kPa": "2.5"},  # looks like psi
+        {"pressure_kPa": "0.28", "yield_pressure_kPa": "0.03"},  # bar
+        {"yield_pressure_kPa": "0"},
+        {"payload_g": "0.0356"},  # kilograms
+        {"thickness_um": "0.2"},  # millimetres
+        {"length_mm": "0.28"},  # metres
+        {"exposure_us": "1200", "capture_fps": "1000"},  # longer than a frame
+        {"remarks": "nice"},
+    ):
+        experiment = one(folder, **cells)
+        (problem,) = experiment.problems
+        assert problem.severity == "warning"
+        assert problem.column.endswith(next(iter(cells)))  # a pressure below the yield pressure is said of that
+        assert len(experiment.trials) == 1
     # A yield pressure of zero with its error is believed.
     assert one(folder, yield_pressure_kPa="0", yield_pressure_sigma_kPa="2").problems == ()
 
@@ -213,22 +210,16 @@ def test_the_smooth_error_of_a_drop_of_47_m_is_not_0_1_mm(tmp_path: Path, settin
     assert vt.diagnose(write(tmp_path, sheet, f"model: [gravity, air_drag]\n{setting}\n")).verdict == verdict
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        None,
-        "time_s,position_m\n" + "1,1\n" * 6,
-        "time_s,position_m\n0,0\n1,1\n",
-        TRACK.replace("0.0001", "oops"),
-        "time_s,position_m,pressure_kPa\n" + "".join(f"{i},{i},28000\n" for i in range(6)),
-    ],
-)
-def test_check_names_the_trial_whose_track_is_wrong(folder: Path, content: str | None) -> None:
-    (folder / "b.csv").unlink()
-    if content is not None:
-        (folder / "b.csv").write_text(content)
-    (problem,) = check_experiment(folder)
-    assert (problem.severity, problem.trial, problem.column) == ("error", "b", "track")
+def test_check_names_the_trial_whose_track_is_wrong(folder: Path) -> None:
+    path = folder / "b.csv"
+    path.unlink()
+    one_moment, two_points = "time_s,position_m\n" + "1,1\n" * 6, "time_s,position_m\n0,0\n1,1\n"
+    in_Pa = "time_s,position_m,pressure_kPa\n" + "".join(f"{i},{i},28000\n" for i in range(6))
+    for content in (None, one_moment, two_points, TRACK.replace("0.0001", "oops"), in_Pa):
+        if content is not None:
+            path.write_text(content)
+        (problem,) = check_experiment(folder)
+        assert (problem.severity, problem.trial, problem.column) == ("error", "b", "track")
 
 
 def filmed(folder: Path, videos: dict[str, str], files: Iterable[str], settings: str = "", aside: str = "") -> Path:
@@ -290,12 +281,12 @@ def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(fol
     assert format_problems(found) == ["error: experiment.yaml, trial a and 1 more: capture_fps is the rate of playback"]
 
 
-@pytest.mark.parametrize("column", ["trial", "diameter_mm", "thickness_um", "length_mm", "yield_pressure_kPa"])
-def test_a_missing_column_stops_the_experiment_with_one_problem(folder: Path, column: str) -> None:
-    cells = [line.split(",") for line in GOOD.splitlines()]
-    drop = cells[0].index(column)
-    write(folder, "\n".join(",".join(cell for i, cell in enumerate(row) if i != drop) for row in cells))
-    assert [problem.code for problem in stopped(folder) if problem.column == column] == ["missing"]
+def test_a_missing_column_stops_the_experiment_with_one_problem(folder: Path) -> None:
+    for column in ("trial", "diameter_mm", "thickness_um", "length_mm", "yield_pressure_kPa"):
+        cells = [line.split(",") for line in GOOD.splitlines()]
+        drop = cells[0].index(column)
+        write(folder, "\n".join(",".join(row[:drop] + row[drop + 1 :]) for row in cells))
+        assert [problem.code for problem in stopped(folder) if problem.column == column] == ["missing"]
 
 
 def test_files_of_the_settings_are_there_and_inside(folder: Path) -> None:
@@ -322,20 +313,15 @@ def test_broken_settings_bring_no_false_alarms_about_the_sheet(folder: Path) -> 
     assert {problem.file for problem in stopped(folder)} == {"experiment.yaml"}
 
 
-BASE = "pressure_drive, gravity, eversion_damping, yield_pressure"
-
-
-@pytest.mark.parametrize(
-    ("settings", "columns"),
-    [
-        (f"model: [{BASE}, air_drag]\n", []),
-        (f"model: [{BASE}, air_drg]\n", ["model"]),
+def test_names_in_the_settings_are_looked_up(folder: Path) -> None:
+    base = "pressure_drive, gravity, eversion_damping, yield_pressure"
+    for settings, columns in (
+        (f"model: [{base}, air_drag]\n", []),
+        (f"model: [{base}, air_drg]\n", ["model"]),
         ("candidates: [leek]\n", ["candidates"]),
-        (f"model: [{BASE}, reservoir_depletion]\n", ["model"]),  # it needs `chamber_l`
+        (f"model: [{base}, reservoir_depletion]\n", ["model"]),  # it needs `chamber_l`
         ("effects: [not_there.py]\n", []),
         ("modle: [gravity]\n", []),
-    ],
-)
-def test_names_in_the_settings_are_looked_up(folder: Path, settings: str, columns: list[str]) -> None:
-    found = [(problem.file, problem.column) for problem in model_problems(write(folder, GOOD, settings))]
-    assert found == [("experiment.yaml", column) for column in columns]
+    ):
+        found = [(problem.file, problem.column) for problem in model_problems(write(folder, GOOD, settings))]
+        assert found == [("experiment.yaml", column) for column in columns], settings

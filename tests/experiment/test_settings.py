@@ -19,9 +19,8 @@ CONFIG = Path(__file__).parents[2] / "config" / "config.yaml"
 
 
 def read(tmp_path: Path, text: str) -> ExperimentSettings:
-    path = tmp_path / "experiment.yaml"
-    path.write_text(text, encoding="utf-8")
-    return read_experiment_settings(path)
+    (tmp_path / "experiment.yaml").write_text(text, encoding="utf-8")
+    return read_experiment_settings(tmp_path / "experiment.yaml")
 
 
 def draft_problems(tmp_path: Path, text: str) -> tuple[Problem, ...]:
@@ -35,21 +34,18 @@ def test_settings_cover_exactly_the_columns_of_the_sheet() -> None:
     assert set(SHARED) <= set(ExperimentSettings.model_fields)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_every_kind_of_calibration(tmp_path: Path) -> None:
+    for text in (
         "{kind: mm_per_px, mm_per_px: 0.37}",
         "{kind: two_points, from_px: [1, 2], to_px: [3, 4], length_mm: 100}",
         "{kind: checkerboard, image: calibration/a.png, squares: [9, 6], square_mm: 5}",
         "{kind: charuco, image: a.png, squares: [5, 7], square_mm: 10, marker_mm: 7, dictionary: DICT_4X4_50}",
-    ],
-)
-def test_every_kind_of_calibration(tmp_path: Path, text: str) -> None:
-    settings = read(tmp_path, f"calibration: {text}\naxis: {{from_px: [0, 1], to_px: [5, 1], width_mm: 40}}\n")
-    assert settings.calibration is not None
-    assert settings.calibration.kind in text
-    assert settings.axis is not None
-    assert settings.axis.to_px == (5.0, 1.0)
+    ):
+        settings = read(tmp_path, f"calibration: {text}\naxis: {{from_px: [0, 1], to_px: [5, 1], width_mm: 40}}\n")
+        assert settings.calibration is not None
+        assert settings.calibration.kind in text
+        assert settings.axis is not None
+        assert settings.axis.to_px == (5.0, 1.0)
     assert read(tmp_path, "steady: 1:20\n").steady == (1.0, 20.0)  # no number in base sixty
 
 
@@ -62,10 +58,10 @@ def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path: Path) ->
     assert (limits.thickness_um, limits.trials, limits.hoop_stress_MPa) == (None, 4, 7.8)
 
 
-@pytest.mark.parametrize("text", ["- a\n- b\n", "just text\n", "3\n", "payload_g: [1, 2\nuse: yes\n"])
-def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
-    (problem,) = draft_problems(tmp_path, text)
-    assert problem.file == "experiment.yaml"
+def test_what_is_no_mapping_is_refused(tmp_path: Path) -> None:
+    for text in ("- a\n- b\n", "just text\n", "3\n", "payload_g: [1, 2\nuse: yes\n"):
+        (problem,) = draft_problems(tmp_path, text)
+        assert problem.file == "experiment.yaml"
     (problem,) = draft_problems(tmp_path, "strict: true\npayload_g: 1\nstrict: false\n")
     assert (problem.column, problem.line) == ("strict", 3)
 
@@ -119,22 +115,19 @@ def test_the_shipped_config_holds_every_key_at_its_default() -> None:
     assert run_settings({"experiment": 2024}).experiment == "2024"
 
 
-@pytest.mark.parametrize(
-    ("values", "column"),
-    [
-        ({"experimant": "x"}, "experimant"),
-        ({"damping": {"sead": 1}}, "damping.sead"),
-        ({"velocity": {"order": 0}}, "velocity.order"),
-        ({"figures": {"formats": []}}, "figures.formats"),
-        ({"figures": {"formats": ["bmp"]}}, "figures.formats.0"),
-        ({"final_at_fraction": 1.5}, "final_at_fraction"),
-        ({"efficiency_at_mm": float("nan")}, "efficiency_at_mm"),
-    ],
-)
-def test_a_wrong_run_setting_is_named(values: dict[str, Any], column: str) -> None:
-    with pytest.raises(ExperimentError) as caught:
-        run_settings(values)
-    assert [problem.column for problem in caught.value.problems] == [column]
+def test_a_wrong_run_setting_is_named() -> None:
+    for column, values in {
+        "experimant": {"experimant": "x"},
+        "damping.sead": {"damping": {"sead": 1}},
+        "velocity.order": {"velocity": {"order": 0}},
+        "figures.formats": {"figures": {"formats": []}},
+        "figures.formats.0": {"figures": {"formats": ["bmp"]}},
+        "final_at_fraction": {"final_at_fraction": 1.5},
+        "efficiency_at_mm": {"efficiency_at_mm": float("nan")},
+    }.items():
+        with pytest.raises(ExperimentError) as caught:
+            run_settings(values)
+        assert [problem.column for problem in caught.value.problems] == [column]
 
 
 def test_every_key_of_both_files_is_listed_once() -> None:

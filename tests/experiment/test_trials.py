@@ -40,14 +40,12 @@ def test_corrections_reach_their_trial_and_are_written_as_they_are_read(tmp_path
     assert folder.corrections_text(found) == folder.corrections_text(given)
 
 
-@pytest.mark.parametrize(
-    "line", ["a,3,remove,", "a,3.5,drop,", "a,-1,drop,", "a,3,move,", "a,three,drop,", "a,3,drop,\na,3,confirm,"]
-)
-def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path, line: str) -> None:
-    corrected(tmp_path, f"trial,frame,action,edge_px\n{line}\n")
-    with pytest.raises(ExperimentError) as stopped:
-        folder.read_experiment(tmp_path)
-    assert "corrections.csv" in {problem.file for problem in stopped.value.problems}
+def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path) -> None:
+    for line in ("a,3,remove,", "a,3.5,drop,", "a,-1,drop,", "a,3,move,", "a,three,drop,", "a,3,drop,\na,3,confirm,"):
+        corrected(tmp_path, f"trial,frame,action,edge_px\n{line}\n")
+        with pytest.raises(ExperimentError) as stopped:
+            folder.read_experiment(tmp_path)
+        assert "corrections.csv" in {problem.file for problem in stopped.value.problems}, line
 
 
 TRIAL = Trial(
@@ -90,9 +88,9 @@ def test_trials_that_differ_in_how_they_were_recorded_are_replicates() -> None:
     assert {len(conditions(column.field, column.to_si(7.0))) for column in numbers} == {1}
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "parts"),
-    [
+def test_the_name_of_a_condition_shows_what_differs() -> None:
+    base = "24mm-200um-280mm_28kPa_0g"
+    for field, value, parts in (
         ("growth_angle_rad", 1.5707963267948966, {"0deg", "90deg"}),
         ("chamber_m3", 3.7e-3, {"", "chamber3.7l"}),
         ("inlet_m", 5.7e-3, {"inlet8mm", "inlet5.7mm"}),
@@ -100,11 +98,8 @@ def test_trials_that_differ_in_how_they_were_recorded_are_replicates() -> None:
         ("film_density_kg_m3", 920.0, {"film1200", "film920"}),
         ("travel_ratio", 1.0, {"ratio2", "ratio1"}),
         ("yield_pressure_Pa", 5e3, {"yield3kPa", "yield5kPa"}),
-    ],
-)
-def test_the_name_of_a_condition_shows_what_differs(field: str, value: Any, parts: set[str]) -> None:
-    base = "24mm-200um-280mm_28kPa_0g"
-    assert conditions(field, value) == {f"{base}_{part}".rstrip("_") for part in parts}
+    ):
+        assert conditions(field, value) == {f"{base}_{part}".rstrip("_") for part in parts}
     # Another vine has a yield pressure of its own.
     named = with_names([TRIAL, replace(TRIAL, name="b", diameter_m=0.012, thickness_m=1e-4, yield_pressure_Pa=5e3)])
     assert [trial.condition for trial in named] == [base, "12mm-100um-280mm_28kPa_0g"]
@@ -155,21 +150,16 @@ def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path: Path) -> N
     assert folder.order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
 
 
-@pytest.mark.parametrize(
-    ("column", "cells", "codes"),
-    [
+def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(tmp_path: Path) -> None:
+    for column, cells, codes in (
         ("", ("",) * 10, ["confounded"]),  # the rows are in order of pressure
         ("order", tuple(f",{i + 1}" for i in range(10)), ["confounded"]),
         ("order", tuple(f",{i + 1}" for i in np.random.default_rng(1).permutation(10)), []),
         ("specimen", tuple(f",{pressure}" for pressure in PRESSURES), ["confounded"]),
         ("specimen", tuple(f",{i % 2}" for i in range(10)), []),
-    ],
-)
-def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(
-    tmp_path: Path, column: str, cells: tuple[str, ...], codes: list[str]
-) -> None:
-    found = folder.check_experiment(written(tmp_path, f",{column}" if column else "", cells))
-    assert [problem.code for problem in found if problem.column == (column or "order")] == codes
+    ):
+        found = folder.check_experiment(written(tmp_path, f",{column}" if column else "", cells))
+        assert [problem.code for problem in found if problem.column == (column or "order")] == codes
 
 
 VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}

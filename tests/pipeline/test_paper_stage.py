@@ -27,18 +27,13 @@ HEADER = (
 )
 
 
-def small_part(folder: Path) -> Path:
+@pytest.mark.slow
+def test_tables_and_figures_are_there_what_was_grown_is_answered_and_what_was_not_is_blank(tmp_path: Path) -> None:
+    experiment, results = tmp_path / "part", tmp_path / "results"
     trials = [trial for trial in read_experiment(ROOT / "data" / "paper").trials if trial.name in CHOSEN]
     assert len(trials) == len(CHOSEN)
     nature = read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
-    write_experiment(grow(trials, nature), folder, "chamber_l: 3.7\npublished: simulated\ncandidates: [air_drag]\n")
-    return folder
-
-
-@pytest.mark.slow
-def test_tables_and_figures_are_there_what_was_grown_is_answered_and_what_was_not_is_blank(tmp_path: Path) -> None:
-    experiment = small_part(tmp_path / "part")
-    results = tmp_path / "results"
+    write_experiment(grow(trials, nature), experiment, "chamber_l: 3.7\npublished: simulated\ncandidates: [air_drag]\n")
     missed = run("paper", experiment, results)
     assert missed.exit_code == 1
     assert "does not exist" in missed.output
