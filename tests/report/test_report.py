@@ -350,23 +350,16 @@ def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: p
 
 
 # The page in a real browser: no errors, no requests, adapts to the colour scheme, and prints.
-def svg_of(figure) -> str:  # type: ignore[no-untyped-def]
-    return render(figure, ["svg"])["svg"].decode()
-
-
-def motion() -> pd.DataFrame:
-    time_s = np.arange(-10, 100) * 1e-3
-    moved_m = np.maximum(time_s, 0)
-    table = pd.DataFrame({"trial": "a", "time_s": time_s, "lead_position_m": moved_m})
-    return table.assign(model_before_m=0.9 * moved_m, model_after_m=moved_m)
-
-
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A page with all optional parts."""
     folder = tmp_path_factory.mktemp("page")
-    steps = ladder("", "reservoir_depletion")
-    pictures = {"ladder": svg_of(draw_ladder(steps)), "before_after": svg_of(draw_before_after("24 kPa", motion(), ""))}
+    steps, time_s = ladder("", "reservoir_depletion"), np.arange(-10, 100) * 1e-3
+    moved_m = np.maximum(time_s, 0)
+    motion = pd.DataFrame({"trial": "a", "time_s": time_s, "lead_position_m": moved_m})
+    motion = motion.assign(model_before_m=0.9 * moved_m, model_after_m=moved_m)
+    drawn = {"ladder": draw_ladder(steps), "before_after": draw_before_after("24 kPa", motion, "")}
+    pictures = {name: render(figure, ["svg"])["svg"].decode() for name, figure in drawn.items()}
     write_clip(folder / "a.mp4", [np.full((64, 96, 3), 20 * i, np.uint8) for i in range(12)], 12)
     names = [f"trial_with_a_rather_long_name_{i}" for i in range(24)]
     html = page(
@@ -380,9 +373,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
         diagnosis=replace(Diagnosis.from_json(diagnosis("ambiguous")), ladder=steps),
         moved=moved(),
     )
-    path = folder / "report.html"
-    path.write_text(html, encoding="utf-8")
-    return path.as_uri()
+    (folder / "report.html").write_text(html, encoding="utf-8")
+    return (folder / "report.html").as_uri()
 
 
 @pytest.fixture(scope="module")
@@ -393,54 +385,44 @@ def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
         yield browser
 
 
-def test_the_browser_logs_no_errors_and_makes_no_requests(chrome: Chrome, address: str) -> None:
+def test_the_browser_logs_no_errors_makes_no_requests_and_plays_the_clip(chrome: Chrome, address: str) -> None:
     chrome.open(address)
     assert chrome.complaints == []
     asked = {request.split(":", 1)[0] for request in chrome.requests if not request.startswith("about:")}
     assert asked <= {"file", "data"}
     assert [request for request in chrome.requests if request.startswith("file:")] == [address]
+    chrome.wait("document.querySelector('video').readyState >= 1", "the clip's header")
+    assert chrome.run("document.querySelector('video').videoWidth") == 96
+    assert chrome.run("document.querySelector('video').duration") == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("width", [1400, 768, 390])
-def test_nothing_reaches_beyond_the_screen(chrome: Chrome, address: str, width: int) -> None:
-    chrome.size(width, 900)
-    chrome.open(address)
-    assert chrome.run("document.documentElement.scrollWidth") <= width
-    pictures = "[...document.querySelectorAll('header .frame svg')]"
-    assert chrome.run(f"{pictures}.filter(one => one.getBoundingClientRect().right > innerWidth).length") == 0
-
-
-def test_the_verdict_and_how_sure_are_on_a_phones_first_screen(chrome: Chrome, address: str) -> None:
-    chrome.size(390, 844)
-    chrome.open(address)
+def test_nothing_reaches_beyond_the_screen_and_a_phones_first_shows_the_verdict(chrome: Chrome, address: str) -> None:
+    for width, height in ((1400, 900), (768, 900), (390, 844)):
+        chrome.size(width, height)
+        chrome.open(address)
+        assert chrome.run("document.documentElement.scrollWidth") <= width
+        pictures = "[...document.querySelectorAll('header .frame svg')]"
+        assert chrome.run(f"{pictures}.filter(one => one.getBoundingClientRect().right > innerWidth).length") == 0
     for what in ("h1", ".facts > div"):
         assert chrome.run(f"document.querySelector('{what}').getBoundingClientRect().bottom") < 844
 
 
 def test_page_and_pictures_follow_a_dark_screen(chrome: Chrome, address: str) -> None:
-    colours = {}
+    ask = {
+        "page": "getComputedStyle(document.body).backgroundColor",
+        "text": "getComputedStyle(document.querySelector('#figure-ladder text')).fill",
+        "grid": "getComputedStyle(document.querySelector('#figure-ladder path[style*=\"--grid\"]')).stroke",
+    }
+    brightness = {}
     for scheme in ("light", "dark"):
         chrome.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         chrome.open(address)
-        of = {"page": "getComputedStyle(document.body).backgroundColor"}
-        of["text"] = "getComputedStyle(document.querySelector('#figure-ladder text')).fill"
-        of["grid"] = "getComputedStyle(document.querySelector('#figure-ladder path[style*=\"--grid\"]')).stroke"
-        colours[scheme] = {name: chrome.run(script) for name, script in of.items()}
+        brightness[scheme] = {name: sum(map(int, chrome.run(script)[4:-1].split(","))) for name, script in ask.items()}
     chrome.send("Emulation.setEmulatedMedia", features=[])
-    brightness = {
-        scheme: {name: sum(map(int, colour[4:-1].split(","))) for name, colour in found.items()}
-        for scheme, found in colours.items()
-    }
-    assert brightness["light"]["page"] > 700 > 300 > brightness["light"]["text"]
-    assert brightness["dark"]["page"] < 120 < 600 < brightness["dark"]["text"]
-    assert brightness["dark"]["page"] < brightness["dark"]["grid"] < brightness["dark"]["text"]
-
-
-def test_the_clip_can_be_played(chrome: Chrome, address: str) -> None:
-    chrome.open(address)
-    chrome.wait("document.querySelector('video').readyState >= 1", "the clip's header")
-    assert chrome.run("document.querySelector('video').videoWidth") == 96
-    assert chrome.run("document.querySelector('video').duration") == pytest.approx(1.0, abs=0.05)
+    light, dark = brightness["light"], brightness["dark"]
+    assert light["page"] > 700 > 300 > light["text"]
+    assert dark["page"] < 120 < 600 < dark["text"]
+    assert dark["page"] < dark["grid"] < dark["text"]
 
 
 def test_it_prints_in_dark_on_light_whatever_the_screen(chrome: Chrome, address: str) -> None:
