@@ -98,27 +98,6 @@ def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> 
     np.testing.assert_allclose(track.pressure_Pa, 1e3 * brought["pressure_kPa"])
 
 
-@pytest.mark.slow
-def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> None:
-    """Three balls let go, filmed at 240 frames a second with 0.2 mm of noise; g = 9.80665."""
-    experiment = tmp_path / "balls"
-    experiment.mkdir()
-    draw = np.random.default_rng(21)
-    sheet = ["trial,track,diameter_mm,pressure_kPa,yield_pressure_kPa,payload_g\n"]
-    for name in ("a", "b", "c"):
-        time_s = np.arange(120) / 240
-        fallen_m = 0.5 * 9.80665 * np.maximum(time_s - 0.0513, 0) ** 2 + 2e-4 * draw.standard_normal(120)
-        pd.DataFrame({"time_s": time_s, "position_m": fallen_m}).to_csv(experiment / f"{name}.csv", index=False)
-        sheet.append(f"{name},{name}.csv,40,0,0,2.7\n")
-    (experiment / "trials.csv").write_text("".join(sheet))
-    (experiment / "experiment.yaml").write_text("travel_ratio: 1\nmodel: [gravity]\n")
-    (g,) = fitted(experiment, tmp_path / "results")["numbers"]
-    assert abs(g["value"] - 9.80665) < 4 * g["sigma"] < 0.04
-    (row,) = read_result(tmp_path / "results" / "comparison.csv").itertuples()
-    assert row.rms_position_m == pytest.approx(2e-4, rel=0.15)
-    assert row.ratio == pytest.approx(1.0, abs=0.15)
-
-
 # A recording whose axis is not that of the others fails when the trials are gathered, and enters no fit.
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
