@@ -210,10 +210,11 @@ def test_a_benchmark_finds_what_it_imports() -> None:
 
 @pytest.mark.parametrize("name", sorted(vinetrack._HOMES))
 def test_a_name_of_the_python_interface_is_documented(name: str) -> None:
-    """Arguments with their meaning, and what is returned (numpydoc)."""
+    """Arguments with their meaning, what is returned (numpydoc), and an example."""
     thing = getattr(vinetrack, name)
     text = thing.__doc__ or ""
-    assert len(text) > 60 or issubclass(thing, Exception)
+    assert ">>> " in text
+    assert len(text) > 60
     if not isinstance(thing, type):
         arguments = thing.__code__.co_varnames[: thing.__code__.co_argcount]
         assert not arguments or "Parameters\n" in text
