@@ -7,11 +7,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hand_sheet import GOOD, HEADER, TRACK, one, stopped, two_vines, write
 
-import vinetrack as vt
 from vinetrack.core.problems import Problem, format_problems
 from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.experiment.folder import Experiment, check_experiment, read_experiment
@@ -186,28 +184,6 @@ def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_st
     for setting, expected_m in (("", math.nan), ("_systematic_mm: 0.25", 2.5e-4), ("_systematic_mm: 0", 0)):
         trial = one(folder, f"position{setting}\n" if setting else "").trials[0]
         assert trial.position_systematic_m == pytest.approx(expected_m, nan_ok=True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("setting", "verdict"), [("", "adequate"), ("position_systematic_mm: 0.1", "unexplained")])
-def test_the_smooth_error_of_a_drop_of_47_m_is_not_0_1_mm(tmp_path: Path, setting: str, verdict: str) -> None:
-    """Two balls dropped twice each and filmed at 15 frames a second by a camera that bends the fall by 15 mm."""
-    draw, sheet = np.random.default_rng(7), "trial,track,diameter_mm,payload_g,travel_ratio,pressure_kPa\n"
-    for k, (diameter_mm, mass_g) in enumerate([(73, 149), (73, 149), (65.5, 58), (65.5, 58)]):
-        time_s = np.arange(0, 5, 1 / 15)
-        since_s = np.maximum(time_s - 0.2 - draw.uniform(0, 0.06), 0)
-        # Fall against drag c v²: y = v∞²/g · ln cosh(g t/v∞).
-        drag_kg_m = 0.5 * 1.2 * 0.47 * math.pi * (diameter_mm / 2e3) ** 2
-        final_m_s = math.sqrt(1e-3 * mass_g * 9.81 / drag_kg_m)
-        fallen_m = final_m_s**2 / 9.81 * np.log(np.cosh(9.81 * since_s / final_m_s))
-        time_s, fallen_m = time_s[fallen_m < 47], fallen_m[fallen_m < 47]
-        along = np.pi * fallen_m / 47
-        bent_m = 0.015 * (draw.standard_normal() * np.sin(along) + draw.standard_normal() * np.sin(2 * along))
-        seen_m = fallen_m + bent_m + 0.004 * draw.standard_normal(time_s.size)
-        rows = "".join(f"{t:.6f},{y:.5f}\n" for t, y in zip(time_s, seen_m, strict=True))
-        (tmp_path / f"b{k}.csv").write_text("time_s,position_m\n" + rows)
-        sheet += f"b{k},b{k}.csv,{diameter_mm},{mass_g},1,0\n"
-    assert vt.diagnose(write(tmp_path, sheet, f"model: [gravity, air_drag]\n{setting}\n")).verdict == verdict
 
 
 def test_check_names_the_trial_whose_track_is_wrong(folder: Path) -> None:
