@@ -96,42 +96,32 @@ LADDER = (
 )
 
 
-@pytest.fixture(scope="module")
-def experiment_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("hidden") / "campaign"
+@pytest.mark.slow
+def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trials = sheet()[6:]  # one vine at three pressures, twice each
     values = {**damping_values(trials), "reservoir_depletion.gamma": 1.2}
     scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005}
     nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=values, seed=7200, **scatter)
+    folder, results, alone = (tmp_path / name for name in ("campaign", "results", "alone"))
     write_experiment(grow(trials, nature), folder, "chamber_l: 3.7\n" + FEW_CANDIDATES)
-    return folder
 
-
-@pytest.fixture(scope="module")
-def results(experiment_commands: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("out") / "campaign"
-    for stage in ("trials", "damping", "model"):
-        succeed(stage, experiment_commands, folder)
-    (folder / "provenance.json").write_text(json.dumps({"experiment": str(experiment_commands)}))
-    return folder
-
-
-@pytest.mark.slow
-def test_straight_from_a_folder_of_tracks_to_one_file_and_no_other(experiment_commands: Path, tmp_path: Path) -> None:
-    before = sorted(experiment_commands.rglob("*"))
-    output = succeed("diagnose", experiment_commands, "--json", tmp_path / "answer.json")
+    # Straight from a folder of tracks to one file and no other.
+    alone.mkdir()
+    before = sorted(folder.rglob("*"))
+    output = succeed("diagnose", folder, "--json", alone / "answer.json")
     assert output.startswith("missing: reservoir_depletion is missing")
-    answer = json.loads((tmp_path / "answer.json").read_text())
+    answer = json.loads((alone / "answer.json").read_text())
     assert answer["effects"] == ["reservoir_depletion"]
     assert answer["final_verdict"] == "adequate"
-    assert [path.name for path in tmp_path.iterdir()] == ["answer.json"]
-    assert sorted(experiment_commands.rglob("*")) == before
+    assert [path.name for path in alone.iterdir()] == ["answer.json"]
+    assert sorted(folder.rglob("*")) == before
 
+    for stage in ("trials", "damping", "model"):
+        succeed(stage, folder, results)
+    (results / "provenance.json").write_text(json.dumps({"experiment": str(folder)}))
 
-@pytest.mark.slow
-def test_the_stage_writes_the_contract_and_effects_are_added_and_saved(
-    results: Path, experiment_commands: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     def ladder() -> list[dict[str, str]]:
         return list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
 
@@ -160,8 +150,8 @@ def test_the_stage_writes_the_contract_and_effects_are_added_and_saved(
     assert len(ladder()) == 3
 
     output = succeed("add", "reservoir_depletion", results, "--save")
-    assert "reservoir_depletion" in (experiment_commands / "experiment.yaml").read_text()
-    assert command_for_results(experiment_commands, results) in output.replace("\n", " ")
+    assert "reservoir_depletion" in (folder / "experiment.yaml").read_text()
+    assert command_for_results(folder, results) in output.replace("\n", " ")
     assert run("add", "reservoir_depletion", results).exit_code == 1
 
 
