@@ -98,11 +98,8 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
 
 
 def errors_px(results: Path, name: str, truth: Truth) -> np.ndarray:
-    """Tracked minus true position while the edge moves, the median taken off (origins are arbitrary), and stated.
-
+    """Tracked minus true position while the edge moves, the median taken off (origins are arbitrary), and stated, px.
     From half a pixel of growth on: before, a door may hide the tip, and the frame counts as lost.
-
-    Shape (n_moving, 2), px.
     """
     track = pd.read_csv(results / "tracks" / f"{name}.csv")
     true_m = truth.lead_position_m[: len(track)]

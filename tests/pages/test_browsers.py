@@ -153,10 +153,11 @@ class Person:
         self.said("#status", said)
 
 
-@pytest.fixture(params=[pytest.param(False, id="here")])
+@pytest.fixture
 def person(clips: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Person]:
     """A page served by this process, so that the server is not restarted for every test, or else by the command."""
-    serving = Served(clips, "--port", "0", command="setup") if request.param else served_here(clips)
+    by_command = getattr(request, "param", False)
+    serving = Served(clips, "--port", "0", command="setup") if by_command else served_here(clips)
     with serving as server, Chrome(tmp_path / "chrome") as chrome:
         yield Person(chrome, server.address)
         assert [text for text in chrome.complaints if "422" not in text] == []
