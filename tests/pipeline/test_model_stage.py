@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from commanded import succeed
 from lsoda_vine import small_campaign
+from test_pipeline import MODEL_HEADERS
 
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.experiment.folder import read_experiment
@@ -21,13 +22,6 @@ from vinetrack.pipeline.model_stage import fit_model
 from vinetrack.pipeline.stages import Job
 from vinetrack.results.folder_layout import Results, measured_trials, read_json, read_result, read_stored_track
 
-HEADERS = {
-    "comparison.csv": "model,condition,rms_position_m,rms_final_velocity_m_s,replicate_floor_m,ratio,worst_at_s,"
-    "worst_at_m,replicate_floor_sigma_m\n",
-    "model_check.csv": "vine,n_steady,n_trajectory,B_steady,B_trajectory,z\n",
-    "audit.csv": "trial,condition,term,size,force_N,share_of_drive,shift_m,time_s,lead_position_m,y_over_L,"
-    "slack_from_s,note\n",
-}
 TRAJECTORY_HEADER = "trial,time_s,lead_position_m,model_position_m,replicates_mean_m,replicates_sigma_m\n"
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
 
@@ -51,7 +45,7 @@ def fitted(experiment: Path, results: Path) -> dict:
     for stage in ("trials", "damping"):
         succeed(stage, experiment, results, "--settings", '{"damping": {"resamples": 200}}')
     fit_model(Job(read_experiment(experiment), results, run_settings({})))
-    for name, header in HEADERS.items():
+    for name, header in MODEL_HEADERS.items():
         assert (results / name).read_text(encoding="utf-8").startswith(header)
     return read_json(results / "fit.json")
 
