@@ -1,12 +1,15 @@
-"""Bars and colour on a terminal alone."""
+"""Bars and colour on a terminal alone, and what is said of compilation."""
 
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import pytest
 
 from vinetrack.core.terminal import progress, severity_first, waiting
+from vinetrack.core.threads import njit
+from vinetrack.pipeline.stages import COMPILING, compilation_told
 
 
 class Screen(io.StringIO):
@@ -32,3 +35,24 @@ def test_nothing_is_shown_where_nobody_looks(capfd: pytest.CaptureFixture[str]) 
         bar.begin("fitting the model")
         bar.reach(1, 3, "clips")
     assert capfd.readouterr() == ("", "")
+
+
+def test_compilation_is_told_once_and_code_is_compiled_where_no_folder_can_be_written(monkeypatch) -> None:
+    import numba
+
+    def unwritable(cache: bool = False, **flags: Any) -> Any:
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return plain(**flags)
+
+    plain = numba.njit
+    said: list[str] = []
+    with monkeypatch.context() as folders:
+        folders.setattr(numba, "njit", unwritable)
+        doubled, halved = njit(nogil=True)(lambda x: 2 * x), njit()(lambda x: x / 2)
+    with compilation_told(said.append):
+        assert halved(doubled(3)) == 3
+        assert said == [COMPILING]
+    with compilation_told(said.append):
+        assert doubled(4) == 8
+    assert said == [COMPILING]

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 # ------------------------------------------------------------------------------
 # Cores of a process, and its pool of threads for compiled code that releases Python's lock.
@@ -31,6 +31,19 @@ def thread_pool(threads: int) -> ThreadPoolExecutor:
 @lru_cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
     return ThreadPoolExecutor(threads)
+
+
+def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function by numba; the compiled form is kept, unless no folder for it can be written."""
+    import numba
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **flags)(function)
+        except RuntimeError:
+            return numba.njit(**flags)(function)
+
+    return compiled
 
 
 # ------------------------------------------------------------------------------

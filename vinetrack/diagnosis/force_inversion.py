@@ -21,10 +21,10 @@ from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
+from vinetrack.core.threads import njit
 from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, Scatter
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
@@ -94,7 +94,7 @@ def uniform_knots(count: int) -> tuple[float, ...]:
 # Compiled integration of the variational equations: responses of motions to small accelerations.
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def integrate_responses(
     time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats, gamma: float
 ) -> tuple[Floats, Floats]:

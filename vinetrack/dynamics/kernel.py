@@ -172,15 +172,15 @@ def integrate_many(batch, first, last, rtol, out, ends, work, means):
 """
 
 
+@lru_cache
 def _cache_folder() -> Path:
-    bases = os.environ.get("VINETRACK_CACHE"), os.environ.get("XDG_CACHE_HOME"), "~/.cache", tempfile.gettempdir()
-    for base in filter(None, bases):
+    for base in filter(None, (os.environ.get("VINETRACK_CACHE"), os.environ.get("XDG_CACHE_HOME"), "~/.cache")):
         folder = Path(base).expanduser() / "vinetrack" / "kernels"
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
-    raise OSError("No writable folder was found for the compiled model; set VINETRACK_CACHE to one.")
+    return Path(tempfile.mkdtemp(prefix="vinetrack-"))  # of this process alone: code is run from there
 
 
 _LOADED: dict[str, ModuleType] = {}  # Kernels of this process by their hash

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,13 @@ def describe_run(
     experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
 ) -> dict[str, Any]:
     """Return the content of `provenance.json`: versions, platform, SHA-256 of every input, model, settings."""
-    libraries = ("numpy", "scipy", "pandas", "numba", "opencv-python-headless", "av", "scikit-image", "matplotlib")
+    libraries = {name: name for name in ("numpy", "scipy", "pandas", "numba", "av", "matplotlib")}
+    libraries |= {"opencv-python-headless": "cv2", "scikit-image": "skimage"}
     return {
         "vinetrack": vinetrack.__version__,
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
-        "libraries": {name: version for name in libraries if (version := _version(name))},
+        "libraries": {name: import_module(module).__version__ for name, module in libraries.items()},
         "experiment": experiment.absolute().as_posix(),
         "inputs": {
             (path.relative_to(experiment) if path.is_relative_to(experiment) else path).as_posix(): _hash_file(path)
@@ -45,10 +46,3 @@ def _hash_file(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return "unreadable"
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return ""

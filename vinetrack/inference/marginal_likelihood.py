@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.core.threads import njit
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE, RELEASE
 from vinetrack.inference.whitening import at_correlation
 
@@ -38,7 +38,7 @@ from vinetrack.inference.whitening import at_correlation
 RIDGE = 1e-13  # Added to the diagonal of systems with a unit diagonal before they are solved (derived)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def step_within_bounds(
     square: Floats, slope: Floats, below: Floats, above: Floats, free: NDArray[np.bool_]
 ) -> tuple[Floats, NDArray[np.bool_]]:
@@ -76,7 +76,7 @@ def step_within_bounds(
     return step, moving
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def solve_scaled(square: Floats, slope: Floats) -> Floats:
     """Solve a symmetric system scaled to a unit diagonal, by least squares where it is singular. Shapes: square (n, n);
     slope (n,) → (n,).
@@ -92,7 +92,7 @@ def solve_scaled(square: Floats, slope: Floats) -> Floats:
     return scale * np.linalg.lstsq(scaled, scale * slope, 1e-12)[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def without_deviations(blocks: Floats, deviation_sd: Floats) -> tuple[Floats, float]:
     """Blocks of trials with their first two unknowns, of standard deviations S, integrated out; and the sum over trials
     of ln det(I + S Z S), Z the cross products of the two. Shapes: blocks (n_trials, k, k); deviation_sd (n_trials, 2) →
@@ -115,7 +115,7 @@ def without_deviations(blocks: Floats, deviation_sd: Floats) -> tuple[Floats, fl
     return left, log_det
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def noise_at_correlations(
     cross_products: Floats,
     prior_precision: Floats,
@@ -155,7 +155,7 @@ def noise_at_correlations(
     return scores, squares, degrees
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _factor(matrix: Floats, lower: Floats) -> None:
     """LDLᵀ factorisation of a symmetric matrix; D is the diagonal of `lower`."""
     for u in range(len(matrix)):
@@ -166,7 +166,7 @@ def _factor(matrix: Floats, lower: Floats) -> None:
             lower[u, v] = left if u == v else left / lower[v, v]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _solved(lower: Floats, right: Floats) -> Floats:
     """The solution with the factors of `_factor`."""
     size, solution = len(right), right.copy()

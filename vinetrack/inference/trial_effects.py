@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.core.threads import njit
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.marginal_likelihood import (
     FitState,
@@ -44,7 +44,7 @@ from vinetrack.inference.whitening import whiten
 # three quarters of the time of a fit that continues from another.
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def products_at_releases(
     time_s: Floats,
     position_m: Floats,

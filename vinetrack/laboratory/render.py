@@ -15,10 +15,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.core.threads import njit
 from vinetrack.laboratory.scene import PATTERN_PX, Ball, Camera, Door, Scene, Target, Tube
 
 Image = NDArray[np.float32]
@@ -251,7 +251,7 @@ def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Imag
 POINTS, LATTICE = 89, 55  # Points in a pixel, on a Fibonacci lattice (derived)
 
 
-@njit(cache=True)
+@njit()
 def _paint_board(
     board: Floats, step_x: Floats, step_y: Floats, pattern: NDArray[np.uint8], per_square: int, margin: float,
     black: float, white: float, light: Image, share: Image,
@@ -313,7 +313,7 @@ Whole = NDArray[np.int64]
 NORMAL_BITS = 12  # Bits of a random number per normal deviate (chosen)
 
 
-@njit(cache=True)
+@njit()
 def _ramp(z: float) -> float:
     """Integral of the normal distribution function Φ from −∞ to z: zΦ(z) + φ(z)."""
     if z > 8:
@@ -323,7 +323,7 @@ def _ramp(z: float) -> float:
     return 0.5 * z * (1 + math.erf(z / math.sqrt(2.0))) + math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
 
 
-@njit(cache=True)
+@njit()
 def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px: float, n: int) -> Image:
     """Return the fraction of the exposure during which a blurred edge covers a point, shape (len(sigmas_px), n). Column
     i is the point `first_px + i·step_px` ahead of the edge's reference position. `path_px` are positions of the edge
@@ -350,7 +350,7 @@ def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px:
     return table
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, shift_y: float, out: Image) -> None:
     """Sample the backdrop, displaced by (shift_x, shift_y) px, at every pixel of the camera; bilinear, into `out`.
     Shapes: canvas (canvas_height, canvas_width); map_x, map_y, out (height, width).
@@ -367,7 +367,7 @@ def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, s
             out[y, x] = top + ay * (bottom - top)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def shade_tube(
     out: Image, along: Image, across: Image, first_x: Whole, last_x: Whole, shift_along: float, shift_across: float,
     tip_px: float, sway: float, sway_length: float, table: Image, table_first: float, table_step: float, fold_row: int,
@@ -443,7 +443,7 @@ def shade_tube(
             out[y, x] += coverage * (film - out[y, x])
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def shade_ball(
     out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
     radius_px: float, sigma_px: float, surface: Image, box: Whole, min_along: float,
@@ -476,7 +476,7 @@ def shade_ball(
             out[y, x] += np.float32((light_sum - coverage_sum * out[y, x]) / path_px.size)
 
 
-@njit(cache=True)
+@njit()
 def _mixed(z: np.uint64) -> np.uint64:
     """Splitmix64's finaliser (Steele et al. 2014): neighbouring seeds give unrelated streams."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -484,7 +484,7 @@ def _mixed(z: np.uint64) -> np.uint64:
     return z ^ (z >> np.uint64(31))
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(fastmath=True, nogil=True)
 def expose(
     light: Image, gain: Image, lamp: float, full_well_e: float, read_noise_e: float, seed: int, frame: int,
     normals: Image, low: float, span: float, out: NDArray[np.uint8 | np.uint16],

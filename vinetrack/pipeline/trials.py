@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
-from importlib.metadata import version
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,7 +95,7 @@ class Kept:
         """The tracking in pixels of a recording (the first input is its path), kept or made."""
         film, *others = inputs
         assert isinstance(film, Path)
-        libraries = list(map(version, ("numpy", "scipy", "numba", "av", "opencv-python-headless", "scikit-image")))
+        libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2", "skimage")]
         code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
         self.tracked = _key(code, libraries, film.resolve(), identity(film), others)
         path = self.folder / f"{self.tracked}.npz"

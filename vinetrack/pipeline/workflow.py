@@ -330,13 +330,6 @@ def print_report_path(plan: WorkflowPlan, workflow: Any) -> None:
         print(f"Report: {path}", flush=True)
 
 
-def shell_prefix() -> str:
-    """Return a prefix for all shell commands that puts this Python first in PATH: no environment need be activated."""
-    return f'set -euo pipefail; export PATH={shlex.quote(str(Path(sys.executable).parent))}:"$PATH"; '.replace(
-        "{", "{{"
-    ).replace("}", "}}")
-
-
 # ------------------------------------------------------------------------------
 # The command `vinetrack check`: facts about the recordings of an experiment, and all problems, before any analysis.
 

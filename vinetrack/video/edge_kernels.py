@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from vinetrack.core.threads import in_parts
+from vinetrack.core.threads import in_parts, njit
 
 # ------------------------------------------------------------------------------
 # Fraction of each pixel that the film covers, for an edge blurred by optics (Gaussian) and by its own motion (box).
@@ -37,7 +36,7 @@ _NORMAL = np.array(
 FASTMATH = {"contract", "arcp", "nsz", "reassoc"}  # Floating-point freedom of the compiler (chosen)
 
 
-@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _normal(z: float) -> tuple[float, float]:
     """Interpolate Φ(z) and its integral zΦ(z) + φ(z) from the table."""
     if z <= -Z_LAST:
@@ -56,7 +55,7 @@ def _normal(z: float) -> tuple[float, float]:
     return a * low + b * low_slope + c * high - d * high_slope, a * low_sum + b * low + c * high_sum - d * high
 
 
-@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
     """Tabulate the coverage p and its slope dp/dx for one length of motion blur. Entry [j, k] is for x = middle − k + j
     TABLE_STEP_PX, with middle = ceil(half) + 1. p is the mean of the normal distribution function over a box of
@@ -82,13 +81,13 @@ def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
     return table
 
 
-@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_reach(length: float, blur: float) -> float:
     """Return the distance from an edge beyond which a pixel is fully covered or fully uncovered."""
     return 0.5 * length + 4 * blur + 0.5
 
 
-@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def subpixel_index(place: float) -> tuple[int, int, float, int]:
     """Split the position of an edge into indices of a coverage table. Returns whole part, px; entry j below the
     fraction; weight of entry j + 1; 1 if the position is a whole number, else 0.
@@ -104,7 +103,7 @@ COLUMNS_AHEAD = 50  # Columns ahead of the last passed one that are used (chosen
 FILM_CLIP_RATIO = 1.7  # Ratio of the clipped squared distance from film to that from background (chosen)
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def film_evidence(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, appearance: np.ndarray, width: float, clip: float
 ) -> np.ndarray:
@@ -135,7 +134,7 @@ def film_evidence(
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def fit_edges(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, start: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
     blur: float, appearance: np.ndarray, inflation: np.ndarray, prior_sd: float, margin: float, rounds: int,
@@ -197,7 +196,7 @@ def fit_edges(
 
 
 # _nrt: numba need not count references in a function that allocates nothing (measured).
-@njit(forceinline=True, cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+@njit(forceinline=True, nogil=True, fastmath=FASTMATH, error_model="numpy", _nrt=False)
 def _normal_sums(
     picture: np.ndarray, rows: tuple[int, int], scale: np.float32, offset: np.float32, appearance: np.ndarray, y: float,
     lag: np.ndarray, half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray,
@@ -291,7 +290,7 @@ def gather(
     return sums
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _gather_rows(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, edge: np.ndarray, reach: np.ndarray, lag: np.ndarray,
     weights: np.ndarray, limits: np.ndarray, appearance: np.ndarray, clip_weight: np.float32, shading: np.ndarray,
@@ -327,7 +326,7 @@ def _gather_rows(
                         squares[i] += w * values[i] * values[i]
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float) -> np.ndarray:
     """Brightness of film and background at every pixel, and the variance about each. A pixel at which one of the two is
     never visible, or whose background changes (a door swings there), takes it from its row: film from the columns
@@ -365,7 +364,7 @@ def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: 
 # What an edge fit leaves, from which the shape of the tip, its light and shade, its blur and the noise follow.
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def residual_sums(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, fit: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
     blur: float, appearance: np.ndarray, margin: float, frames: np.ndarray, shading: np.ndarray,

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import CAMERA_FILES, CONTAINERS, IMAGES, Bools, Floats, Indices
 from vinetrack.core.tables import file_size
+from vinetrack.core.threads import njit
 
 if TYPE_CHECKING:
     import av
@@ -340,7 +340,7 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
     return repeated
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Mean absolute change of each frame, of every second row of some columns, from the one before; shape (n_frames,).
     The first has none before it: infinity.

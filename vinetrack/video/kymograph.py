@@ -13,11 +13,10 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.core.threads import FEWEST_PICTURES, in_parts
+from vinetrack.core.threads import FEWEST_PICTURES, in_parts, njit
 from vinetrack.video.edge_kernels import FASTMATH
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 # Compiled: the largest change of each pixel, and paths through pixels that change in order.
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
     """Find the first picture after the largest step of each pixel's mean brightness, and the power of that step,
     (n_pixels,) each. Shapes: pictures (n, n_pixels).
@@ -55,7 +54,7 @@ def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.nda
     return step_frame, best
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def monotone_path_sums(
     along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
 ) -> np.ndarray:
@@ -95,7 +94,7 @@ def mean_changes(pictures: NDArray[Any], step: int) -> NDArray[np.float64]:
     return np.concatenate(sums) / (height * width)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sums_of_changes(pictures: np.ndarray, step: int) -> np.ndarray:
     """Sum the absolute changes of `mean_changes`."""
     n, height, width = pictures.shape
@@ -122,7 +121,7 @@ PEAK_FRACTION = 0.15  # Part of the largest score of a column that its changes m
 END_FRAMES = 5
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _change_score(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, group_size: int, noise: float, begin: int,
     end: int,
@@ -159,7 +158,7 @@ def _change_score(
     return score / noise_power - np.float32(1.0)
 
 
-@njit(cache=True)
+@njit()
 def dividing_path(evidence: np.ndarray) -> np.ndarray:
     """Find the monotone path that best separates film from background, by dynamic programming. The sum of `evidence`
     behind the edge is minimised; the edge never retreats. Shapes: evidence (n_frames, n_along) → (n_frames,).
@@ -261,7 +260,7 @@ def _median_frame(strip: Strip, frames: slice) -> NDArray[np.float32]:
     return np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _votes(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, first: np.ndarray, last: np.ndarray, softening: float
 ) -> np.ndarray:
@@ -278,7 +277,7 @@ def _votes(
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def mean_appearance(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int
 ) -> np.ndarray:
@@ -322,7 +321,7 @@ def mean_appearance(
     return sums
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def clipped_residual_sums(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, noise: float, path: np.ndarray, appearance: np.ndarray,
     begin: int, end: int,

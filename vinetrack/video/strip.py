@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices
-from vinetrack.core.threads import FEWEST_PICTURES, in_parts
+from vinetrack.core.threads import FEWEST_PICTURES, in_parts, njit
 from vinetrack.video.axis import Axis
 
 BAND_GAP_PX = 5  # Rows left out between tube and background, to allow for sway and blur (chosen)
@@ -270,7 +269,7 @@ def register(luma: NDArray[Any], places: Indices, basis: Floats, shift_px: Float
     return solution, sigma
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit every frame to the rows of `basis` by least squares, twice: the second time without outliers (4 sd). `data`
     has shape (n_frames, n_pixels), `basis` (4, n_pixels). Returns the coefficients, shape (n_frames, 4), and the
@@ -319,7 +318,7 @@ def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray) -> tupl
     return out, error
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _masked_products(basis: np.ndarray, inlier: np.ndarray) -> np.ndarray:
     """Products of the rows of `basis` with each other, shape (4, 4), summed over the inliers."""
     out = np.empty((4, 4))
