@@ -6,15 +6,7 @@ import math
 
 import pytest
 
-from vinetrack.core.units import (
-    UNITS,
-    convert,
-    interval,
-    number,
-    split_unit,
-    with_error,
-    with_interval,
-)
+from vinetrack.core.units import UNITS, convert, interval, number, split_unit, with_error, with_interval
 
 
 def test_inches_pounds_and_psi_are_exact_by_definition() -> None:
@@ -26,28 +18,20 @@ def test_inches_pounds_and_psi_are_exact_by_definition() -> None:
     assert convert(180, "deg", "rad") == math.pi
 
 
-def test_a_number_goes_to_si_as_division_rounds_it() -> None:
+def test_a_number_goes_to_si_as_division_rounds_it_and_back() -> None:
     """28.7 · 0.001 is 0.028700000000000003; the double next to 0.0287 is wanted."""
     assert UNITS["mm"].to_si(28.7) == 28.7 / 1000
     assert UNITS["um"].to_si(207) == 207 / 1e6
     assert UNITS["deg"].to_si(33.3) == math.radians(33.3)
-
-
-@pytest.mark.parametrize("name", UNITS)
-def test_from_si_undoes_to_si(name: str) -> None:
-    assert UNITS[name].from_si(UNITS[name].to_si(0.37)) == pytest.approx(0.37, rel=1e-15)
+    for unit in UNITS.values():
+        assert unit.from_si(unit.to_si(0.37)) == pytest.approx(0.37, rel=1e-15)
 
 
 def test_the_longest_ending_that_is_a_unit_is_the_unit() -> None:
-    assert split_unit("film_density_g_cm3") == ("film_density", "g_cm3")
-    assert split_unit("thickness_um") == ("thickness", "um")
-    assert split_unit("mm_per_px") == ("mm_per_px", "")
-    assert split_unit("kPa") == ("kPa", "")
-
-
-def test_a_number_has_three_digits_and_an_exponent_only_where_needed() -> None:
-    values = (0.37, 1069.0, 0.0, -2.345, 1.5e-7, math.nan, None)
-    assert [number(value) for value in values] == ["0.370", "1069", "0", "-2.35", "1.50e-07", "–", "–"]
+    for name, parts in (("film_density_g_cm3", ("film_density", "g_cm3")), ("thickness_um", ("thickness", "um"))):
+        assert split_unit(name) == parts
+    for name in ("mm_per_px", "kPa"):
+        assert split_unit(name) == (name, "")
 
 
 @pytest.mark.parametrize(
@@ -66,7 +50,9 @@ def test_a_value_ends_where_its_error_does(value: float, sigma: float, text: str
     assert with_error(value, sigma) == text
 
 
-def test_an_interval_shows_both_ends_to_the_same_digit() -> None:
+def test_a_number_has_three_digits_and_an_interval_shows_both_ends_to_the_same() -> None:
+    values = (0.37, 1069.0, 0.0, -2.345, 1.5e-7, math.nan, None)
+    assert [number(value) for value in values] == ["0.370", "1069", "0", "-2.35", "1.50e-07", "–", "–"]
     assert interval([0.36512, 0.37449]) == "0.3651 to 0.3745"
     assert with_interval(0.4001, [0.359, 0.4412]) == "0.400 (95 %: 0.359 to 0.441)"
     assert with_interval(0.4001, [None, None]) == "0.400"
