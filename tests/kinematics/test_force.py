@@ -12,16 +12,8 @@ from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 from vinetrack import effects
 from vinetrack.core.records import Kinematics, Track, Trial, Window, plain_track
 from vinetrack.dynamics.model import base_model
-from vinetrack.kinematics.force import (
-    Release,
-    SteadyForce,
-    TrialMotion,
-    find_release,
-    flag_rest,
-    known_pressure,
-    steady_force,
-    why_not_in_fit,
-)
+from vinetrack.kinematics import force as module
+from vinetrack.kinematics.force import Release, SteadyForce, TrialMotion, find_release, flag_rest
 from vinetrack.kinematics.velocity import estimate_kinematics
 
 G = 9.81
@@ -46,7 +38,7 @@ def moved(pressure_Pa: np.ndarray | None = None, trial: Trial = VINE) -> TrialMo
 
 
 def force_of(trial: Trial, window: Window = WINDOW, pressure_Pa: np.ndarray | None = None, model=None) -> SteadyForce:
-    return steady_force(moved(pressure_Pa, trial), window, model or base_model())
+    return module.steady_force(moved(pressure_Pa, trial), window, model or base_model())
 
 
 def test_force_is_the_excess_pressure_and_the_weight_of_what_still_moves() -> None:
@@ -58,12 +50,9 @@ def test_force_is_the_excess_pressure_and_the_weight_of_what_still_moves() -> No
     assert force.yield_sigma_N == pytest.approx(200 * AREA, rel=1e-12)
     assert force.window_pressure_Pa == pytest.approx(14e3, rel=1e-12)
     assert force.pressure_source == "set"
-
-
-@pytest.mark.parametrize(("angle_deg", "share"), [(0, 1), (60, 0.5), (90, 0), (180, -1)])
-def test_weight_counts_along_the_growth(angle_deg: float, share: float) -> None:
-    force = force_of(replace(VINE, growth_angle_rad=math.radians(angle_deg)))
-    assert force.force_N == pytest.approx(11e3 * AREA + share * 2 * FILM * 0.18 * G, rel=1e-9)
+    for angle_deg, share in ((60, 0.5), (90, 0), (180, -1)):
+        force = force_of(replace(VINE, growth_angle_rad=math.radians(angle_deg)))
+        assert force.force_N == pytest.approx(11e3 * AREA + share * 2 * FILM * 0.18 * G, rel=1e-9)
 
 
 def test_a_measured_pressure_takes_the_place_of_the_set_one() -> None:
@@ -101,16 +90,13 @@ def test_in_a_quasi_steady_window_inertia_is_taken_off() -> None:
     assert force_of(VINE).force_N - force_of(VINE, window).force_N == pytest.approx(2 * FILM * 0.18 * 2.0, rel=1e-2)
 
 
-def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only() -> None:
-    assert known_pressure(moved(), base_model()) is None
-    found = known_pressure(moved(np.where(np.arange(200) % 2, 12e3 + np.arange(200), math.nan)), base_model())
+def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only_and_payloads_are_in_no_law() -> None:
+    assert module.known_pressure(moved(), base_model()) is None
+    found = module.known_pressure(moved(np.where(np.arange(200) % 2, 12e3 + np.arange(200), math.nan)), base_model())
     assert found is not None
     np.testing.assert_allclose(found[1:], 12e3 + np.arange(1, 200))
-
-
-def test_a_vine_with_a_payload_has_no_place_in_the_law() -> None:
-    assert why_not_in_fit(VINE) == ""
-    assert why_not_in_fit(replace(VINE, payload_kg=0.0356))
+    assert module.why_not_in_fit(VINE) == ""
+    assert module.why_not_in_fit(replace(VINE, payload_kg=0.0356))
 
 
 # ---- release time and resting position ----
@@ -120,18 +106,13 @@ def release_of(track: Track, travel_ratio: float = 2.0) -> Release:
     return find_release(track, estimate_kinematics(track, travel_ratio=travel_ratio))
 
 
-@pytest.mark.parametrize(
-    ("vine", "noise_m", "frames"),
-    [
-        (Vine(1, 3.0), 3e-5, 0.5),
-        (Vine(1, 10.0), 1e-4, 0.5),
-        (Vine(3, 5.0), 1e-4, 1.0),
-        (Vine(4, 10.0), 1e-4, 1.0),
-        (Vine(4, 1.0), 1e-4, 2.0),
-        (Vine(4, 0.3), 3e-5, 2.0),
-    ],
-    ids=str,
-)
+FOUND_WITHIN = [
+    (Vine(1, 3.0), 3e-5, 0.5), (Vine(1, 10.0), 1e-4, 0.5), (Vine(3, 5.0), 1e-4, 1.0),
+    (Vine(4, 10.0), 1e-4, 1.0), (Vine(4, 1.0), 1e-4, 2.0), (Vine(4, 0.3), 3e-5, 2.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("vine", "noise_m", "frames"), FOUND_WITHIN, ids=str)
 def test_onset_is_found_to_within_frames(vine, noise_m, frames):
     off = []
     for seed in range(1000, 1020):

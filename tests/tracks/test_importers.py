@@ -14,15 +14,8 @@ from nptdms import ChannelObject, TdmsWriter
 from vine_truth import make_track
 
 from vinetrack.core.records import Trial, with_flag
-from vinetrack.tracks.importers import (
-    TrackError,
-    attach_pressure,
-    flag_end_of_motion,
-    load_track,
-    read_pressure_trace,
-    read_track,
-    unrounded_times,
-)
+from vinetrack.tracks import importers
+from vinetrack.tracks.importers import TrackError, read_pressure_trace, read_track
 
 TIMES = np.arange(8) / 100
 POSITIONS = 0.5 * 9.81 * TIMES**2
@@ -64,25 +57,21 @@ def test_blank_pressures_are_interpolated_and_a_frame_without_a_point_has_no_pos
     assert track.pressure_Pa is None
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "time_s,position_m\n1,1\n2,2\n3,3\n4,4\n",
-        "time_s,position_mm\n" + rows(TIMES, POSITIONS),
-        "frame,position_m\n" + rows(TIMES, POSITIONS),
-        "time_s,position_m\n0,0\n1,1\n1,2\n2,3\n3,4\n",
-        "time_s,position_m\n0,0\n1,x\n2,2\n3,3\n4,4\n",
-        "time_s,position_m\n0,0\n1,\n2,2\n3,3\n4,4\n",
-        "time_s,position_m\n0,0\n1,nan\n2,2\n3,3\n4,4\n",
-        "time_s,position_m\n0,0\n1,1e300\n2,2\n3,3\n4,4\n",
-        "time_s,position_m,sigma_m\n0,0,1\n1,1,-1\n2,2,1\n3,3,1\n4,4,1\n",
-        "time_s,position_m,pressure_kPa\n" + "".join(f"{i},{i},24000\n" for i in range(5)),
-        "time_s,position_m,pressure_kPa\n" + "".join(f"{i},{i},-200\n" for i in range(5)),
-        "\tt,x\n1,1\n",
-        "t (s)\tx (furlong)\n" + rows(TIMES, POSITIONS, separator="\t"),
-    ],
-)
+HEADER = "time_s,position_m\n"
+NO_TRACKS = [
+    "",
+    HEADER + "1,1\n2,2\n3,3\n4,4\n",
+    "time_s,position_mm\n" + rows(TIMES, POSITIONS),
+    "frame,position_m\n" + rows(TIMES, POSITIONS),
+    *(HEADER + f"0,0\n1,1\n{row}\n2,3\n3,4\n" for row in ("1,2", "1.5,x", "1.5,", "1.5,nan", "1.5,1e300")),
+    "time_s,position_m,sigma_m\n0,0,1\n1,1,-1\n2,2,1\n3,3,1\n4,4,1\n",
+    *("time_s,position_m,pressure_kPa\n" + "".join(f"{i},{i},{kPa}\n" for i in range(5)) for kPa in (24000, -200)),
+    "\tt,x\n1,1\n",
+    "t (s)\tx (furlong)\n" + rows(TIMES, POSITIONS, separator="\t"),
+]
+
+
+@pytest.mark.parametrize("text", NO_TRACKS)
 def test_an_invalid_track_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(TrackError):
         read_track(write(tmp_path, text))
@@ -102,9 +91,7 @@ def test_an_invalid_track_is_refused(tmp_path: Path, text: str) -> None:
         ("t (ms)\tx (cm)\n", "\t", ".", (1000, 100)),
     ],
 )
-def test_exports_of_a_straight_motion(
-    tmp_path: Path, header: str, separator: str, decimal: str, scales: tuple[float, ...]
-) -> None:
+def test_exports_of_a_straight_motion(tmp_path: Path, header, separator, decimal, scales) -> None:
     """In a plane the principal axis is exact along any direction, whatever the origin."""
     origin_m = 0.3 if len(scales) > 2 else 0.0
     columns = (TIMES * scales[0], *(origin_m + scale * POSITIONS for scale in scales[1:]))
@@ -117,11 +104,10 @@ def test_exports_of_a_straight_motion(
 def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path: Path) -> None:
     """Out to +1 m and back to 0.2 m on the other side: the end counts as forwards."""
     there = np.array([0.0, 0.5, 0.9, 1.0, 0.9, 0.5, 0.1, -0.2])
-    text = "t,x,y\n" + rows(TIMES, 0.6 * there, 0.8 * there)
-    np.testing.assert_allclose(read_track(write(tmp_path, text)).lead_position_m, -there, atol=2e-9)
+    track = read_track(write(tmp_path, "t,x,y\n" + rows(TIMES, 0.6 * there, 0.8 * there)))
+    np.testing.assert_allclose(track.lead_position_m, -there, atol=2e-9)
 
 
-FRAME_MS = 4.0
 SCALE = 400.0  # px per m
 
 
@@ -139,13 +125,7 @@ def system(frame: int, origin: tuple[float, float] = (50.0, 300.0), scale: float
     return tracker(f"[{frame}]", thing("FrameData", *(tracker(key, value) for key, value in values.items())))
 
 
-def project(
-    marks: dict[int, tuple[float, float]],
-    *,
-    axes: str | None = None,
-    unit: str = "m",
-    clock: str = tracker("delta_t", FRAME_MS),
-) -> str:
+def project(marks, axes: str | None = None, unit: str = "m", clock: str = tracker("delta_t", 4.0)) -> str:
     """A Tracker project with one point mass; `marks` in px, image y downwards."""
     points = "".join(
         tracker(f"[{n}]", thing("PointMass$FrameData", tracker("x", float(x)), tracker("y", float(y))))
@@ -180,21 +160,15 @@ def test_a_project_with_frames_left_out_and_a_camera_that_moved(tmp_path: Path) 
     np.testing.assert_allclose(moved.lead_position_m, TRAVEL, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        project(MARKS, axes=system(0, scale=1.0)),
-        project(MARKS, axes=system(0, scale=0.0)),
-        project(MARKS, axes=""),
-        project(MARKS, clock=""),
-        project(MARKS, unit="parsec"),
-        project({}),
-        project({1: (1.0, 2.0)}),
-        project(MARKS).replace("TrackerPanel", "Launcher"),
-        project(MARKS)[:-40],
-        '<?xml version="1.0"?><!DOCTYPE b [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]><object>&b;</object>',
-    ],
-)
+NO_PROJECTS = [
+    *(project(MARKS, axes=axes) for axes in (system(0, scale=1.0), system(0, scale=0.0), "")),
+    *(project(MARKS, clock=""), project(MARKS, unit="parsec"), project({}), project({1: (1.0, 2.0)})),
+    *(project(MARKS).replace("TrackerPanel", "Launcher"), project(MARKS)[:-40]),
+    '<?xml version="1.0"?><!DOCTYPE b [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]><object>&b;</object>',
+]
+
+
+@pytest.mark.parametrize("text", NO_PROJECTS)
 def test_projects_that_cannot_be_used(tmp_path: Path, text: str) -> None:
     with pytest.raises(TrackError):
         read_track(write(tmp_path, text, "tip.trk"))
@@ -205,12 +179,12 @@ def test_a_trace_is_interpolated_on_the_times_of_the_track_unless_it_is_of_anoth
     np.testing.assert_allclose(pressure_Pa, [30500, 29000, 10000])
     track = make_track(np.arange(5.0), np.arange(5.0))
     np.testing.assert_allclose(
-        attach_pressure(track, time_s, pressure_Pa).pressure_Pa, [29500, 28000, 26000, 24000, 22000]
+        importers.attach_pressure(track, time_s, pressure_Pa).pressure_Pa, [29500, 28000, 26000, 24000, 22000]
     )
-    short = attach_pressure(track, np.array([0.0, 2.0]), np.array([2e4, 1e4]))
+    short = importers.attach_pressure(track, np.array([0.0, 2.0]), np.array([2e4, 1e4]))
     np.testing.assert_allclose(short.pressure_Pa, [2e4, 1.5e4, 1e4, 1e4, 1e4])
     with pytest.raises(TrackError):
-        attach_pressure(track, np.array([100.0, 200.0]), np.array([2e4, 1e4]))
+        importers.attach_pressure(track, np.array([100.0, 200.0]), np.array([2e4, 1e4]))
 
 
 @pytest.mark.real
@@ -234,29 +208,28 @@ def test_rounded_times_of_even_frames_become_even(rate_hz: float, digits: int) -
     for seed in range(5):
         true_s = float(np.random.default_rng(seed).uniform(0, 0.3)) + np.arange(150) / rate_hz
         for written_s in (np.round(true_s, digits), np.floor(true_s * 10**digits) / 10**digits):
-            restored_s, note = unrounded_times(written_s)
+            restored_s, note = importers.unrounded_times(written_s)
             # Less than a fifth of what rounding does, but for a shift of them all.
             off_s = restored_s - true_s
             assert np.max(np.abs(off_s - off_s.mean())) < 0.1 * 10.0**-digits
             assert note
 
 
-@pytest.mark.parametrize(
-    "time_s",
-    [
-        np.arange(100) / 500,
-        np.arange(100) / 1069,
-        np.round(np.arange(100) / 1069, 6),
-        np.round(np.delete(np.arange(100), [40, 41]) / 1069, 3),
-        np.round(np.cumsum(np.random.default_rng(2).uniform(0.5e-3, 1.5e-3, 100)), 3),
-        np.array([0.0, 0.001, 0.002, 0.002, 0.003]),
-        np.zeros(20),
-    ],
-    ids=["even to the digit", "not rounded", "to the microsecond", "frames are missing", "uneven", "few", "standing"],
-)
-def test_other_times_stay_as_they_are(time_s: np.ndarray) -> None:
-    kept_s, note = unrounded_times(time_s)
-    assert kept_s is time_s
+OTHER_TIMES = {
+    "even to the digit": np.arange(100) / 500,
+    "not rounded": np.arange(100) / 1069,
+    "to the microsecond": np.round(np.arange(100) / 1069, 6),
+    "frames are missing": np.round(np.delete(np.arange(100), [40, 41]) / 1069, 3),
+    "uneven": np.round(np.cumsum(np.random.default_rng(2).uniform(0.5e-3, 1.5e-3, 100)), 3),
+    "few": np.array([0.0, 0.001, 0.002, 0.002, 0.003]),
+    "standing": np.zeros(20),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_TIMES)
+def test_other_times_stay_as_they_are(name: str) -> None:
+    kept_s, note = importers.unrounded_times(OTHER_TIMES[name])
+    assert kept_s is OTHER_TIMES[name]
     assert note == ""
 
 
@@ -277,7 +250,7 @@ CLOCK_S = np.arange(120) / 200
 def ended(position_m: np.ndarray, seed: int = 620, **stated: float):
     trial = Trial(name="t", **({"travel_ratio": 1.0} | stated))
     noise = np.random.default_rng(seed).normal(0, 2e-4, position_m.size)
-    track = flag_end_of_motion(trial, make_track(CLOCK_S, position_m + noise))
+    track = importers.flag_end_of_motion(trial, make_track(CLOCK_S, position_m + noise))
     return np.flatnonzero(with_flag(track.flag, "after_end")), track.notes
 
 
@@ -323,7 +296,7 @@ def test_a_motion_without_an_end_keeps_its_points(position_m):
 )
 def test_only_bodies_without_chosen_frames_are_cut(tmp_path: Path, travel_ratio, frames_used, ends):
     path = write(tmp_path, "time_s,position_m\n" + rows(CLOCK_S, fall(0.7, 0.6)))
-    track = load_track(Trial(name="ball", track=path, travel_ratio=travel_ratio, frames_used=frames_used))
+    track = importers.load_track(Trial(name="ball", track=path, travel_ratio=travel_ratio, frames_used=frames_used))
     assert with_flag(track.flag, "after_end").any() == ends
 
 
@@ -352,12 +325,10 @@ def read_tdms(folder: Path, made: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_times_and_pressures_come_out_as_they_were_written(tmp_path: Path) -> None:
+    """A waveform says its own times and unit."""
     time_s, pressure_Pa = read_tdms(tmp_path, BOTH_CHANNELS)
     assert np.array_equal(time_s, TRACE_S)
     assert np.allclose(pressure_Pa, 1000 * PRESSURE_KPA, rtol=1e-15)
-
-
-def test_a_waveform_says_its_own_times_and_unit(tmp_path: Path) -> None:
     wave = {"wf_start_offset": 0.25, "wf_increment": 5e-4, "unit_string": "psi"}
     made = tdms(other=np.arange(3, dtype="<u1"), pressure=(np.arange(10, dtype="<i2"), wave))
     time_s, pressure_Pa = read_tdms(tmp_path, made)
@@ -365,17 +336,13 @@ def test_a_waveform_says_its_own_times_and_unit(tmp_path: Path) -> None:
     assert np.allclose(pressure_Pa, 6894.757 * np.arange(10), rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "made",
-    [
-        b"time_s,pressure_kPa\n0,1\n",
-        BOTH_CHANNELS[:-9],
-        BOTH_CHANNELS + b"TDSm",
-        tdms(volts=TRACE_S),
-        tdms(pressure_kPa=TRACE_S),
-    ],
-    ids=["text", "cut short", "half a segment", "no pressure", "no times"],
-)
+NO_TRACES = {
+    "text": b"time_s,pressure_kPa\n0,1\n", "cut short": BOTH_CHANNELS[:-9], "half a segment": BOTH_CHANNELS + b"TDSm",
+    "no pressure": tdms(volts=TRACE_S), "no times": tdms(pressure_kPa=TRACE_S),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("made", NO_TRACES.values(), ids=NO_TRACES)
 def test_unsupported_content_is_refused(tmp_path: Path, made: bytes) -> None:
     with pytest.raises(TrackError):
         read_tdms(tmp_path, made)

@@ -9,16 +9,9 @@ import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track
+from vinetrack.tracks import position_noise as module
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.tracks.position_noise import (
-    ar1_noise,
-    common_rounding_noise,
-    find_outliers,
-    noise_shape,
-    position_noise,
-    reject_outliers,
-    rounding_noise,
-)
+from vinetrack.tracks.position_noise import find_outliers, noise_shape, position_noise, reject_outliers
 
 FRAMES = np.arange(300) / 1069
 
@@ -60,12 +53,12 @@ def rounded(seed: int, step_m: float = 1e-3) -> np.ndarray:
 def test_rounding_of_most_tracks_is_that_of_all_and_of_few_is_not():
     """A track at one speed shows none of it: 5 mm from frame to frame are multiples of any millimetre."""
     even = 5e-3 * np.arange(20.0)
-    assert rounding_noise(even) == 0
-    assert common_rounding_noise([even, *map(rounded, range(3))]) == pytest.approx(1e-3 / np.sqrt(12))
+    assert module.rounding_noise(even) == 0
+    assert module.common_rounding_noise([even, *map(rounded, range(3))]) == pytest.approx(1e-3 / np.sqrt(12))
     fine = [ar1(60, 1e-4, 0.0, np.random.default_rng(seed)) + rounded(seed, 1e-9) for seed in range(3)]
-    assert common_rounding_noise([*fine, rounded(1)]) == 0
-    assert common_rounding_noise([rounded(1), rounded(2, 2e-3), rounded(3, 5e-4), *fine[:1]]) == 0
-    assert common_rounding_noise([]) == 0
+    assert module.common_rounding_noise([*fine, rounded(1)]) == 0
+    assert module.common_rounding_noise([rounded(1), rounded(2, 2e-3), rounded(3, 5e-4), *fine[:1]]) == 0
+    assert module.common_rounding_noise([]) == 0
 
 
 def test_noise_of_rounded_positions_is_not_kept_below_rounding():
@@ -137,7 +130,7 @@ def test_standard_deviations_that_a_file_states_are_used_where_they_hold_and_onl
 
 @pytest.mark.parametrize("correlation", [-0.4, 0.0, 0.9])
 def test_variance_and_lag_one_correlation_are_those_of_the_process(correlation: float) -> None:
-    noise = ar1_noise(200_000, 2e-4, correlation, np.random.default_rng(5))
+    noise = module.ar1_noise(200_000, 2e-4, correlation, np.random.default_rng(5))
     # Standard error of a variance of correlated normal noise: √(2/n · (1+ρ²)/(1−ρ²)); four of them.
     allowed = 4 * np.sqrt(2 / noise.size * (1 + correlation**2) / (1 - correlation**2))
     assert np.var(noise) == pytest.approx(4e-8, rel=allowed)
