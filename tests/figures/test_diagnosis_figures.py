@@ -11,32 +11,16 @@ from figure_frames import assert_nothing_is_cut_off
 from hand_diagnosis import ladder
 from matplotlib.colors import to_hex
 
-from vinetrack.figures.damping_figures import (
-    draw_paper_damping,
-    draw_paper_position,
-    draw_paper_reservoir,
-    draw_paper_rms,
-    draw_paper_speeds,
-)
-from vinetrack.figures.diagnosis_figures import (
-    AFTER,
-    BEFORE,
-    draw_before_after,
-    draw_candidates,
-    draw_cosines,
-    draw_drift,
-    draw_ladder,
-    draw_learned_force,
-    draw_missing_force,
-    draw_where,
-)
+from vinetrack.figures import damping_figures as paper_figures
+from vinetrack.figures import diagnosis_figures as figures
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION
 
-# Figures of a diagnosis, from tables written by hand: positions, colours and text.
+NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
+OFF_M = {"before": 8e-3, "after": 1e-3}
 
 
 def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
-    (ax,) = draw_ladder(ladder("", "reservoir_depletion")).axes
+    (ax,) = figures.draw_ladder(ladder("", "reservoir_depletion")).axes
     assert ax.get_yscale() == "log"
     assert "(mm)" in ax.get_ylabel()
     curves = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
@@ -44,40 +28,30 @@ def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
     assert [label.get_text() for label in ax.get_xticklabels()] == ["initial\nmodel", "+ reservoir\ndepletion"]
 
 
-def prediction(name: str, before_m: float, after_m: float) -> pd.DataFrame:
+def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
     time_s = np.arange(-10, 100) * 1e-3
     moved_m = np.maximum(time_s, 0)
-    table = pd.DataFrame({"trial": name, "time_s": time_s, "lead_position_m": moved_m})
-    models = {"model_before_m": before_m, "model_after_m": after_m}
-    return table.assign(**{model: moved_m - off_m * (time_s >= 0) for model, off_m in models.items()})
-
-
-def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
-    table = pd.concat([prediction("a", 8e-3, 1e-3), prediction("b", 8e-3, 1e-3)])
-    growth, left = draw_before_after("24 kPa", table, "air drag").axes
-    assert [text.get_text() for text in growth.get_legend().get_texts()] == [
-        "measured, N = 2",
-        "initial model: 8.0 mm rms",
-        "with air drag: 1.0 mm rms",
-    ]
-    assert {to_hex(line.get_color()) for line in left.lines} >= {BEFORE.lower(), AFTER.lower()}
+    table = pd.DataFrame({"time_s": time_s, "lead_position_m": moved_m})
+    table = table.assign(**{f"model_{name}_m": moved_m - off * (time_s >= 0) for name, off in OFF_M.items()})
+    table = pd.concat([table.assign(trial=name) for name in "ab"])
+    growth, left = figures.draw_before_after("24 kPa", table, "air drag").axes
+    shown = [text.get_text() for text in growth.get_legend().get_texts()]
+    assert shown == ["measured, N = 2", "initial model: 8.0 mm rms", "with air drag: 1.0 mm rms"]
+    assert {to_hex(line.get_color()) for line in left.lines} >= {figures.BEFORE.lower(), figures.AFTER.lower()}
     assert left.lines[0].get_ydata()[-1] == pytest.approx(8.0)
 
 
-def ranking(*rows: tuple[str, str, str, float, bool]) -> pd.DataFrame:
-    columns = ["effect", "kind", "status", "delta_chi2", "in_answer_set"]
-    table = pd.DataFrame(rows, columns=columns).assign(plausible=True, size="k = 1.0 ± 0.1")
-    return table.assign(sigma=np.sqrt(np.maximum(table["delta_chi2"].astype(float), 0)))
-
-
 def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() -> None:
-    table = ranking(
-        ("air_drag", "physical", "refitted", 400.0, True),
-        ("leak", "physical", "refitted", 100.0, False),
-        ("time_base", "measurement", "screened", 25.0, False),
-        ("payload_drag", "physical", "not testable here", math.nan, False),
+    table = pd.DataFrame(
+        [
+            ("air_drag", "physical", "refitted", 400.0, 20.0, True),
+            ("leak", "physical", "refitted", 100.0, 10.0, False),
+            ("time_base", "measurement", "screened", 25.0, 5.0, False),
+            ("payload_drag", "physical", "not testable here", math.nan, math.nan, False),
+        ],
+        columns=["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set"],
     )
-    (ax,) = draw_candidates([("What is missing?", table)]).axes
+    (ax,) = figures.draw_candidates([("What is missing?", table.assign(plausible=True, size="k = 1.0 ± 0.1"))]).axes
     assert [bar.get_width() for bar in ax.patches] == pytest.approx([20, 10, 5])
     assert [to_hex(bar.get_edgecolor()) for bar in ax.patches] == [BLUE.lower(), MUTED, ORANGE.lower()]
     assert ax.patches[2].get_facecolor()[3] == 0
@@ -85,8 +59,8 @@ def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() ->
     assert "k = 1.0 ± 0.1" in ax.texts[0].get_text()
 
 
-def groups() -> pd.DataFrame:
-    """B of one vine against pressure, before and after, and γ that only the larger model has."""
+def test_a_drifting_parameter_is_drawn_against_the_condition() -> None:
+    """B of one vine against pressure, before and after; γ, that only the larger model has, against the vine."""
     row = {"parameter": "eversion_damping.B", "vine": "v", "symbol": "B", "against": "pressure_Pa", "n_trials": 2}
     rows = [
         row | {"model": model, "level": 1e3 * kPa, "ratio": 1 + slope * (kPa - 40) / 40, "ratio_sigma": 0.02}
@@ -94,11 +68,7 @@ def groups() -> pd.DataFrame:
         for kPa in (24, 36, 60)
     ]
     gamma = {"parameter": "reservoir_depletion.gamma", "symbol": "γ", "against": "vine", "level": math.nan}
-    return pd.DataFrame([*rows, rows[-1] | gamma])
-
-
-def test_a_drifting_parameter_is_drawn_against_the_condition() -> None:
-    (ax,) = draw_drift(groups(), "air drag").axes
+    (ax,) = figures.draw_drift(pd.DataFrame([*rows, rows[-1] | gamma]), "air drag").axes
     assert ax.get_xlabel() == "pressure (kPa)"
     assert ax.get_title(loc="left") == "B against pressure, N = 6"
     before, after = (container.lines[0] for container in ax.containers)
@@ -108,28 +78,23 @@ def test_a_drifting_parameter_is_drawn_against_the_condition() -> None:
 
 
 def test_the_missing_force_is_drawn_against_each_variable() -> None:
-    point = {"value": 0.1, "force_N": 0.4, "sigma_N": 0.05, "condition": ""}
-    against = ("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa")
-    rows = [point | {"against": name, "condition": c} for name in against for c in ("", "a", "b")]
-    fig = draw_missing_force(pd.DataFrame(rows))
+    point = {"value": 0.1, "force_N": 0.4, "sigma_N": 0.05}
+    rows = [point | {"against": name, "condition": c} for name in NOTHING for c in ("", "a", "b")]
+    fig = figures.draw_missing_force(pd.DataFrame(rows))
     labels = ["growth y (mm)", "tail speed ẋ (m/s)", "time since release (ms)", "pressure (kPa)"]
     assert [ax.get_xlabel() for ax in fig.axes] == labels
     assert fig.axes[0].containers[0].lines[0].get_xdata() == pytest.approx([100.0])
     assert_nothing_is_cut_off(fig)
 
 
-def cells(after: float = 0.1e-3) -> pd.DataFrame:
-    rows = [
+def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter() -> None:
+    cells = [
         {"condition_label": f"12 mm, {k} kPa", "n_trials": 2, "growth_from": g / 4, "growth_to": (g + 1) / 4}
-        | {"misfit_before_m": sign * 1e-3 * (g + 1), "misfit_after_m": after, "scatter_m": 0.6e-3}
+        | {"misfit_before_m": sign * 1e-3 * (g + 1), "misfit_after_m": 0.1e-3, "scatter_m": 0.6e-3}
         for k, sign in ((24, 1), (60, -1))
         for g in range(4)
     ]
-    return pd.DataFrame(rows)
-
-
-def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter() -> None:
-    before, after = draw_where(cells(), "air drag").axes
+    before, after = figures.draw_where(pd.DataFrame(cells), "air drag").axes
     sides = [to_hex(patch.get_facecolor()) for patch in before.patches]
     assert sides == [BLUE.lower()] * 4 + [VERMILLION.lower()] * 4
     depths = [patch.get_alpha() for patch in before.patches[:4]]
@@ -138,29 +103,22 @@ def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter() 
     assert not after.texts
 
 
-def pairs(names: list[str], values: list[float]) -> pd.DataFrame:
-    at = [(names[i], names[j]) for i in range(len(names)) for j in range(i)]
-    rows = [(*pair, value) for pair, value in zip(at, values, strict=True)]
-    return pd.DataFrame(rows, columns=["effect", "other", "cosine"])
-
-
 def test_cosines_stand_below_the_diagonal_and_ties_are_framed() -> None:
-    (ax,) = draw_cosines(pairs(["a", "b", "c"], [0.97, -0.5, 0.0])).axes
+    rows = [("b", "a", 0.97), ("c", "a", -0.5), ("c", "b", 0.0)]
+    (ax,) = figures.draw_cosines(pd.DataFrame(rows, columns=["effect", "other", "cosine"])).axes
     assert [text.get_text() for text in ax.texts] == [".97", "−.50", ".00"]
-    framed = [patch for patch in ax.patches if patch.get_linewidth() > 0]
-    assert len(framed) == 1
+    assert len([patch for patch in ax.patches if patch.get_linewidth() > 0]) == 1
     assert [label.get_text() for label in ax.get_xticklabels()] == ["a", "b"]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["b", "c"]
 
 
 # The learned force as a curve or a map, with units, and blank outside the range of the trials.
-NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
 Y, V = np.linspace(0, 0.25, 26), np.linspace(0, 8, 20)
 
 
 def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been() -> None:
     curve = pd.DataFrame({**NOTHING, "lead_position_m": Y, "force_N": -Y, "sigma_N": 0.02, "trials": Y < 0.2})
-    (ax,) = draw_learned_force(pd.concat([curve.assign(condition=name) for name in ("", "a", "b")])).axes
+    (ax,) = figures.draw_learned_force(pd.concat([curve.assign(condition=name) for name in ("", "a", "b")])).axes
     assert ax.get_xlabel() == "growth y (mm)"
     line = next(line for line in ax.lines if line.get_label() == "learned force")
     assert line.get_xdata().max() == pytest.approx(190.0)
@@ -173,7 +131,7 @@ def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
     places = {**NOTHING, "lead_position_m": y, "tail_velocity_m_s": v, "sigma_N": 0.02}
     surface = pd.DataFrame({**places, "force_N": -y * v, "trials": v < 6, "condition": ""})
     along = surface[v == V[10]].assign(condition="a")
-    force, error, *bars = draw_learned_force(pd.concat([surface, along])).axes
+    force, error, *bars = figures.draw_learned_force(pd.concat([surface, along])).axes
     assert (force.get_xlabel(), force.get_ylabel()) == ("growth y (mm)", "tail speed ẋ (m/s)")
     assert [bar.get_ylabel() for bar in bars] == ["missing force (N)", "its standard error (N)"]
     # The one condition's motion, over either map.
@@ -182,39 +140,29 @@ def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
 
 # Figures for comparison with the paper, from tables written by hand: content, and nothing cut off.
 NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
-PRINTED_CM = {7: 1.90, 14: 0.29, 28: 0.31}
 
 
-def motions() -> pd.DataFrame:
-    way = np.linspace(0, 1, 30)
+def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points() -> None:
+    way, time_s = np.linspace(0, 1, 30), np.linspace(0, 1 / 7, 100)
     parts = [
         pd.DataFrame({"time_s": way * (1 + 0.3 * k) / kPa, "lead_position_m": 0.28 * way * (1 - 0.05 * k)}).assign(
             pressure_kPa=float(kPa), departure=name
         )
-        for kPa in PRINTED_CM
+        for kPa in (7, 14, 28)
         for k, name in enumerate(("eq2", *NAMES))
     ]
-    return pd.concat(parts, ignore_index=True)
-
-
-def means() -> pd.DataFrame:
-    time_s = np.linspace(0, 1 / 7, 100)
-    columns = {"pressure_kPa": 7.0, "lead_position_sigma_m": 0.002, "n_trials": 4}
-    return pd.DataFrame({"time_s": time_s, "lead_position_m": 0.28 * 7 * time_s} | columns)
-
-
-ERRORS = pd.DataFrame({"pressure_kPa": [7.0], "rms_mean_m": [0.0032]})
-
-
-def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points() -> None:
-    ax = draw_paper_position(motions(), means(), ERRORS).axes[0]
-    (eq2,) = (line for line in ax.lines if line.get_label().startswith("Eq. (2)"))
+    mean = pd.DataFrame({"time_s": time_s, "lead_position_m": 0.28 * 7 * time_s, "pressure_kPa": 7.0})
+    mean = mean.assign(lead_position_sigma_m=0.002, n_trials=4)
+    errors = pd.DataFrame({"pressure_kPa": [7.0], "rms_mean_m": [0.0032]})
+    fig = paper_figures.draw_paper_position(pd.concat(parts, ignore_index=True), mean, errors)
+    (eq2,) = (line for line in fig.axes[0].lines if line.get_label().startswith("Eq. (2)"))
     assert eq2.get_ydata()[-1] == pytest.approx(28.0)
-    (mean,) = (line for line in ax.lines if line.get_marker() == "o")
-    assert np.allclose(mean.get_ydata(), 28 * 7 * np.asarray(mean.get_xdata()))
+    (points,) = (line for line in fig.axes[0].lines if line.get_marker() == "o")
+    assert np.allclose(points.get_ydata(), 28 * 7 * np.asarray(points.get_xdata()))
+    assert_nothing_is_cut_off(fig)
 
 
-def points() -> pd.DataFrame:
+def test_printed_lines_have_the_printed_slope() -> None:
     rows = [
         (f"v{scale}", 6.0 * scale, 50.0 * scale, speed, B * speed**0.37)
         for scale, B in ((1, 0.57), (4, 6.44))
@@ -223,23 +171,16 @@ def points() -> pd.DataFrame:
     columns = ["vine", "diameter_mm", "thickness_um", "x_ss_m_s", "force_N"]
     table = pd.DataFrame([*rows, ("other", 30.0, 50.0, 1.0, 1.0)], columns=columns)
     paper = {"x_ss_paper_m_s": 1.1 * table["x_ss_m_s"], "force_paper_N": 0.99 * table["force_N"]}
-    return table.assign(**paper, eligible=True, used=table["x_ss_m_s"] > 0.6)
-
-
-def damping() -> dict:
+    table = table.assign(**paper, eligible=True, used=table["x_ss_m_s"] > 0.6)
     law = {"n": 0.372, "n_95": [0.36, 0.384], "vines": {"v1": {"B": 0.575}, "v4": {"B": 6.4}}}
-    return {"paper": law | {"n": 0.38}, "both_axes": law}
-
-
-def test_printed_lines_have_the_printed_slope() -> None:
-    ax = draw_paper_damping(points(), damping()).axes[0]
-    dashed = [line for line in ax.lines if line.get_linestyle() == "--"]
+    fig = paper_figures.draw_paper_damping(table, {"paper": law | {"n": 0.38}, "both_axes": law})
+    dashed = [line for line in fig.axes[0].lines if line.get_linestyle() == "--"]
     assert len(dashed) == 2
-    x, y = (np.log(values) for values in dashed[0].get_data())
-    assert np.polyfit(x, y, 1) == pytest.approx([0.37, np.log(0.57)])
+    assert np.polyfit(*np.log(dashed[0].get_data()), 1) == pytest.approx([0.37, np.log(0.57)])
+    assert_nothing_is_cut_off(fig)
 
 
-def departures() -> pd.DataFrame:
+def test_published_errors_stand_beside_ours() -> None:
     rows = [
         (figure, float(kPa), name, 0.01 * (k + 1), 0.1 * (k + 1))
         for figure, pressures_kPa in (("Fig. 4", (7, 14, 28)), ("Fig. 5", (14, 28, 41)))
@@ -247,49 +188,34 @@ def departures() -> pd.DataFrame:
         for k, name in enumerate(NAMES)
     ]
     columns = ["figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s"]
-    return pd.DataFrame(rows, columns=columns)
-
-
-def paper() -> pd.DataFrame:
-    return pd.DataFrame({"row": ["position_rms_7kPa", "final_speed_rms_41kPa"], "ours": [0.32, 0.07]})
-
-
-def test_published_errors_stand_beside_ours() -> None:
-    left, right = draw_paper_rms(paper(), departures()).axes
+    paper = pd.DataFrame({"row": ["position_rms_7kPa", "final_speed_rms_41kPa"], "ours": [0.32, 0.07]})
+    fig = paper_figures.draw_paper_rms(paper, pd.DataFrame(rows, columns=columns))
+    left, right = fig.axes
     published, ours = (line.get_ydata() for line in left.lines[:2])
     assert list(published) == [1.90, 0.29, 0.31]
     assert ours[0] == 0.32
     assert np.isnan(ours[1])
     assert "m/s" in right.get_ylabel()
-
-
-def speeds() -> pd.DataFrame:
-    row = {"vine": "v", "final_at_mm": 120.0, "n_final": 4, "final_lead_velocity_sigma_m_s": 0.02}
-    rows = [
-        row | {"pressure_kPa": kPa, "payload_g": g, "final_lead_velocity_m_s": kPa / 20 - g / 100}
-        for kPa in (14.0, 28.0)
-        for g in (0.0, 20.0, 35.6)
-    ]
-    return pd.DataFrame(rows)
+    assert_nothing_is_cut_off(fig)
 
 
 def test_final_speeds_stand_beside_eq2_where_payloads_differ() -> None:
-    (ax,) = draw_paper_speeds(speeds(), speeds().assign(final_lead_velocity_m_s=1.0)).axes
+    row = {"vine": "v", "final_at_mm": 120.0, "n_final": 4, "final_lead_velocity_sigma_m_s": 0.02}
+    speeds = pd.DataFrame(
+        row | {"pressure_kPa": kPa, "payload_g": g, "final_lead_velocity_m_s": kPa / 20 - g / 100}
+        for kPa in (14.0, 28.0)
+        for g in (0.0, 20.0, 35.6)
+    )
+    fig = paper_figures.draw_paper_speeds(speeds, speeds.assign(final_lead_velocity_m_s=1.0))
+    (ax,) = fig.axes
     assert [len(container.lines[0].get_xdata()) for container in ax.containers] == [3, 3]
     assert len([line for line in ax.lines if list(line.get_ydata()) == [1.0] * 3]) == 2
-    assert draw_paper_speeds(speeds().assign(pressure_kPa=range(6)), speeds()) is None
+    assert paper_figures.draw_paper_speeds(speeds.assign(pressure_kPa=range(6)), speeds) is None
+    assert_nothing_is_cut_off(fig)
 
 
-@pytest.mark.slow
-def test_nothing_is_cut_off() -> None:
+def test_nothing_of_the_reservoir_is_cut_off() -> None:
     y = np.linspace(0, 0.28, 5)
     left = [pd.DataFrame({"lead_position_m": y, "gauge_left": 1 - y / 2, "pressure_kPa": kPa}) for kPa in (7.0, 28.0)]
-    pressures = [one.assign(departure=name) for one in left for name in ("depletion_slow", "depletion_fast")]
-    for figure in (
-        draw_paper_position(motions(), means(), ERRORS),
-        draw_paper_damping(points(), damping()),
-        draw_paper_reservoir(pd.concat(pressures, ignore_index=True)),
-        draw_paper_rms(paper(), departures()),
-        draw_paper_speeds(speeds(), speeds()),
-    ):
-        assert_nothing_is_cut_off(figure)
+    pressures = [one.assign(departure=name) for one in left for name in NAMES[:2]]
+    assert_nothing_is_cut_off(paper_figures.draw_paper_reservoir(pd.concat(pressures, ignore_index=True)))

@@ -10,37 +10,23 @@ import pytest
 from matplotlib.text import Text
 
 from vinetrack.core.records import Track
-from vinetrack.figures.overlay import (
-    AFTER,
-    BEFORE,
-    TRACKED,
-    ClipView,
-    Edge,
-    compose,
-    draw_pixel_places,
-    draw_strip,
-    levels,
-    periodic_error,
-    subpixel_positions,
-)
+from vinetrack.figures import overlay
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, draw_strip, periodic_error
 from vinetrack.figures.style import render
 from vinetrack.report.build import inline_picture
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
-
-# Frames of a clip: every edge at its position and in its colour, with scale, time and names.
 
 
 def rgb(colour: str) -> np.ndarray:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
 
 
-def edges(tracked: float = 200.0, before: float = 300.0, after: float = 210.0) -> list[Edge]:
-    return [
-        Edge("tracked edge", TRACKED, np.array([math.nan, tracked])),
-        Edge("initial model", BEFORE, np.array([0.0, before]), np.array([0.0, 25.0])),
-        Edge("with air drag", AFTER, np.array([0.0, after]), np.array([0.0, math.nan])),
-    ]
+EDGES = [
+    overlay.Edge("tracked edge", TRACKED, np.array([math.nan, 200.0])),
+    overlay.Edge("initial model", BEFORE, np.array([0.0, 300.0]), np.array([0.0, 25.0])),
+    overlay.Edge("with air drag", AFTER, np.array([0.0, 210.0]), np.array([0.0, math.nan])),
+]
 
 
 @pytest.mark.parametrize(
@@ -55,9 +41,9 @@ def edges(tracked: float = 200.0, before: float = 300.0, after: float = 210.0) -
 def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_length_it_names(
     axis: Axis, size: tuple[int, int], width_px: int
 ) -> None:
-    view, grey = ClipView("a", axis, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
+    view, grey = overlay.ClipView("a", axis, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
     zoom = width_px / size[0]
-    unseen, picture = (compose(view, grey, frame, 12.0, edges())[-round(zoom * size[1]) :] for frame in (0, 1))
+    unseen, picture = (overlay.compose(view, grey, frame, 12.0, EDGES)[-round(zoom * size[1]) :] for frame in (0, 1))
     assert picture.shape[1] == width_px
     across = 0 if axis.from_px[1] == axis.to_px[1] else 1
     for colour, place in ((TRACKED, 220), (BEFORE, 320), (AFTER, 230)):
@@ -68,10 +54,7 @@ def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_len
     if size[0] == 640:
         # A sixth of 640 px is 26.7 mm; the round length below it is 20 mm, or 80 px.
         assert max(int(row.sum()) for row in (picture == 255).all(axis=2)) == pytest.approx(80 * zoom, abs=2)
-
-
-def test_grey_levels_are_stretched_and_clipped() -> None:
-    assert levels(np.array([[10, 60, 110, 200]], np.uint16), 10, 110).tolist() == [[0, 128, 255, 255]]
+    assert overlay.levels(np.array([[10, 60, 110, 200]], np.uint16), 10, 110).tolist() == [[0, 128, 255, 255]]
 
 
 # The strip of a recording, from arrays written by hand: position of the edge, and marks of flagged frames.
@@ -91,17 +74,13 @@ def tracking(n_along: int = 300, height: int = 60) -> Tracking:
     return Tracking(track, Axis((0.0, 30.0), (n_along - 1.0, 30.0), 20.0), kymograph, pictures, 1.0, 0.1, np.zeros(N))
 
 
-def test_the_edge_and_flagged_frames_are_counted_apart() -> None:
-    kymograph = draw_strip("a", tracking(), 1e-3).axes[0]
+def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_where_it_was() -> None:
+    kymograph, _, *frames = draw_strip("a", tracking(), 1e-3).axes
     shown = {line.get_label(): line for line in kymograph.lines if not line.get_label().startswith("_")}
     assert list(shown) == ["leading edge, N = 36", "flagged, N = 3", "corrected by hand, N = 1"]
     for label, px, ms in (("flagged, N = 3", [132, 160], [26, 30]), ("corrected by hand, N = 1", [125], [25])):
         assert shown[label].get_xdata().tolist() == px
         assert shown[label].get_ydata() == pytest.approx(ms)
-
-
-def test_each_frame_shows_the_edge_across_the_axis_where_it_was() -> None:
-    frames = draw_strip("a", tracking(), 1e-3).axes[2:]
     titles = [ax.get_title(loc="left") for ax in frames]
     assert titles == ["frame 10, 10.0 ms", "frame 25, 25.0 ms", "frame 39, 39.0 ms"]
     for ax, at in zip(frames, (20, 125, 223), strict=True):
@@ -140,13 +119,13 @@ def test_only_sound_moving_frames_of_recordings_count() -> None:
         {"edge_px": [10.25, 11.5, 12.75, np.nan, 14.0], "flag": ["", np.nan, "doubtful", "lost", "after_end"]}
     )
     elsewhere = pd.DataFrame({"edge_px": [np.nan, np.nan], "flag": [np.nan, np.nan]})
-    assert subpixel_positions({"a": filmed, "b": elsewhere}).tolist() == [0.25, 0.5]
-    assert len(subpixel_positions({})) == 0
+    assert overlay.subpixel_positions({"a": filmed, "b": elsewhere}).tolist() == [0.25, 0.5]
+    assert len(overlay.subpixel_positions({})) == 0
 
 
 @pytest.mark.parametrize(("amplitude_px", "words"), [(0.1, "more than chance"), (0.0, "no more than chance")])
 def test_the_histogram_holds_every_edge_and_says_what_it_shows(amplitude_px: float, words: str) -> None:
-    figure = draw_pixel_places(places(amplitude_px, 600, seed=972))
+    figure = overlay.draw_pixel_places(places(amplitude_px, 600, seed=972))
     (ax,) = figure.axes
     assert sum(bar.get_height() for bar in ax.patches[:10]) == 600
     said = " ".join(text.get_text() for text in figure.findobj(Text)).replace("\n", " ")

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from vinetrack.figures.style import look
-
-
-def words(figure: Figure) -> str:
-    return "\n".join(text.get_text() for text in figure.findobj(Text))
 
 
 def assert_nothing_is_cut_off(figure: Figure) -> None:
