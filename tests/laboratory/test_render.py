@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import erf
 
-from vinetrack.laboratory.filming import render_recording, render_target
+from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.render import FrameRenderer
 from vinetrack.laboratory.scene import Ball, Camera, Door, Encoding, Light, Scene, Sensor, Target, Tube, preset
 
@@ -251,23 +251,6 @@ def crossings(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_corners_of_a_checkerboard_are_where_opencv_projects_them():
-    expected = projected(CHECKER.corners_m(), CAMERA)
-    measured = crossings(render_target(CHECKER, SCENE), expected + 0.3)
-    assert np.abs(measured - expected).max() < 0.03
-    assert np.abs((measured - expected).mean(axis=0)).max() < 0.01
-
-
-@pytest.mark.slow
-def test_every_marker_of_a_charuco_board_can_be_read():
-    target = Target(squares=(12, 5), square_m=0.022, marker_m=0.016)
-    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
-    picture = (render_target(target, SCENE) / 257).astype(np.uint8)
-    _, ids, _ = cv2.aruco.ArucoDetector(words).detectMarkers(picture)
-    assert sorted(ids.ravel().tolist()) == list(range(30))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("shake_px", [0.0, 0.5])
 def test_target_in_a_trials_recording_hangs_where_it_is_told(shake_px):
     target = replace(CHECKER, squares=(11, 3), square_m=0.02)
@@ -279,4 +262,5 @@ def test_target_in_a_trials_recording_hangs_where_it_is_told(shake_px):
     measured = crossings(renderer.frame(2), expected)
     free = expected[:, 1] > 110  # clear of the tube
     assert (max(np.abs(moved)) > 0.1) == (shake_px > 0)
-    assert np.abs(measured - expected)[free].max() < 0.05
+    assert np.abs(measured - expected)[free].max() < 0.03
+    assert np.abs((measured - expected)[free].mean(axis=0)).max() < 0.01
