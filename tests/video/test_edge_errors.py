@@ -17,8 +17,6 @@ from vinetrack.video.strip import Strip
 from vinetrack.video.track import Tracking
 
 COLUMNS = 460
-
-
 AXIS = Axis((20.0, 59.5), (440.0, 59.5), 40.0)
 
 
@@ -52,17 +50,11 @@ def grown_px(frames: np.ndarray, start_px: float = 60.0, rest: int = 12, speed: 
     return start_px + speed * np.maximum(frames - rest, 0.0)
 
 
+GRAINS = [{}, {"wall_sd": 30.0, "tail_sd": 30.0}, {"wall_sd": 5.0, "tail_sd": 45.0}, {"background_sd": 30.0}]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"wall_sd": 30.0, "tail_sd": 30.0},
-        {"wall_sd": 5.0, "tail_sd": 45.0},
-        {"background_sd": 30.0},
-        {"door": True},
-    ],
-)
+@pytest.mark.parametrize("changes", [*GRAINS, {"door": True}])
 def test_stated_errors_match_the_true_errors(changes: dict[str, float]) -> None:
     """Random errors show in second differences of the errors: Σ(1, −2, 1)² = 6."""
     short = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
@@ -161,11 +153,13 @@ def test_an_edge_behind_a_sliding_door_is_lost(door_grey: int) -> None:
     assert np.abs(error[usable]).max() < 0.1
 
 
-# ---- the disagreement of bands against known jitter ----
+@pytest.mark.slow
+@pytest.mark.parametrize("sd_px", [0.0, 0.2, 0.6])
+def test_disagreement_is_the_error_of_the_mean(sd_px):
+    """A step edge blurred by 1 px whose bands of ten rows are each misplaced by `sd_px`; the state is exact.
 
-
-def jittered(sd_px):
-    """A step edge blurred by 1 px whose bands of ten rows are each misplaced by `sd_px`; the state is exact."""
+    It is another error in every frame; a band that always lags adds none.
+    """
     rng, rows, columns = np.random.default_rng(311), 40, 400
     edge = 30.0 + 4.0 * np.arange(80)
     own = edge[:, None] + rng.normal(0, sd_px, (80, BANDS))
@@ -175,14 +169,7 @@ def jittered(sd_px):
     strip = Strip(values, np.full(80, 1 / 200), np.zeros(80), np.zeros((80, 2)), 1.0, axis, False)
     appearance = np.ones((4, rows, columns), np.float32)
     appearance[0], appearance[1] = 160, 60
-    return strip, EdgeState(edge, np.zeros(80), np.zeros(rows), 1.0, appearance, np.ones(3)), own
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sd_px", [0.0, 0.2, 0.6])
-def test_disagreement_is_the_error_of_the_mean(sd_px):
-    """It is another one in every frame; a band that always lags adds none."""
-    strip, state, own = jittered(sd_px)
+    state = EdgeState(edge, np.zeros(80), np.zeros(rows), 1.0, appearance, np.ones(3))
     lagging = np.repeat([0.0, 0.0, 0.0 if sd_px else 1.5, 0.0], 10)
     found, slow_px = band_disagreement(strip, replace(state, lag=lagging), state.edge, np.ones(80, dtype=bool))
     true = float(np.std(own.mean(axis=1) - state.edge))
@@ -193,8 +180,6 @@ def test_disagreement_is_the_error_of_the_mean(sd_px):
         assert found.max() < 0.1
         assert slow_px < 0.05
 
-
-# ---- hidden frames that do not lead up to the motion after them ----
 
 LEAP_FRAMES = np.arange(40.0)
 

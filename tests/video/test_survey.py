@@ -23,15 +23,7 @@ from vinetrack.video import survey as module
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.images import capture_rate
-from vinetrack.video.survey import (
-    RecordingFacts,
-    Surveyor,
-    axis_notes,
-    direction_notes,
-    measure_recording,
-    size_problems,
-    tracked_facts,
-)
+from vinetrack.video.survey import RecordingFacts, Surveyor
 
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"
 ROW = "24,200,280,28,3"
@@ -55,15 +47,15 @@ def check(folder: Path, *videos: str, settings: str = SCALE, header: str = HEADE
     return [" ".join(filter(None, (p.severity, p.trial, p.column))) for p in check_experiment(folder, Surveyor())]
 
 
-@pytest.mark.parametrize(
-    "fault", ["text", "index cut off", "three frames", "empty", "missing", "empty folder", "no images"]
-)
+@pytest.mark.parametrize("fault", ["text", "empty", "cut off", "three frames", "missing", "empty folder", "no images"])
 def test_what_is_no_recording_is_an_error_at_its_place(tmp_path: Path, fault: str) -> None:
     path = tmp_path / "a.mp4"
     if fault in ("text", "empty"):
         path.write_text("not a film\n" * 50 if fault == "text" else "")
-    elif fault in ("index cut off", "three frames"):
-        write_clip(path, 3 if fault == "three frames" else 40, False, 0.7 if fault == "index cut off" else 1.0)
+    elif fault == "cut off":
+        write_clip(path, 40, index_first=False, share=0.7)
+    elif fault == "three frames":
+        write_clip(path, 3, index_first=False)
     elif fault != "missing":
         path.mkdir()
         if fault == "no images":
@@ -89,22 +81,22 @@ def test_a_rate_that_contradicts_the_frames_own_is_refused(tmp_path: Path, monke
 BOARD = "calibration: {kind: checkerboard, image: board.png, squares: [5, 5], square_mm: 5}\n"
 
 
-@pytest.mark.parametrize(
-    ("scale", "size_px", "found"),
-    [
-        ("", None, ["error calibration"]),
-        (BOARD, None, ["error calibration.image"]),
-        (BOARD, (50, 50), ["error calibration.image"]),
-        (BOARD, (64, 96), ["error calibration.image"]),
-    ],
-    ids=["no scale", "no picture", "picture of another size", "no board"],
-)
-def test_what_gives_no_scale_is_reported_once(tmp_path: Path, scale: str, size_px: tuple | None, found: list) -> None:
+NO_SCALES = {
+    "no scale": ("", None, "error calibration"),
+    "no picture": (BOARD, None, "error calibration.image"),
+    "picture of another size": (BOARD, (50, 50), "error calibration.image"),
+    "no board": (BOARD, (64, 96), "error calibration.image"),
+}
+
+
+@pytest.mark.parametrize("case", NO_SCALES)
+def test_what_gives_no_scale_is_reported_once(tmp_path: Path, case: str) -> None:
+    scale, size_px, found = NO_SCALES[case]
     for name in ("a.mp4", "b.mp4"):
         write_clip(tmp_path / name)
     if size_px is not None:
         cv2.imwrite(str(tmp_path / "board.png"), np.full(size_px, 90, np.uint8))
-    assert check(tmp_path, "a.mp4", "b.mp4", settings="capture_fps: 1000\n" + scale) == found
+    assert check(tmp_path, "a.mp4", "b.mp4", settings="capture_fps: 1000\n" + scale) == [found]
 
 
 @pytest.mark.parametrize(
@@ -117,9 +109,7 @@ def test_what_gives_no_scale_is_reported_once(tmp_path: Path, scale: str, size_p
         ("from_px: [5, 30], via_px: [[50, 34]], to_px: [90, 50], width_mm: 2", []),
     ],
 )
-def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(
-    tmp_path: Path, given: str, found: list[str]
-) -> None:
+def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(tmp_path: Path, given, found) -> None:
     write_clip(tmp_path / "a.mp4")
     assert check(tmp_path, "a.mp4", settings=SCALE + f"axis: {{{given}}}\n") == found
 
@@ -151,11 +141,9 @@ SWAPPED = replace(VINE, diameter_m=VINE.length_m, length_m=VINE.diameter_m)
         (replace(VINE, compare_sizes=False), 10.0, 138.0, []),
     ],
 )
-def test_sizes_that_contradict_the_sheet_are_named_once(
-    trial: Trial, scale: float, grown_mm: float, found: list[str]
-) -> None:
+def test_sizes_that_contradict_the_sheet_are_named_once(trial: Trial, scale: float, grown_mm: float, found) -> None:
     facts = replace(FACTS, tube_width_mm=12.1 * scale, tube_width_sigma_mm=0.25 * scale, growth_mm=grown_mm)
-    assert [f"{problem.severity} {problem.column}" for problem in size_problems(trial, facts)] == found
+    assert [f"{problem.severity} {problem.column}" for problem in module.size_problems(trial, facts)] == found
 
 
 @pytest.mark.parametrize(
@@ -171,7 +159,7 @@ def test_sizes_that_contradict_the_sheet_are_named_once(
 def test_growth_in_another_direction_than_stated_is_noted(to_px: tuple, angle_deg: float, blank: bool, noted: bool):
     trials = [replace(VINE, name=name, growth_angle_rad=np.radians(angle_deg)) for name in "ab"]
     facts = replace(FACTS, axis=Axis((60.0, 30.0), to_px))
-    assert len(direction_notes([facts] * 2, trials, ["a", "b"] if blank else [])) == noted
+    assert len(module.direction_notes([facts] * 2, trials, ["a", "b"] if blank else [])) == noted
 
 
 @pytest.mark.parametrize(
@@ -191,8 +179,8 @@ def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg: list[floa
         replace(VINE, name=name, axis=Axis((100.0, 100.0), end)) for name, end in zip("abcde", ends, strict=False)
     ]
     facts = [replace(FACTS, trial=trial.name, axis=trial.axis) for trial in trials]
-    assert axis_notes(facts, trials) == []  # it was given
-    notes = axis_notes(facts, [replace(trial, axis=None) for trial in trials])
+    assert module.axis_notes(facts, trials) == []  # it was given
+    notes = module.axis_notes(facts, [replace(trial, axis=None) for trial in trials])
     assert len(notes) == bool(named)
     assert all(named in note for note in notes)
 
@@ -242,7 +230,7 @@ def test_check_reports_the_facts_of_a_correct_recording(clip: Path, tmp_path: Pa
     assert facts.mean_speed_m_s == pytest.approx(6, rel=0.1)
     experiment = read_experiment(tmp_path)
     trial = experiment.trials[0]
-    tracked = tracked_facts(trial, measure_recording(trial, experiment.settings, experiment.folder))
+    tracked = module.tracked_facts(trial, module.measure_recording(trial, experiment.settings, experiment.folder))
     assert repr(facts) == repr(tracked)  # what the tracker says, to the last digit
 
 
