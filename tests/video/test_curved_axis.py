@@ -12,25 +12,16 @@ from pictures import in_memory, tracked
 from plain_scene import Plan, plain_scene
 
 from vinetrack.core.records import Trial
+from vinetrack.video import curved_axis as curves
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import PlaneCalibration, PlaneMap
-from vinetrack.video.curved_axis import (
-    CurvedAxis,
-    axis_entry,
-    axis_from_entry,
-    axis_through,
-    curve_problem,
-    find_curve,
-    find_growth_axis,
-)
+from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_problem
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import cut_strip
-from vinetrack.video.track import Tracking, in_metres, track_pixels
+from vinetrack.video.track import in_metres, track_pixels
 
 RADIUS = 300.0
-SIDE = 400
-SHORT = {"pieces": ((120.0, 0.0), (345.0, 66.0)), "from_px": (40.0, 90.0)}
 
 
 def quarter(count: int = 25) -> CurvedAxis:
@@ -45,10 +36,10 @@ def test_two_points_are_the_straight_axis() -> None:
     axis = axis_through([(10.0, 30.0), (100.0, 70.0)], 12.0)
     assert type(axis) is Axis
     assert axis == Axis((10.0, 30.0), (100.0, 70.0), 12.0)
-    assert axis_from_entry(axis_entry(axis) | {"width_px": 12.0}) == axis
+    assert curves.axis_from_entry(curves.axis_entry(axis) | {"width_px": 12.0}) == axis
     curve = replace(quarter(), width_px=14.0)
-    assert axis_from_entry(axis_entry(curve) | {"width_px": 14.0}) == curve
-    assert set(axis_entry(axis)) == {"from_px", "to_px"}
+    assert curves.axis_from_entry(curves.axis_entry(curve) | {"width_px": 14.0}) == curve
+    assert set(curves.axis_entry(axis)) == {"from_px", "to_px"}
 
 
 def test_positions_on_a_quarter_of_a_circle_are_its_arc_length() -> None:
@@ -63,10 +54,7 @@ def test_positions_on_a_quarter_of_a_circle_are_its_arc_length() -> None:
     places = uneven.points(np.linspace(0, uneven.length_px, 500))
     assert places[:, 0].max() < 230  # no overshoot
     assert places[:, 1].min() > -6
-
-
-def test_places_beside_a_curve_lie_on_its_normal_and_beyond_its_end_straight_on() -> None:
-    axis = quarter()
+    # Places beside a curve lie on its normal, and beyond its end straight on.
     along = np.array([100.0, 250.0])
     beside, middle = axis.points(along, 20.0), axis.points(along)
     assert np.allclose(np.sum((beside - middle) * axis.direction_at(along), axis=1), 0, atol=1e-9)
@@ -87,7 +75,7 @@ def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused() -> Non
 
 
 def test_rings_about_the_circles_middle_become_level_lines() -> None:
-    y, x = np.mgrid[:SIDE, :SIDE].astype(float)
+    y, x = np.mgrid[:400, :400].astype(float)
     rings = np.clip(128 + (np.hypot(x - 20, y - 330) - RADIUS), 0, 255)
     strip = cut_strip(np.repeat(rings[None], 4, axis=0).round().astype(np.uint8), quarter(), 12.0)
     assert strip.values.shape == (4, 25, int(quarter().length_px) + 1)
@@ -96,23 +84,15 @@ def test_rings_about_the_circles_middle_become_level_lines() -> None:
     assert strip.axis == quarter()
 
 
-@pytest.fixture(scope="module")
-def bent() -> BentScene:
-    return bent_scene(BentPlan(seed=3, speed=22.0, **BENDS["quarter"]))
-
-
-def drawn(scene: BentScene, count: int = 6, off_px: float = 3.0) -> Axis:
-    """An axis as a hand draws it: `count` points, each off by a few pixels."""
-    places = scene.places(np.linspace(8.0, scene.arc_px[-1] - 8.0, count))
-    return axis_through(places + np.random.default_rng(scene.plan.seed).normal(0, off_px, places.shape))
-
-
-def followed(scene: BentScene, axis: Axis) -> Tracking:
-    return tracked(scene.frames, scene.plan.exposure, axis)
+def drawn(scene: BentScene) -> Axis:
+    """An axis as a hand draws it: six points, each off by a few pixels."""
+    places = scene.places(np.linspace(8.0, scene.arc_px[-1] - 8.0, 6))
+    return axis_through(places + np.random.default_rng(scene.plan.seed).normal(0, 3.0, places.shape))
 
 
 @pytest.mark.slow
-def test_metres_are_lengths_along_the_curve_in_the_tilted_plane(bent: BentScene) -> None:
+def test_metres_are_lengths_along_the_curve_in_the_tilted_plane() -> None:
+    bent = bent_scene(BentPlan(seed=3, speed=22.0, **BENDS["quarter"]))
     parameters = np.array([0.45, 0.02, 0.0, -0.01, 0.4, 0.0, 0.08, 0.05, -0.05, 0.0])
     covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
     plane = PlaneMap(bent.plan.width, bent.plan.height, parameters, covariance)
@@ -138,9 +118,9 @@ def test_metres_are_lengths_along_the_curve_in_the_tilted_plane(bent: BentScene)
 
 @pytest.mark.slow
 def test_camera_shake_is_removed_along_a_curve() -> None:
-    plan = BentPlan(seed=2, speed=22.0, shake=1.2, width=560, height=480, **(BENDS["quarter"] | SHORT))
-    shaken = bent_scene(plan)
-    tracking = followed(shaken, drawn(shaken))
+    short = {"pieces": ((120.0, 0.0), (345.0, 66.0)), "from_px": (40.0, 90.0)}
+    shaken = bent_scene(BentPlan(seed=2, speed=22.0, shake=1.2, width=560, height=480, **short))
+    tracking = tracked(shaken.frames, shaken.plan.exposure, drawn(shaken))
     used = shaken.moving & tracking.track.usable
     error = tracking.track.edge_px[used] - shaken.edge_px[used]
     assert error.std() < 0.4  # of a shake of 1.2 px, 0.9 px as a standard deviation
@@ -149,16 +129,10 @@ def test_camera_shake_is_removed_along_a_curve() -> None:
     assert np.nanmin(tracking.track.lead_position_systematic_m[used]) > 0.1e-3
 
 
-# ---- the curve along which a vine grew, found from its motion ----
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "is_drawn", "sd_px", "off_px"), [
-    ("quarter", True, 0.35, 2.0), ("quarter", False, 0.4, 2.5), ("gentle", False, 0.4, 2.5)
-])  # fmt: skip
-def test_a_bent_vine_is_followed_along_a_curve_drawn_or_found(
-    name: str, is_drawn: bool, sd_px: float, off_px: float
-) -> None:
+@pytest.mark.parametrize(("name", "is_drawn"), [("quarter", True), ("quarter", False), ("gentle", False)])
+def test_a_bent_vine_is_followed_along_a_curve_drawn_or_found(name: str, is_drawn: bool) -> None:
+    sd_px, off_px = (0.35, 2.0) if is_drawn else (0.4, 2.5)
     scene = bent_scene(BentPlan(seed=3 if is_drawn else 4, speed=22.0, **BENDS[name]))
     tracking = tracked(scene.frames, scene.plan.exposure, drawn(scene) if is_drawn else None)
     assert isinstance(tracking.axis, CurvedAxis)
@@ -177,7 +151,7 @@ def test_a_bent_vine_is_followed_along_a_curve_drawn_or_found(
 def test_a_straight_vine_keeps_the_straight_axis_it_had(changes: dict) -> None:
     plan = Plan(**({"seed": 5, "width": 640, "end_px": 540.0} | changes))
     small = SmallPictures(plain_scene(plan).frames)
-    assert find_growth_axis(small) == find_axis(small)
+    assert curves.find_growth_axis(small) == find_axis(small)
 
 
 @pytest.mark.parametrize(("length_px", "width_px"), [(21, 2), (3, 10), (9, 3), (14, 1), (40, 40)])
@@ -189,5 +163,5 @@ def test_a_band_hardly_longer_than_wide_has_no_curve(length_px: int, width_px: i
         for t in range(20):
             frames[t, y : y + width_px, x : x + length_px * t // 20 + 1] += 100
         small = SmallPictures(np.clip(frames, 0, 255).astype(np.uint8))
-        curve = find_curve(small)
+        curve = curves.find_curve(small)
         assert curve is None or curve.length_px > 2 * curve.width_px

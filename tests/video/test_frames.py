@@ -15,22 +15,14 @@ from camera_files import write_cine, write_mraw, write_side_file
 from plain_scene import write_images, write_video
 
 from vinetrack.core.records import Trial
-from vinetrack.video.frames import (
-    PHANTOM_TABLE,
-    RecordingError,
-    inspect_recording,
-    iterate_frames,
-    quiet_log,
-    read_frames,
-)
+from vinetrack.video import frames as module
+from vinetrack.video.frames import PHANTOM_TABLE, RecordingError, inspect_recording, read_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.strip import camera_unit
 
 RNG = np.random.default_rng(5)
 FRAMES = (np.add.outer(np.arange(24) * 3, np.add.outer(np.arange(48), np.arange(64))) % 200 + 20).astype(np.uint8)
 NOISE = RNG.integers(0, 255, (60, 96, 128)).astype(np.uint8)
-
-
 DEEP = FRAMES.astype(np.uint16) * 17
 
 
@@ -83,13 +75,13 @@ def test_films_that_two_threads_decode_do_not_share_the_log_of_the_decoder():
     heard, decodes, ends = [], threading.Event(), threading.Event()
 
     def other() -> None:
-        with quiet_log() as messages:
+        with module.quiet_log() as messages:
             decodes.set()
             ends.wait()
         heard.append(messages)
 
     thread = threading.Thread(target=other)
-    with quiet_log() as messages:
+    with module.quiet_log() as messages:
         thread.start()
         decodes.wait(0.3)
         av.logging.log(av.logging.ERROR, "vinetrack", "a fault of the first film")
@@ -166,7 +158,7 @@ def test_a_cine_gives_back_every_value(tmp_path, frames, options, expected, dept
     assert np.array_equal(read.luma, expected)
     assert read.luma.dtype == expected.dtype
     assert (read.recording.bit_depth, read.recording.declared_frames, read.notes) == (depth, 9, ())
-    assert np.array_equal(np.stack(list(iterate_frames(read.recording))), expected)
+    assert np.array_equal(np.stack(list(module.iterate_frames(read.recording))), expected)
 
 
 def test_the_table_of_packed_cines_is_that_of_the_vendor():
