@@ -17,7 +17,6 @@ from scipy.stats import binom
 
 import vinetrack as vt
 from vinetrack.core.published import DAMPING_B, DIAMETER_MM, THICKNESS_UM
-from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics import damping
@@ -222,11 +221,12 @@ def test_a_condition_of_which_less_than_half_is_steady_is_left_out_with_its_stea
     assert points["used"][0]
 
 
-# ---- the damping law under a model of the pressure, on vines from the virtual laboratory ----
+@pytest.mark.slow
+def test_b_and_n_come_home_with_the_pressure_of_the_model() -> None:
+    """Two small vines on a chamber of 0.25 L: at the lowest pressure a third of it is lost along the way.
 
-
-def running_down(seed: int) -> list[tuple[Trial, Track]]:
-    """Two small vines on a chamber of 0.25 L: at the lowest pressure a third of it is lost along the way."""
+    With the set pressure nothing is steady and our rules refuse; the published rule goes on, and is wrong.
+    """
     vines = {1: (15.1, 22.8, 30.5, 38.3, 46, 53.7), 2: (12.7, 18.5, 24.3, 30.1, 35.9, 41.7)}
     trials = [
         replace(trial, chamber_m3=2.5e-4)
@@ -234,14 +234,8 @@ def running_down(seed: int) -> list[tuple[Trial, Track]]:
         for trial in of_vine(isometric_vine(scale), pressures_kPa, 3, prefix=f"R{scale}_")
     ]
     trials = list(with_names(trials))
-    nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=seed)
-    return [(one.stated, one.track) for one in grow(trials, nature)]
-
-
-@pytest.mark.slow
-def test_b_and_n_come_home_with_the_pressure_of_the_model() -> None:
-    """With the set pressure nothing is steady and our rules refuse; the published rule goes on, and is wrong."""
-    pairs = running_down(41)
+    nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=41)
+    pairs = [(one.stated, one.track) for one in grow(trials, nature)]
     settings = RunSettings.model_validate({"damping": {"resamples": 300}})
     motions = look_at_motions(pairs, settings)
     found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs, profile=False)
@@ -285,9 +279,6 @@ def test_walls_of_one_diameter_make_a_line_and_unknown_ones_belong_to_none() -> 
     assert family["line"]["slope"] == pytest.approx(0.02)
     assert family["line"]["intercept"] == pytest.approx(0.0, abs=1e-9)
     assert found["isometric"] == []
-
-
-# ---- trends with size against exact power laws and against textbook regressions worked out by hand ----
 
 
 def conditions(rows: list[dict]) -> pd.DataFrame:

@@ -99,9 +99,6 @@ def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only_and_pay
     assert module.why_not_in_fit(replace(VINE, payload_kg=0.0356))
 
 
-# ---- release time and resting position ----
-
-
 def release_of(track: Track, travel_ratio: float = 2.0) -> Release:
     return find_release(track, estimate_kinematics(track, travel_ratio=travel_ratio))
 

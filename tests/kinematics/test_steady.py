@@ -163,8 +163,6 @@ def test_a_speed_that_bends_within_the_window_is_known_no_better_than_the_bend()
     assert window.x_ss_sigma_m_s == pytest.approx(2 * bend_m_s, rel=0.05)
 
 
-# ---- windows in which a vine keeps up with a falling pressure, against trajectories integrated here by SciPy ----
-
 B, N, CHAMBER_M3, GAMMA, AMBIENT_PA = 6.44, 0.37, 1e-3, 1.4, 101_325.0
 STEP_S = 1 / 1069
 
@@ -200,9 +198,6 @@ def test_where_inertia_rules_there_is_no_window() -> None:
     """The drive of 34 kPa falls so fast that the film's inertia takes more than a tenth of it."""
     windows = analysed(34, seed=1003).windows
     assert not windows.get("quasi_steady", windows["gated"]).accepted
-
-
-# ---- the paper's literal rule against a search by brute force, and the misfires it is known for ----
 
 
 def longest_by_brute_force(velocity: np.ndarray) -> int:

@@ -74,8 +74,6 @@ def test_a_falling_ball_is_measured_but_has_no_place_in_the_law() -> None:
     assert math.isnan(float(result.row["efficiency"]))  # type: ignore[arg-type]
 
 
-# ---- replicates put together, against means and standard errors worked out by hand ----
-
 BARE = Trial(name="", diameter_m=0.012, thickness_m=100e-6, length_m=0.2, pressure_Pa=24e3, yield_pressure_Pa=3e3)
 LOADED = replace(BARE, pressure_Pa=34e3, payload_kg=0.0356)
 KINDS = {"bare": (BARE, 4), "loaded": (LOADED, 3), "alone": (replace(BARE, pressure_Pa=30e3), 1)}
@@ -129,8 +127,6 @@ def test_failed_trials_count_for_nothing_and_efficiency_has_its_variants() -> No
     assert loaded["efficiency_with_weight"] == pytest.approx(0.52 / (1 + share), rel=1e-6)
     assert loaded["efficiency_with_weight_sigma"] == pytest.approx(0.02 / (1 + share), rel=1e-6)
 
-
-# ---- final speed and energy efficiency against numbers worked out by hand ----
 
 VINE = replace(LOADED, length_m=0.3)
 

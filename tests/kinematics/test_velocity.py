@@ -69,8 +69,6 @@ def test_where_points_jump_about_the_velocity_is_known_as_badly_as_they_say():
     assert 0.2 < np.median(np.abs(pulls)) < 2
 
 
-# ---- local polynomials against polynomials, SciPy and Monte Carlo ----
-
 EVEN = np.arange(60) / 1000
 GAPPED = np.delete(np.arange(64) / 1000, [20, 21, 22, 40])
 UNEVEN = np.cumsum(np.random.default_rng(1000).uniform(0.5, 1.5, 60)) / 1000

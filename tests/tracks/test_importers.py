@@ -200,9 +200,6 @@ def test_a_real_project_is_read_in_its_own_scale() -> None:
     assert scale == pytest.approx(398.71, abs=0.01)
 
 
-# ---- times of a file with too few digits are replaced by the even series that they were ----
-
-
 @pytest.mark.parametrize(("rate_hz", "digits"), [(240.0, 3), (240.0, 4), (1069.0, 3), (2400.0, 3), (2400.0, 4)])
 def test_rounded_times_of_even_frames_become_even(rate_hz: float, digits: int) -> None:
     for seed in range(5):
@@ -241,8 +238,6 @@ def test_a_file_with_times_to_the_millisecond_is_read(tmp_path: Path) -> None:
     for path in (table, export):
         assert np.diff(read_track(path).time_s) == pytest.approx(1 / 1069, rel=2e-3)
 
-
-# ---- imported tracks of bodies end with a bounce or an abrupt stop, and nowhere else ----
 
 CLOCK_S = np.arange(120) / 200
 
@@ -299,8 +294,6 @@ def test_only_bodies_without_chosen_frames_are_cut(tmp_path: Path, travel_ratio,
     track = importers.load_track(Trial(name="ball", track=path, travel_ratio=travel_ratio, frames_used=frames_used))
     assert with_flag(track.flag, "after_end").any() == ends
 
-
-# ---- pressure traces in TDMS files ----
 
 TRACE_S = np.arange(12) * 2e-3 + 0.1
 PRESSURE_KPA = 20 + np.arange(12) ** 2 / 8.0

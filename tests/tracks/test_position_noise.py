@@ -67,8 +67,6 @@ def test_noise_of_rounded_positions_is_not_kept_below_rounding():
     assert position_noise(np.arange(y.size) / 267, y, robust=True)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)
 
 
-# ---- noise of known size and shape on known motions ----
-
 BLUR_S = 60e-6
 NOISE_M = 6e-5
 UNSTATED = [None] * 8
@@ -125,9 +123,6 @@ def test_standard_deviations_that_a_file_states_are_used_where_they_hold_and_onl
     assert noise_shape(times, positions, stated) is None
 
 
-# ---- simulated noise has the requested standard deviation and correlation, from the first position on ----
-
-
 @pytest.mark.parametrize("correlation", [-0.4, 0.0, 0.9])
 def test_variance_and_lag_one_correlation_are_those_of_the_process(correlation: float) -> None:
     noise = module.ar1_noise(200_000, 2e-4, correlation, np.random.default_rng(5))
@@ -137,8 +132,6 @@ def test_variance_and_lag_one_correlation_are_those_of_the_process(correlation: 
     lag_one = np.mean(noise[1:] * noise[:-1]) / np.var(noise)
     assert lag_one == pytest.approx(correlation, abs=4 * np.sqrt((1 - correlation**2) / noise.size))
 
-
-# ---- single points displaced by known amounts on known motions ----
 
 FRAME_S = 1 / CAPTURE_FPS
 

@@ -30,8 +30,6 @@ def test_black_background_is_not_used_for_flicker() -> None:
     assert not strip.stabilised
 
 
-# ---- what stays and stands out is growth ----
-
 MOUTH = (60, 120)
 OPEN_RAD = math.radians(25)
 SWING = range(10, 16)

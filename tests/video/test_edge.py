@@ -208,8 +208,6 @@ def test_a_recording_is_tracked_with_its_corrections(tmp_path: Path) -> None:
     assert np.flatnonzero(with_flag(after.flag, "corrected")).tolist() == [20, 25]
 
 
-# ---- a tip behind a door or in the mouth of a launcher is doubtful or lost, never ok ----
-
 MOUTH_PLAN = Plan(seed=520, width=640, height=200, from_px=(20.0, 100.0), end_px=520.0, rest_frames=15)
 
 
@@ -254,8 +252,6 @@ def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path: Path) -
     ratio = np.sqrt(np.mean(np.concatenate(errors) ** 2) / np.mean(np.concatenate(stated) ** 2))
     assert 0.6 < ratio < 1.3
 
-
-# ---- a front leaves a tube where one front passes along its middle ----
 
 AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
 """Six rows beside the middle of the tube."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pictures
 import pytest
@@ -11,9 +9,7 @@ from plain_scene import Plan, plain_scene
 from scipy.special import ndtr
 
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge import BANDS, band_disagreement, leap_error_px
-from vinetrack.video.edge_state import EdgeState
-from vinetrack.video.strip import Strip
+from vinetrack.video.edge import BANDS, leap_error_px
 from vinetrack.video.track import Tracking
 
 COLUMNS = 460
@@ -151,34 +147,6 @@ def test_an_edge_behind_a_sliding_door_is_lost(door_grey: int) -> None:
     assert not usable[(frames > 12) & (true < 138)].any()
     assert usable[true > 150].all()
     assert np.abs(error[usable]).max() < 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sd_px", [0.0, 0.2, 0.6])
-def test_disagreement_is_the_error_of_the_mean(sd_px):
-    """A step edge blurred by 1 px whose bands of ten rows are each misplaced by `sd_px`; the state is exact.
-
-    It is another error in every frame; a band that always lags adds none.
-    """
-    rng, rows, columns = np.random.default_rng(311), 40, 400
-    edge = 30.0 + 4.0 * np.arange(80)
-    own = edge[:, None] + rng.normal(0, sd_px, (80, BANDS))
-    cover = ndtr(np.repeat(own, rows // BANDS, axis=1)[:, :, None] - np.arange(columns))
-    values = np.rint(200 * (60 + 100 * cover + rng.normal(0, 1, (80, rows, columns)))).astype(np.uint16)
-    axis = Axis((0.0, 0.0), (columns - 1.0, 0.0), float(rows))
-    strip = Strip(values, np.full(80, 1 / 200), np.zeros(80), np.zeros((80, 2)), 1.0, axis, False)
-    appearance = np.ones((4, rows, columns), np.float32)
-    appearance[0], appearance[1] = 160, 60
-    state = EdgeState(edge, np.zeros(80), np.zeros(rows), 1.0, appearance, np.ones(3))
-    lagging = np.repeat([0.0, 0.0, 0.0 if sd_px else 1.5, 0.0], 10)
-    found, slow_px = band_disagreement(strip, replace(state, lag=lagging), state.edge, np.ones(80, dtype=bool))
-    true = float(np.std(own.mean(axis=1) - state.edge))
-    if sd_px:
-        assert float(np.sqrt(np.mean(found**2))) == pytest.approx(true, rel=0.35)
-        assert slow_px < 0.35 * true
-    else:
-        assert found.max() < 0.1
-        assert slow_px < 0.05
 
 
 LEAP_FRAMES = np.arange(40.0)

@@ -101,24 +101,18 @@ def test_a_picture_missing_by_its_number_leaves_a_gap_and_one_cut_short_is_damag
     assert frames.damaged.tolist() == [i == 4 for i in range(23)]
 
 
-def write_dng(path, picture, fps):
-    """A minimal CinemaDNG frame: one strip of 16-bit mosaic, tags 33434 (exposure) and 51044 (rate)."""
-    height, width = picture.shape
-    tags = [
-        (256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 16), (259, 3, 1, 1), (262, 3, 1, 32803), (273, 4, 1, 174),
-        (277, 3, 1, 1), (278, 4, 1, height), (279, 4, 1, 2 * picture.size), (33434, 5, 1, 158),
-        (50706, 1, 4, 0x00000401), (51044, 10, 1, 166),
-    ]  # fmt: skip
-    body = b"".join(struct.pack("<HHII", *tag) for tag in tags)
-    rationals = struct.pack("<IIII", 1, 5000, round(fps * 1000), 1000)
-    path.write_bytes(
-        b"II*\0" + struct.pack("<IH", 8, len(tags)) + body + bytes(4) + rationals + picture.astype("<u2").tobytes()
-    )
-
-
 def test_dng_frames_carry_rate_exposure_and_values(tmp_path):
+    """Minimal CinemaDNG frames: one strip of 16-bit mosaic, tags 33434 (exposure) and 51044 (rate)."""
+    tags = [
+        (256, 4, 1, 24), (257, 4, 1, 16), (258, 3, 1, 16), (259, 3, 1, 1), (262, 3, 1, 32803), (273, 4, 1, 174),
+        (277, 3, 1, 1), (278, 4, 1, 16), (279, 4, 1, 768), (33434, 5, 1, 158), (50706, 1, 4, 0x00000401),
+        (51044, 10, 1, 166),
+    ]  # fmt: skip
+    header = b"II*\0" + struct.pack("<IH", 8, len(tags)) + b"".join(struct.pack("<HHII", *tag) for tag in tags)
     for i in range(4):
-        write_dng(tmp_path / f"shot_{i:03d}.dng", np.full((16, 24), 3000 + 10 * i, np.uint16), 1069.0)
+        picture = np.full((16, 24), 3000 + 10 * i, "<u2").tobytes()
+        rationals = struct.pack("<IIII", 1, 5000, 1_069_000, 1000)
+        (tmp_path / f"shot_{i:03d}.dng").write_bytes(header + bytes(4) + rationals + picture)
     frames = read_frames(tmp_path)
     assert frames.recording.capture_fps == pytest.approx(1069.0)
     assert frames.recording.exposure_s == pytest.approx(1 / 5000)
@@ -134,25 +128,23 @@ def test_fewer_frames_than_declared_are_reported(tmp_path):
     assert frames.notes
 
 
-# ---- files of high-speed cameras ----
-
 TWELVE, TEN, EIGHT = (
     np.random.default_rng(11).integers(0, 2**bits, (9, 24, 32)).astype(np.uint16 if bits > 8 else np.uint8)
     for bits in (12, 10, 8)
 )
 
 
-@pytest.mark.parametrize(
-    ("frames", "options", "expected", "depth"),
-    [
-        (EIGHT, {"real_bits": 8}, EIGHT, 8),
-        (TWELVE, {}, TWELVE, 12),
-        (TWELVE, {"pack": 1024, "annotation": b"12345678"}, TWELVE, 12),
-        (TEN, {"pack": 256}, PHANTOM_TABLE[TEN], 12),
-    ],
-    ids=["8 bit", "16 bit", "packed 12 bit", "packed 10 bit"],
-)
-def test_a_cine_gives_back_every_value(tmp_path, frames, options, expected, depth):
+CINES = {
+    "8 bit": (EIGHT, {"real_bits": 8}, EIGHT, 8),
+    "16 bit": (TWELVE, {}, TWELVE, 12),
+    "packed 12 bit": (TWELVE, {"pack": 1024, "annotation": b"12345678"}, TWELVE, 12),
+    "packed 10 bit": (TEN, {"pack": 256}, PHANTOM_TABLE[TEN], 12),
+}
+
+
+@pytest.mark.parametrize("kind", CINES)
+def test_a_cine_gives_back_every_value(tmp_path, kind):
+    frames, options, expected, depth = CINES[kind]
     path = write_cine(tmp_path / "a.cine", frames, **options)
     read = read_frames(path)
     assert np.array_equal(read.luma, expected)
@@ -230,19 +222,16 @@ def test_an_unsupported_mraw_is_refused(tmp_path, options):
         inspect_recording(path)
 
 
-def test_a_stack_has_rate_and_exposure_of_its_side_file(tmp_path):
+def test_pictures_have_rate_and_exposure_of_their_own_side_file(tmp_path):
     cv2.imwritemulti(str(tmp_path / "a.tif"), list(TWELVE))
     assert inspect_recording(tmp_path / "a.tif").capture_fps is None
     write_side_file(tmp_path / "a.cih", TWELVE, form="Tiff", rate=750, shutter="1/1000")
     recording = inspect_recording(tmp_path / "a.tif")
     assert (recording.capture_fps, recording.exposure_s, recording.bit_depth) == (750, 1e-3, 12)
-
-
-@pytest.mark.parametrize("other", [{"total": 8}, {"width": 30}, {"form": "MRaw"}])
-def test_a_side_file_of_other_pictures_is_ignored(tmp_path, other):
     folder = write_images(tmp_path / "shots", TWELVE, ".tif")
-    write_side_file(folder / "shots.cih", TWELVE, **({"form": "Tiff"} | other))
-    assert inspect_recording(folder).capture_fps is None
+    for other in ({"total": 8}, {"width": 30}, {"form": "MRaw"}):
+        write_side_file(folder / "shots.cih", TWELVE, **({"form": "Tiff"} | other))
+        assert inspect_recording(folder).capture_fps is None
 
 
 def test_a_sheet_that_contradicts_the_recording_is_refused(tmp_path):

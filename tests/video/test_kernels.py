@@ -63,9 +63,6 @@ def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and
     assert first.stdout == later.stdout
 
 
-# ---- threads of the tracker ----
-
-
 @pytest.mark.parametrize(("stated", "expected"), [("1", 1), ("2", 2), ("64", 4), ("", 4), ("0", 4), ("many", 4)])
 def test_the_usual_variable_limits_the_threads(monkeypatch: pytest.MonkeyPatch, stated: str, expected: int) -> None:
     monkeypatch.setattr(threads, "available_cores", lambda: 8)

@@ -114,8 +114,6 @@ def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(tmp_pat
     assert check(tmp_path, "a.mp4", settings=SCALE + f"axis: {{{given}}}\n") == found
 
 
-# ---- sizes in the picture against the sheet ----
-
 FPS, SCALE_MM = 1069.0, 0.24
 VINE = Trial(name="a", diameter_m=0.012, length_m=0.14)
 FACTS = RecordingFacts(
@@ -146,38 +144,27 @@ def test_sizes_that_contradict_the_sheet_are_named_once(trial: Trial, scale: flo
     assert [f"{problem.severity} {problem.column}" for problem in module.size_problems(trial, facts)] == found
 
 
-@pytest.mark.parametrize(
-    ("to_px", "angle_deg", "blank", "noted"),
-    [
-        ((300.0, 40.0), 0.0, False, False),
-        ((75.0, 200.0), 0.0, True, False),
-        ((300.0, 40.0), 90.0, False, False),
-        ((75.0, 200.0), 90.0, False, True),
-        ((300.0, 40.0), 0.0, True, True),
-    ],
-)
+ACROSS, DOWN = (300.0, 40.0), (75.0, 200.0)
+DIRECTIONS = [(ACROSS, 0, False, False), (DOWN, 0, True, False), (ACROSS, 90, False, False)]
+DIRECTIONS += [(DOWN, 90, False, True), (ACROSS, 0, True, True)]
+
+
+@pytest.mark.parametrize(("to_px", "angle_deg", "blank", "noted"), DIRECTIONS)
 def test_growth_in_another_direction_than_stated_is_noted(to_px: tuple, angle_deg: float, blank: bool, noted: bool):
     trials = [replace(VINE, name=name, growth_angle_rad=np.radians(angle_deg)) for name in "ab"]
     facts = replace(FACTS, axis=Axis((60.0, 30.0), to_px))
     assert len(module.direction_notes([facts] * 2, trials, ["a", "b"] if blank else [])) == noted
 
 
-@pytest.mark.parametrize(
-    ("slopes_deg", "named"),
-    [
-        ([0, 1, -2, 179, 1], ""),
-        ([0, 1, -2, 60, 1], "d"),
-        ([0, 1, -2, 60, -35], "d first"),
-        ([0, 1, 60, 61], ""),
-        ([0, 60], ""),
-        ([88, 90, -89, 0], "d"),
-    ],
-)
+SLOPES_DEG = [([0, 1, -2, 179, 1], ""), ([0, 1, -2, 60, 1], "d"), ([0, 1, -2, 60, -35], "d first")]
+SLOPES_DEG += [([0, 1, 60, 61], ""), ([0, 60], ""), ([88, 90, -89, 0], "d")]
+
+
+@pytest.mark.parametrize(("slopes_deg", "named"), SLOPES_DEG)
 def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg: list[float], named: str) -> None:
     ends = [(100 + 200 * np.cos(np.radians(s)), 100 + 200 * np.sin(np.radians(s))) for s in slopes_deg]
-    trials = [
-        replace(VINE, name=name, axis=Axis((100.0, 100.0), end)) for name, end in zip("abcde", ends, strict=False)
-    ]
+    named_ends = zip("abcde", ends, strict=False)
+    trials = [replace(VINE, name=name, axis=Axis((100.0, 100.0), end)) for name, end in named_ends]
     facts = [replace(FACTS, trial=trial.name, axis=trial.axis) for trial in trials]
     assert module.axis_notes(facts, trials) == []  # it was given
     notes = module.axis_notes(facts, [replace(trial, axis=None) for trial in trials])
