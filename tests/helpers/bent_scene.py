@@ -57,10 +57,12 @@ BENDS: dict[str, dict] = {
 """Curves by name: a quarter circle of 300 px radius, an S of 248 px, a gentle bend of 1100 px, a sharp one of 90 px."""
 
 
-def curve_of(plan: BentPlan) -> tuple[np.ndarray, np.ndarray]:
-    """Places (x, y), shape (n, 2), and arc length, (n,), px, every 1/20 px along the plan's pieces."""
+def bent_scene(plan: BentPlan) -> BentScene:
+    """Draw the plan: a textured tube with a rounded tip, blurred along its way by the exposure, over a still ground."""
+    rng = np.random.default_rng(plan.seed)
+    # Places (x, y) of the curve and their arc length, every 1/20 px along the plan's pieces
     x, y, angle, done = *plan.from_px, np.radians(plan.angle_deg), 0.0
-    places, arcs = [], []
+    pieces, arcs = [], []
     for length, turn in plan.pieces:
         s = np.arange(0, length, 0.05)
         bend = np.radians(turn) / length
@@ -70,16 +72,10 @@ def curve_of(plan: BentPlan) -> tuple[np.ndarray, np.ndarray]:
         else:
             way = np.outer(np.append(s, length), [np.cos(angle), np.sin(angle)])
         way += (x, y)
-        places.append(way[:-1])
+        pieces.append(way[:-1])
         arcs.append(s + done)
         x, y, angle, done = *way[-1], angle + bend * length, done + length
-    return np.concatenate(places), np.concatenate(arcs)
-
-
-def bent_scene(plan: BentPlan) -> BentScene:
-    """Draw the plan: a textured tube with a rounded tip, blurred along its way by the exposure, over a still ground."""
-    rng = np.random.default_rng(plan.seed)
-    curve, arc = curve_of(plan)
+    curve, arc = np.concatenate(pieces), np.concatenate(arcs)
     plan = replace(plan, end_px=float(arc[-1]) - 20.0)
     n = int(np.argmax(travel(plan, np.arange(5000.0)) >= plan.end_px)) + plan.end_frames
     h, w = plan.height, plan.width

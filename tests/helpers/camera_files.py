@@ -16,35 +16,21 @@ def packed(values: np.ndarray, bits: int) -> bytes:
     return np.packbits(text.astype(np.uint8).ravel()).tobytes()
 
 
-def write_cine(
-    path: Path,
-    frames: np.ndarray,
-    *,
-    rate: int = 5000,
-    exposure_ns: int = 40_000,
-    pack: int = 0,
-    real_bits: int = 12,
-    version: int = 1,
-    compression: int = 0,
-    colour_filter: int = 0,
-    bit_count: int | None = None,
-    times_s: np.ndarray | None = None,
-    exposures_s: np.ndarray | None = None,
-    annotation: bytes = b"",
-    setup_bytes: int = 5768,
-) -> Path:
+def write_cine(path: Path, frames: np.ndarray, times_s=None, exposures_s=None, annotation=b"", **said: int) -> Path:
     """A Phantom cine. `pack` is 0, 256 (10 bits, the values given are those before linearisation) or 1024 (12 bits)."""
+    options = {
+        "rate": 5000, "exposure_ns": 40_000, "pack": 0, "real_bits": 12, "version": 1, "compression": 0,
+        "colour_filter": 0, "bit_count": 8 if frames.dtype == np.uint8 else 16,
+    } | said  # fmt: skip
+    pack, bits, kind = options["pack"], options["bit_count"], (44, options["compression"], options["version"])
     n, height, width = frames.shape
-    setup = bytearray(setup_bytes)
-    setup[140:144] = b"ST" + struct.pack("<H", setup_bytes)
-    struct.pack_into("<I", setup, 768, rate)
-    struct.pack_into("<I", setup, 772, exposure_ns // 1000)
-    struct.pack_into("<I", setup, 800, 731)  # the version of software that wrote settings of the full length
-    struct.pack_into("<I", setup, 808, colour_filter)
-    struct.pack_into("<I", setup, 896, real_bits)
-    if setup_bytes > 1572:
-        struct.pack_into("<I", setup, 1568, exposure_ns)
-        struct.pack_into("<ii", setup, 5732, 0, 2**real_bits - 1)
+    setup = bytearray(5768)
+    setup[140:144] = b"ST" + struct.pack("<H", len(setup))
+    at_place = {768: options["rate"], 772: options["exposure_ns"] // 1000, 808: options["colour_filter"]}
+    at_place |= {800: 731}  # the version of software that wrote settings of the full length
+    at_place |= {896: options["real_bits"], 1568: options["exposure_ns"], 5736: 2 ** options["real_bits"] - 1}
+    for place, value in at_place.items():
+        struct.pack_into("<I", setup, place, value)
     blocks = []
     if times_s is not None:
         ticks = [round(float(t) * TICK) for t in times_s]
@@ -53,15 +39,12 @@ def write_cine(
     if exposures_s is not None:
         blocks.append((1003, b"".join(struct.pack("<I", round(float(e) * TICK)) for e in exposures_s)))
     tags = b"".join(
-        struct.pack("<IHH", 8 + len(data), kind, i < len(blocks) - 1) + data for i, (kind, data) in enumerate(blocks)
+        struct.pack("<IHH", 8 + len(data), name, i < len(blocks) - 1) + data for i, (name, data) in enumerate(blocks)
     )
-    bits = bit_count or (8 if frames.dtype == np.uint8 else 16)
-    pictures = []
-    for frame in frames:
-        if pack:
-            pictures.append(packed(frame, {256: 10, 1024: 12}[pack]))
-        else:
-            pictures.append(frame[::-1].astype("<u2" if bits == 16 else "u1").tobytes())
+    if pack:
+        pictures = [packed(frame, {256: 10, 1024: 12}[pack]) for frame in frames]
+    else:
+        pictures = [frame[::-1].astype("<u2" if bits == 16 else "u1").tobytes() for frame in frames]
     table = 84 + len(setup) + len(tags)
     at, offsets, body = table + 8 * n, [], b""
     for picture in pictures:
@@ -69,7 +52,7 @@ def write_cine(
         offsets.append(at)
         at += len(block)
         body += block
-    header = struct.pack("<2s3HiIiI3I", b"CI", 44, compression, version, 0, n, -n // 2, n, 44, 84, table)
+    header = struct.pack("<2s3HiIiI3I", b"CI", *kind, 0, n, -n // 2, n, 44, 84, table)
     header += struct.pack("<II", 0, 1_500_000_000)
     bitmap = struct.pack("<IiiHHIIiiII", 40, width, height, 1, bits, pack, len(pictures[0]), 0, 0, 0, 0)
     path.write_bytes(header + bitmap + bytes(setup) + tags + struct.pack(f"<{n}q", *offsets) + body)

@@ -58,23 +58,11 @@ class Hiding(GroundTruth):
         return make_model(self.effects, self.own).with_values(self.values)
 
 
-def grown(
-    trials: Sequence[Trial],
-    seed: int,
-    effects: Sequence[str] = (),
-    values: Mapping[str, float] | None = None,
-    own: Sequence[Path] = (),
-    **more: float,
-) -> list[VirtualTrial]:
+def grown(trials: Sequence[Trial], seed: int, effects=(), values=None, own=(), **more: float) -> list[VirtualTrial]:
     """The trials grown with the printed B and n and these effects hidden."""
     hidden = own_effects(own)
-    nature = Hiding(
-        effects=(*BASE, *effects, *hidden),
-        values={**damping_values(trials), **(values or {})},
-        seed=seed,
-        own=hidden,
-        **more,  # type: ignore[arg-type]
-    )
+    known = {**damping_values(trials), **(values or {})}
+    nature = Hiding(effects=(*BASE, *effects, *hidden), values=known, seed=seed, own=hidden, **more)
     return grow(trials, nature)
 
 

@@ -75,41 +75,6 @@ def travel(plan: Plan, time: np.ndarray) -> np.ndarray:
     return np.minimum(plan.start_px + run, plan.end_px)
 
 
-def _tube(
-    plan: Plan,
-    back: np.ndarray,
-    wall: np.ndarray,
-    tail: np.ndarray,
-    along: np.ndarray,
-    off: np.ndarray,
-    frame: int,
-    speed: float,
-) -> np.ndarray:
-    """What the tube adds to the background while a frame is exposed; drawn where there is some of it."""
-    added = np.zeros(back.shape)
-    inside = np.clip(plan.radius - np.abs(off) + 0.5, 0, 1)
-    parts = int(np.clip(2 * speed, 4, 80))
-    places = [travel(plan, np.array([frame + plan.exposure * (j + 0.5) / parts]))[0] for j in range(parts)]
-    seen = (inside > 0) & (along < max(places) + 0.5)
-    if not seen.any():
-        return added
-    rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
-    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    back, wall, along, off, inside = back[box], wall[box], along[box], off[box], inside[box]
-    bulge = plan.tip_depth * (1 - np.sqrt(np.clip(1 - (off / plan.radius) ** 2, 0, 1)))
-    cover = np.zeros(off.shape, np.float32)
-    inner = np.zeros(off.shape, np.float32)
-    lines, within = np.clip(off + 32, 0, 63).astype(np.int32), np.abs(off) < 0.6 * plan.radius
-    for now in places:
-        cover += np.clip(now - bulge - along + 0.5, 0, 1)
-        inner += tail[lines, np.mod((along - 2 * now).astype(np.int32), 8192)] * within
-    cover, inner = cover / parts * inside, inner / parts
-    shade = 1 - 0.25 * np.clip(off / plan.radius, -1, 1) ** 2
-    tube = plan.opacity * (plan.film * shade + wall) + (1 - plan.opacity) * back + inner
-    added[box] = cover * (tube - back)
-    return added
-
-
 def moving(plan: Plan, n_frames: int) -> np.ndarray:
     """Which frames show a tube that moves while they are exposed."""
     later = travel(plan, np.arange(n_frames) + plan.exposure)
@@ -153,7 +118,25 @@ def plain_scene(plan: Plan) -> Scene:
     speed = travel(plan, np.arange(n_frames) + plan.exposure) - travel(plan, np.arange(n_frames, dtype=float))
     for i in range(n_frames):
         sway = plan.wobble * np.sin(0.4 * i + phase[0]) * np.clip(along / w, 0, 1) if plan.wobble else 0.0
-        picture = back + _tube(plan, back, wall, tail, along, across - sway, i, float(speed[i]))
+        # What the tube adds to the background while the frame is exposed, where there is some of it
+        off, parts = across - sway, int(np.clip(2 * speed[i], 4, 80))
+        inside = np.clip(plan.radius - np.abs(off) + 0.5, 0, 1)
+        places = [travel(plan, np.array([i + plan.exposure * (j + 0.5) / parts]))[0] for j in range(parts)]
+        seen = (inside > 0) & (along < max(places) + 0.5)
+        picture = back.astype(float)
+        if seen.any():
+            rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+            box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+            ground, s, off = back[box], along[box], off[box]
+            bulge = plan.tip_depth * (1 - np.sqrt(np.clip(1 - (off / plan.radius) ** 2, 0, 1)))
+            cover, inner = np.zeros(off.shape, np.float32), np.zeros(off.shape, np.float32)
+            lines, within = np.clip(off + 32, 0, 63).astype(np.int32), np.abs(off) < 0.6 * plan.radius
+            for now in places:
+                cover += np.clip(now - bulge - s + 0.5, 0, 1)
+                inner += tail[lines, np.mod((s - 2 * now).astype(np.int32), 8192)] * within
+            shade = 1 - 0.25 * np.clip(off / plan.radius, -1, 1) ** 2
+            tube = plan.opacity * (plan.film * shade + wall[box]) + (1 - plan.opacity) * ground + inner / parts
+            picture[box] += cover / parts * inside[box] * (tube - ground)
         if plan.door:
             swing = 14.0 * max(0.0, i - plan.rest_frames + 3)
             panel = (along > plan.start_px + 24 + 0.6 * swing) & (along < plan.start_px + 60 + 0.6 * swing)
@@ -169,14 +152,7 @@ def plain_scene(plan: Plan) -> Scene:
 
 
 def write_video(
-    path: Path,
-    frames: np.ndarray,
-    codec: str = "libx264",
-    pix_fmt: str = "yuv420p",
-    bit_rate: int = 0,
-    options: dict[str, str] | None = None,
-    playback_fps: int = 60,
-    container_options: dict[str, str] | None = None,
+    path, frames, codec="libx264", pix_fmt="yuv420p", bit_rate=0, options=None, playback_fps=60, container_options=None
 ) -> Path:
     """Write frames (n, h, w) as a video whose container claims `playback_fps`."""
     with av.open(str(path), "w", options=container_options or {}) as container:
