@@ -15,7 +15,6 @@ import pytest
 from by_hand import LOADED, N, followed
 from hidden import laboratories as faults
 from hidden.balls import fallen
-from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_kinds import BARE
 from hidden.laboratory_rows import ROWS, campaign
 from hidden.motion import AIR, G, Tube, follow
@@ -26,7 +25,6 @@ from hidden.visibility import visible_sigma
 
 from vinetrack.dynamics.model import base_model
 from vinetrack.dynamics.simulate import simulate
-from vinetrack.experiment.folder import read_experiment
 
 SEED = 20_900
 FEW = (18, 24)
@@ -48,17 +46,6 @@ def test_every_row_makes_a_campaign_that_moves(name):
         assert np.all(np.isfinite(one.position_m))
         assert np.ptp(one.position_m) > 0.01
     json.dumps(made.truth, allow_nan=False)
-
-
-def test_a_folder_is_one_that_the_package_reads(tmp_path):
-    made = campaign("trace_clock", SEED, FEW, weighed=False)
-    write_experiment(made, tmp_path)
-    read = read_experiment(tmp_path)
-    assert len(read.trials) == len(made.recordings)
-    first = made.recordings[0]
-    assert read.trials[0].pressure_Pa == pytest.approx(1e3 * float(first.cells["pressure_kPa"]))
-    header = (tmp_path / str(first.cells["track"])).read_text().splitlines()[0]
-    assert header == "time_s,position_m,pressure_kPa"
 
 
 def test_wear_follows_the_order_of_each_vine():

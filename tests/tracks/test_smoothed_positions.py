@@ -34,17 +34,12 @@ def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
     assert all(detect_smoothing(tracks(seed, rho)) is None for seed in range(351, 371))
 
 
-@pytest.mark.parametrize("frames", [3, 5, 9])
-def test_a_moving_average_is_found_with_its_length(frames: int) -> None:
-    found = detect_smoothing(tracks(352, smooth=lambda y: uniform_filter1d(y, frames)))
-    assert (found.window, found.degree, found.decimation) == (frames, 0, frames)
-
-
-@pytest.mark.parametrize("frames", [7, 11])
-def test_a_polynomial_is_distinguished_from_a_moving_average(frames: int) -> None:
-    found = detect_smoothing(tracks(353, smooth=lambda y: savgol_filter(y, frames, 3)))
-    assert (found.window, found.degree) == (frames, 2)
-    assert 1 < found.decimation < frames
+@pytest.mark.parametrize(("degree", "frames"), [(0, 3), (0, 5), (0, 9), (2, 7), (2, 11)])
+def test_a_moving_average_and_a_polynomial_are_found_with_their_lengths(degree: int, frames: int) -> None:
+    average, polynomial = (lambda y: uniform_filter1d(y, frames)), (lambda y: savgol_filter(y, frames, 3))
+    found = detect_smoothing(tracks(352 + degree // 2, smooth=polynomial if degree else average))
+    assert (found.window, found.degree) == (frames, degree)
+    assert 1 < found.decimation < frames if degree else found.decimation == frames
 
 
 def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path: Path) -> None:

@@ -84,8 +84,10 @@ def test_a_given_axis_two_degrees_off_is_centred():
     assert errors(scene, tracking)[0].std() < 0.2
 
 
-def test_time_is_mid_exposure_and_flags_are_known():
+def test_time_is_mid_exposure_and_flags_are_known_and_a_still_recording_is_refused():
     scene, tracking = followed(seed=206)
+    with pytest.raises(RecordingError):
+        pictures.tracked(np.repeat(scene.frames[:1], 20, axis=0), 0.2)
     track = tracking.track
     assert track.time_s[0] == pytest.approx(scene.plan.exposure / 2000)
     assert np.diff(track.time_s) == pytest.approx(np.full(len(track.time_s) - 1, 1e-3))
@@ -102,17 +104,9 @@ def test_two_frames_of_rest_at_the_end_are_not_growth(speed):
     count = int(np.flatnonzero(scene.moving)[-1]) + 3
     after = with_flag(pictures.tracked(scene.frames[:count], scene.plan.exposure).track.flag, "after_end")
     assert after.tolist() == [False] * (count - 2) + [True] * 2
-
-
-def test_a_pause_of_one_frame_in_slow_growth_is_not_a_stop():
+    # A pause of one frame in slow growth is not a stop.
     edge = np.concatenate([np.full(8, 50.0), 50 + 1.0 * np.arange(1, 30), [79.0]])
     assert moving_range(edge, np.full(edge.size, 0.05)) == (8, edge.size - 1)
-
-
-def test_a_still_recording_is_refused():
-    still = np.repeat(plain_scene(Plan(seed=208, **SHORT)).frames[:1], 20, axis=0)
-    with pytest.raises(RecordingError):
-        pictures.tracked(still, 0.2)
 
 
 def test_wrong_repeated_and_missing_frames_are_flagged_and_the_times_are_corrected():
