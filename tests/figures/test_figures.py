@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import matplotlib.colors as mcolors
 import numpy as np
@@ -11,7 +10,6 @@ import pandas as pd
 import pytest
 from figure_frames import assert_nothing_is_cut_off
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from vinetrack.dynamics.simulate import effect_motion
@@ -103,18 +101,10 @@ def test_all_trials_have_a_panel_for_each_condition_or_for_each_vine(
     assert len(panels) == n_panels
     thin = [line for ax in panels for line in ax.lines if line.get_linewidth() < 1]
     assert len(thin) == n_conditions * replicates
+    if n_conditions == 40:
+        assert_nothing_is_cut_off(figure)
     if n_conditions > 60:
         assert any("pressure (kPa)" in text.get_text() for text in figure.findobj(Text))
-
-
-EVERY_FIGURE: dict[str, Callable[[], Figure]] = {
-    "law": lambda: draw_damping_law(points(4), damping(4)),
-    "law of 20 vines": lambda: draw_damping_law(points(20), damping(20)),
-    "exponents": lambda: draw_exponents(damping(4)),
-    "scaling": lambda: draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"}),
-    "overview": lambda: motion_figures.draw_overview(*campaign(40, 1)),
-    "trial": lambda: trial_figure(),
-}
 
 
 def test_the_same_figure_gives_the_same_bytes() -> None:
@@ -123,9 +113,11 @@ def test_the_same_figure_gives_the_same_bytes() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_nothing_of_a_campaign_is_cut_off(name: str) -> None:
-    assert_nothing_is_cut_off(EVERY_FIGURE[name]())
+def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off() -> None:
+    for n_vines in (4, 20):
+        assert_nothing_is_cut_off(draw_damping_law(points(n_vines), damping(n_vines)))
+    assert_nothing_is_cut_off(draw_exponents(damping(4)))
+    assert_nothing_is_cut_off(draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"}))
 
 
 def test_without_content_there_is_no_figure() -> None:
@@ -157,7 +149,7 @@ def test_line_and_power_law_are_drawn_as_fitted() -> None:
 LONG = "still accelerating: the speed rises by 24 % (20 to 28 %) across the window; choose a later start " * 3
 
 
-def trial_figure() -> Figure:
+def test_x_ss_is_drawn_at_the_speed_of_the_leading_edge() -> None:
     """All rules refuse, in long sentences, but one, which finds 2 m/s of the tail."""
     time_s = np.arange(200) / 1000
     kinematics = pd.DataFrame({"time_s": time_s, "lead_position_m": time_s})
@@ -166,13 +158,10 @@ def trial_figure() -> Figure:
     found = {"x_ss_m_s": 2.0, "x_ss_sigma_m_s": 0.01, "from_s": 0.05, "to_s": 0.15}
     windows = [{"rule": rule, "accepted": rule == "gated", "reason": LONG, **found} for rule in RULE_COLOURS]
     title = "W" * 60 + " · 24 mm × 200 µm × 280 mm · 28 kPa · 35.6 g"
-    return motion_figures.draw_trial_motion(title, track, kinematics, pd.DataFrame(windows))
-
-
-def test_x_ss_is_drawn_at_the_speed_of_the_leading_edge() -> None:
-    speed = trial_figure().axes[1]
-    level = next(line for line in speed.lines if to_hex(line.get_color()) == RULE_COLOURS["gated"].lower())
+    figure = motion_figures.draw_trial_motion(title, track, kinematics, pd.DataFrame(windows))
+    level = next(line for line in figure.axes[1].lines if to_hex(line.get_color()) == RULE_COLOURS["gated"].lower())
     assert list(level.get_ydata()) == [1.0, 1.0]
+    assert_nothing_is_cut_off(figure)
 
 
 # Figures of model and measurement: one condition, forty, and none.

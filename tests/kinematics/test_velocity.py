@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
-from vinetrack.kinematics.velocity import correlated, estimate_kinematics, fit_all_windows
+from vinetrack.kinematics.velocity import estimate_kinematics, fit_all_windows
 
 SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
 TRIALS = [
@@ -105,9 +105,3 @@ def test_misfit_of_noise_averages_its_number_of_terms(rho):
     rng = np.random.default_rng(1000)
     misfits = [fit_all_windows(EVEN, ar1(60, 1.0, rho, rng), 21, 3, rho).misfit[::20] for _ in range(500)]
     assert np.mean(misfits) == pytest.approx(4.0, rel=0.08)
-
-
-def test_correlated_is_multiplication_by_the_correlation_matrix():
-    weights = np.random.default_rng(1000).standard_normal((3, 12))
-    lag = np.abs(np.subtract.outer(np.arange(12), np.arange(12)))
-    np.testing.assert_allclose(correlated(weights, 0.6), weights @ 0.6**lag, rtol=1e-12)

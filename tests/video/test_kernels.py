@@ -20,11 +20,6 @@ RIM = 40 * np.exp(-0.5 * ((np.arange(65) - 32 + 4.0) / 2.0) ** 2)
 """Shading of a tip with a bright rim 4 px behind its edge, grey levels, by distance ahead of it from −32 px on."""
 
 
-def shaded(distance: np.ndarray) -> np.ndarray:
-    """What the rim adds, linear between whole distances ahead of the edge, grey levels."""
-    return np.interp(distance, np.arange(65) - 32.0, RIM, left=0.0, right=0.0)
-
-
 def stepping(seed: int = 961, rim: bool = False, contrast: float = 110.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A strip with a noisy edge, its place, and brightness and variances on either side."""
     rng = np.random.default_rng(seed)
@@ -35,7 +30,8 @@ def stepping(seed: int = 961, rim: bool = False, contrast: float = 110.0) -> tup
                          np.full((9, 120), 12.0), np.full((9, 120), 9.0)]).astype(np.float32)  # fmt: skip
     values = pictures[1] + cover * (pictures[0] - pictures[1]) + rng.normal(0, 3, cover.shape)
     if rim:
-        values = values + shaded(x - (edge[:, None, None] - LAG[:, None]))
+        ahead = x - (edge[:, None, None] - LAG[:, None])
+        values = values + np.interp(ahead, np.arange(65) - 32.0, RIM, left=0.0, right=0.0)
     return np.clip(values, 0, 255).astype(np.uint8), edge, pictures
 
 
