@@ -5,6 +5,7 @@ The truth is the motion that the virtual laboratory filmed, and the same recordi
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -16,7 +17,6 @@ import pytest
 from plain_scene import write_video
 
 from vinetrack.core.records import Trial, with_flag
-from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.filming import Filming, film
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera
@@ -63,17 +63,16 @@ class Clip:
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> Clip:
     folder = tmp_path_factory.mktemp("clip")
-    (folder / "trials.csv").write_text(
-        "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,mm_per_px\np36,a.mp4,12,100,140,36,0.24\n"
-    )
-    (folder / "experiment.yaml").write_text(
-        f"capture_fps: {CAPTURE_FPS:g}\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
-    )
+    stated = Trial(
+        name="p36", video=folder / "a.mp4", diameter_m=0.012, thickness_m=100e-6, length_m=0.14, pressure_Pa=36e3,
+        yield_pressure_Pa=3e3, growth_angle_rad=math.pi / 2, m_per_px=2.4e-4, capture_fps=CAPTURE_FPS,
+        exposure_s=93.5e-6, vine="v",
+    )  # fmt: skip
     nature = GroundTruth(
-        values={"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}},
+        values={"eversion_damping.n": 0.37, "eversion_damping.B": {"v": 1.83}},
         damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
     )  # fmt: skip
-    grown = grow(read_experiment(folder, strict=True).trials, nature)[0]
+    grown = grow([stated], nature)[0]
     truth = film(grown, Filming(camera=Camera(m_per_px=2.4e-4)), grown.stated.video, seed=41)
     return Clip(grown.stated, truth, read_frames(grown.stated.video))
 

@@ -20,37 +20,21 @@ BEFORE, AFTER = 300, 180
 """Frames of rest beyond those of the scene."""
 
 
+Filmed = tuple[Scene, np.ndarray]
+
+
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return plain_scene(
+def filmed() -> Filmed:
+    """A scene, and its frames with rest before and after it, each frame of rest with grain of its own."""
+    scene = plain_scene(
         Plan(seed=20942, width=384, height=96, from_px=(24.0, 48.0), end_px=320.0, radius=14.0, speed=9.0)
     )
-
-
-@pytest.fixture(scope="module")
-def long_frames(scene: Scene) -> np.ndarray:
-    """The scene with rest before and after it, each frame of rest with grain of its own."""
-    rng = np.random.default_rng(20943)
-    frames = np.concatenate(
-        [np.repeat(scene.frames[:1], BEFORE, 0), scene.frames, np.repeat(scene.frames[-1:], AFTER, 0)]
-    )
+    first, last = np.repeat(scene.frames[:1], BEFORE, 0), np.repeat(scene.frames[-1:], AFTER, 0)
+    frames, rng = np.concatenate([first, scene.frames, last]), np.random.default_rng(20943)
     for rest in (slice(None, BEFORE), slice(-AFTER, None)):
         grain = np.rint(rng.normal(0, 2.0, frames[rest].shape))
         frames[rest] = np.clip(frames[rest] + grain, 0, 255).astype(np.uint8)
-    return frames
-
-
-@pytest.fixture(scope="module", params=["30", "5000", "1"])
-def film(request: pytest.FixtureRequest, long_frames: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With a key frame every 30, with one, and with key frames alone."""
-    path = tmp_path_factory.mktemp("film") / "long.mp4"
-    return write_video(path, long_frames, options={"crf": "14", "g": request.param})
-
-
-@pytest.fixture
-def bracketed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every recording counts as a long one."""
-    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    return scene, frames
 
 
 def track(path: Path, **stated: object) -> Track:
@@ -58,41 +42,31 @@ def track(path: Path, **stated: object) -> Track:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("bracketed")
-def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scene, long_frames: np.ndarray) -> None:
-    frames = read_event(inspect_recording(film))
+@pytest.mark.parametrize("key_frames", ["30", "5000", "1"])
+def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monkeypatch, key_frames) -> None:
+    """With a key frame every 30, with one, and with key frames alone; tracked as the whole film is."""
+    scene, long_frames = filmed
+    film = write_video(tmp_path / "long.mp4", long_frames, options={"crf": "14", "g": key_frames})
+    whole, whole_track = read_frames(film), track(film)
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    frames, part = read_event(inspect_recording(film)), track(film)
     moving = np.flatnonzero(scene.moving) + BEFORE
     assert frames.first <= moving[0] - 40
     assert frames.first + len(frames) > moving[-1] + 40
     assert len(frames) < len(moving) + 2 * (MARGIN_FRAMES + 60)
     assert frames.n_recorded == len(long_frames)
-    whole = read_frames(film)
     same = slice(frames.first, frames.first + len(frames))
     assert np.array_equal(frames.luma, whole.luma[same])
     assert np.array_equal(frames.slot, whole.slot[same])
-
-
-@pytest.mark.slow
-def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = track(film)
-    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
-    part = track(film)
-    assert len(part.time_s) == len(whole.time_s)
-    assert part.time_s == pytest.approx(whole.time_s)
-    moving = np.flatnonzero(scene.moving) + BEFORE
-    known = np.isfinite(part.edge_px[moving]) & np.isfinite(whole.edge_px[moving])
+    assert len(part.time_s) == len(whole_track.time_s)
+    assert part.time_s == pytest.approx(whole_track.time_s)
+    known = np.isfinite(part.edge_px[moving]) & np.isfinite(whole_track.edge_px[moving])
     assert known.mean() > 0.95
-    apart = (part.edge_px - whole.edge_px)[moving][known]
-    assert np.std(apart) < 0.05
+    assert np.std((part.edge_px - whole_track.edge_px)[moving][known]) < 0.05
     assert set(part.flag[: BEFORE - 150]) == {"before_release"}
     assert set(part.flag[-100:]) == {"after_end"}
-    off = part.edge_px[moving][known] - scene.edge_px[moving - BEFORE][known]
-    assert np.std(off) < 0.3
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("bracketed")
-def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scene: Scene) -> None:
+    assert np.std(part.edge_px[moving][known] - scene.edge_px[moving - BEFORE][known]) < 0.3
+    # Frames that the sheet names are those that are decoded.
     wanted = (BEFORE - 20, BEFORE + len(scene.frames) - 1)
     frames = read_event(inspect_recording(film), wanted)
     assert (frames.first, frames.first + len(frames) - 1) == wanted
@@ -102,8 +76,9 @@ def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scen
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("bracketed")
-def test_of_a_long_cine_the_event_is_read_and_no_more(scene: Scene, long_frames: np.ndarray, tmp_path: Path) -> None:
+def test_of_a_long_cine_the_event_is_read_and_no_more(filmed: Filmed, tmp_path: Path, monkeypatch) -> None:
+    scene, long_frames = filmed
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
     missing = np.delete(np.arange(len(long_frames) + 1), BEFORE + 30) / 1000 + 0.2
     deep = long_frames.astype(np.uint16) * 16
     path = write_cine(tmp_path / "long.cine", deep, rate=1000, exposure_ns=200_000, times_s=missing)
