@@ -332,9 +332,7 @@ def test_an_ordinary_error_is_no_slip():
 
 
 @pytest.mark.slow
-def test_nothing_is_missing_from_a_simulation_of_the_model_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_missing_from_a_simulation_of_the_model_itself(tmp_path, monkeypatch):
     """What the integrator errs by, 1 µm in a metre, had passed for motion that is noisier than rest."""
     camera = shots.Camera
     monkeypatch.setattr(shots, "Camera", lambda _noise_m, **how: camera(0.0, **how))
@@ -365,7 +363,7 @@ def filmed(vine: Vine, pressures_kPa: tuple[float, ...], payload_g: float, state
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("stated_deg", "true_deg"), [(90, 0), (0, 90)], ids=["level for down", "blank for level"])
-def test_a_loaded_vine_tells_that_its_angle_is_wrong(stated_deg: float, true_deg: float) -> None:
+def test_a_loaded_vine_tells_that_its_angle_is_wrong(stated_deg, true_deg):
     told = diagnosed(filmed(Vine(24, 200, 280), (14, 28, 41), 35.6, stated_deg, true_deg), ANGLE_RIVALS)
     assert (told.verdict, told.answer_set, told.effects) == ("artefact", ("growth_angle",), ())
     (slip,) = (number for row in told.ranking if row.effect == "growth_angle" for number in row.numbers)
@@ -373,7 +371,7 @@ def test_a_loaded_vine_tells_that_its_angle_is_wrong(stated_deg: float, true_deg
 
 
 @pytest.mark.slow
-def test_a_bare_vine_of_light_film_cannot_tell() -> None:
+def test_a_bare_vine_of_light_film_cannot_tell():
     bare = filmed(Vine(12, 100, 140), (24, 30, 38, 48), 0, 90, 0)
     told = diagnosed([(replace(t, position_systematic_m=1e-4), track) for t, track in bare], ANGLE_RIVALS)
     assert told.verdict == "adequate"

@@ -21,7 +21,7 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, Misf
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, select_effects, slack_fit
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_result import YIELD_PRESSURE, Fit
+from vinetrack.inference.fit_result import YIELD_PRESSURE
 from vinetrack.inference.optimiser import relative_residual
 from vinetrack.inference.solving import solve_onward
 
@@ -110,13 +110,13 @@ def test_a_static_yield_far_above_the_yield_pressure_is_found():
 
 
 @pytest.fixture(scope="module")
-def whole() -> Fit:
+def whole():
     """The base model fitted to trials whose tail rubs."""
     pairs = grown({"tail_friction.mu_w": 1.0}, seed=7270)
     return initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), ["tail_friction"]), profile=False)
 
 
-def test_a_fit_is_the_same_once_its_curves_are_made_again(whole: Fit) -> None:
+def test_a_fit_is_the_same_once_its_curves_are_made_again(whole):
     fit = whole
     light = without_curves(fit)
     assert not light.trials
@@ -146,12 +146,12 @@ def grown_with_tail(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -
 
 
 @pytest.fixture(scope="module")
-def slackened() -> Fit:
+def slackened():
     return fit(vt.base_model(), grown_with_tail(60.0, "free"), profile=False)
 
 
 @pytest.mark.slow
-def test_a_slack_tail_is_found_where_the_model_has_it_push(slackened: Fit):
+def test_a_slack_tail_is_found_where_the_model_has_it_push(slackened):
     slack = slack_fit(slackened)
     assert slack is not None
     assert slack.names == ("tail_slack",)
@@ -177,9 +177,7 @@ def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_push
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suspect", [False, True])
-def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_better(
-    monkeypatch: pytest.MonkeyPatch, *, suspect: bool
-) -> None:
+def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_better(monkeypatch, *, suspect):
     trials = [replace(one, growth_angle_rad=np.pi / 2) for one in sheet()]
     virtual = campaigns.grown(trials, 6, ["tail_friction"], {"tail_friction.mu_w": 0.04}, noise_m=5e-5)
     found = fit(vt.base_model(), pairs_of(virtual), profile=False)

@@ -12,7 +12,7 @@ import grown as campaigns
 import numpy as np
 import pandas as pd
 import pytest
-from hidden_truth import Pairs, grown, sheet
+from hidden_truth import grown, sheet
 from lsoda_vine import as_track, small_campaign
 from own_effect import NAME, write_effect
 from tube.folder import write_folder
@@ -21,7 +21,7 @@ from tube.recordings import read_recordings, thresholds
 
 import vinetrack as vt
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Track, Trial, plain_track
+from vinetrack.core.records import Floats, Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import ForceEstimate
@@ -32,28 +32,27 @@ from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.selection import contradictions
 from vinetrack.effects import own_effects
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_result import Fit
 from vinetrack.tracks.importers import flag_end_of_motion
 
 FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
 
 
 @pytest.fixture(scope="module")
-def nothing_missing() -> Diagnosis:
+def nothing_missing():
     return vt.diagnose(grown(seed=7000))
 
 
 @pytest.fixture(scope="module")
-def depleted_pairs() -> Pairs:
+def depleted_pairs():
     return grown({"reservoir_depletion.gamma": 1.25}, seed=7100)
 
 
 @pytest.fixture(scope="module")
-def depleted(depleted_pairs: Pairs) -> Diagnosis:
+def depleted(depleted_pairs):
     return vt.diagnose(depleted_pairs, candidates=FEW)
 
 
-def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_said(nothing_missing: Diagnosis) -> None:
+def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_said(nothing_missing):
     assert nothing_missing.verdict == nothing_missing.final_verdict == "adequate"
     assert nothing_missing.effects == nothing_missing.answer_set == ()
     ranking = {one.effect: one for one in nothing_missing.rounds[0].ranking}
@@ -66,7 +65,7 @@ def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_s
 
 
 @pytest.mark.slow
-def test_a_size_well_beyond_what_could_hide_would_have_been_seen() -> None:
+def test_a_size_well_beyond_what_could_hide_would_have_been_seen():
     """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
 
     def asked(**hidden: float) -> Diagnosis:
@@ -81,7 +80,7 @@ def test_a_size_well_beyond_what_could_hide_would_have_been_seen() -> None:
     assert "tail_friction" in found.answer_set
 
 
-def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted: Diagnosis) -> None:
+def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
     assert (depleted.verdict, depleted.final_verdict) == ("missing", "adequate")
     assert depleted.effects == depleted.answer_set == ("reservoir_depletion",)
     gamma = depleted.fit["gamma"]
@@ -97,7 +96,7 @@ def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted: Diag
     assert last["rms_in_sample_m"] < 2 * last["floor_m"]
 
 
-def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted: Diagnosis, tmp_path: Path) -> None:
+def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted, tmp_path):
     write_json(tmp_path / "diagnosis.json", depleted.to_json())
     read = Diagnosis.from_json(json.loads((tmp_path / "diagnosis.json").read_text()))
     write_json(tmp_path / "again.json", read.to_json())
@@ -108,7 +107,7 @@ def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted: Diagnosis,
 
 
 @pytest.mark.slow
-def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do() -> None:
+def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do():
     found = vt.diagnose(grown({"length_scale.eps": 0.06}, seed=7002, trials=sheet(35.6)[::2]), ladder=False)
     assert found.verdict == "artefact"
     assert "length_scale" in found.answer_set
@@ -118,7 +117,7 @@ def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do() -> None:
 
 
 @pytest.mark.slow
-def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
+def test_missing_frames_are_said_first(depleted_pairs):
     once = depleted_pairs[::2]  # one trial of every condition
     trial, track = next((trial, track) for trial, track in once if trial.pressure_Pa == 40e3)
     moving = int(np.searchsorted(track.lead_position_m, track.lead_position_m[0] + 0.05))
@@ -131,7 +130,7 @@ def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
     assert "reservoir_depletion" in found.notes[0].facts["explanation"]
 
 
-def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diagnosis) -> None:
+def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted):
     missing = LostFrames(("a", "b"))
     result = with_lost_frames(depleted, missing)
     assert (result.verdict, result.effects) == (depleted.verdict, depleted.effects)
@@ -141,7 +140,7 @@ def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diag
 
 
 @pytest.mark.slow
-def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
+def test_a_users_own_effect_is_found_like_any_other(tmp_path):
     own = own_effects([write_effect(tmp_path)])
     scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005, "longest_frames": 420}
     virtual = campaigns.grown(sheet()[::2], 7003, own=[tmp_path / f"{NAME}.py"], values={f"{NAME}.k": 1.5}, **scatter)
@@ -154,7 +153,7 @@ def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_measured_pressure_already_holds_what_happens_in_the_chamber() -> None:
+def test_a_measured_pressure_already_holds_what_happens_in_the_chamber():
     pairs = [
         (trial, replace(track, pressure_Pa=np.full(track.time_s.size, trial.pressure_Pa)))
         for trial, track in grown(seed=7005)
@@ -168,11 +167,11 @@ def test_a_measured_pressure_already_holds_what_happens_in_the_chamber() -> None
 
 
 @pytest.fixture(scope="module")
-def plain() -> Fit:
+def plain():
     return fit(vt.base_model(), grown(seed=51), profile=False)
 
 
-def test_an_effect_that_predicts_no_condition_better_is_said_to(plain: Fit) -> None:
+def test_an_effect_that_predicts_no_condition_better_is_said_to(plain):
     def told(left_out_m: float) -> tuple[Remark, ...]:
         return contradictions((plain,), ("latch_release",), pd.DataFrame({"rms_left_out_m": [4.09e-3, left_out_m]}))
 
@@ -182,7 +181,7 @@ def test_an_effect_that_predicts_no_condition_better_is_said_to(plain: Fit) -> N
 
 
 @pytest.mark.slow
-def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain: Fit) -> None:
+def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain):
     of_fit = {name: getattr(plain.predictor, name) for name in ("steps", "pressure_step")}
     kept = {name: array.copy() for name, array in of_fit.items()}
     theta = plain.solution.state.theta.copy()
@@ -212,7 +211,7 @@ def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:
 
 
 @pytest.fixture(scope="module")
-def balls() -> list[tuple[Trial, Track]]:
+def balls():
     made, time_s = [], np.arange(100) / 120
     for kind, size in enumerate(((0.04, 2.7e-3), (0.1, 20e-3), (0.038, 60e-3))):
         for repeat in range(3):
@@ -224,7 +223,7 @@ def balls() -> list[tuple[Trial, Track]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", [["gravity"], ["gravity", "payload_friction"]])
-def test_the_drag_of_falling_balls_is_named(balls: list[tuple[Trial, Track]], model: list[str]) -> None:
+def test_the_drag_of_falling_balls_is_named(balls, model):
     found = vt.diagnose(balls, model=vt.make_model(model), ladder=False, advice=False)
     assert (found.verdict, found.effects) == ("missing", ("air_drag",))
     drag = found.fits[-1]["C_D"]
@@ -235,7 +234,7 @@ def test_the_drag_of_falling_balls_is_named(balls: list[tuple[Trial, Track]], mo
 
 
 @pytest.mark.slow
-def test_vines_that_a_wall_stops_half_way_lack_nothing() -> None:
+def test_vines_that_a_wall_stops_half_way_lack_nothing():
     draw, stopped = np.random.default_rng(1), []
     for trial, track in small_campaign(3)[0]:
         wall_m = track.lead_position_m[0] + 0.8 * np.ptp(track.lead_position_m)
@@ -249,9 +248,7 @@ def test_vines_that_a_wall_stops_half_way_lack_nothing() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "verdict"), [(["gravity"], "missing"), (["gravity", "air_drag"], "adequate")])
-def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_model(
-    model: list[str], verdict: str
-) -> None:
+def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_model(model, verdict):
     time_s = np.arange(-8, 60) / 15
     drops = []
     for seed in (10, 11):
@@ -267,7 +264,7 @@ def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_
 
 @pytest.mark.real
 @pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
-def test_the_drag_of_eight_real_paper_cups_is_named() -> None:
+def test_the_drag_of_eight_real_paper_cups_is_named():
     found = vt.diagnose(Path(REAL) / "falling_cups", ladder=False, advice=False)
     assert (found.verdict, found.effects) == ("missing", ("air_drag",))
     assert found.fits[-1]["C_D"].value == pytest.approx(1.24, abs=0.03)
@@ -275,7 +272,7 @@ def test_the_drag_of_eight_real_paper_cups_is_named() -> None:
 
 @pytest.mark.real
 @pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
-def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_mends_most_of_it(tmp_path: Path) -> None:
+def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_mends_most_of_it(tmp_path):
     """Its authors fit a pressure to start above one to stop, and drag that rises with the length."""
     sticking = [one for one in read_recordings(Path(REAL) / "everting_tube") if one.name == "tube2_hi_2"]
     experiment = vt.read_experiment(write_folder(sticking, tmp_path))
@@ -293,7 +290,7 @@ def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_m
     assert slope == pytest.approx(start[1], rel=1 / 3)
 
 
-def test_a_force_narrower_than_a_millimetre_or_far_beyond_drive_and_weight_is_not_named() -> None:
+def test_a_force_narrower_than_a_millimetre_or_far_beyond_drive_and_weight_is_not_named():
     estimate = ForceEstimate(100.0, np.array([-20.0]), 1.0, np.empty(0), 1)
     law = Law("patch", n_shapes=2, low=0.274, high=0.294)
     assert RankedLaw(law, estimate, 0.0, largest_N=50.0).is_detected

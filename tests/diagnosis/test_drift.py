@@ -23,12 +23,12 @@ def fitted(pairs: Pairs) -> Fit:
 
 
 @pytest.fixture(scope="module")
-def emptying() -> Fit:
+def emptying():
     """Vines on a chamber that nothing refills, without it."""
     return fitted(pairs_of(grown(sheet(), 51, ["reservoir_depletion"])))
 
 
-def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure() -> None:
+def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure():
     """The higher the pressure, the wider and faster a vine is whose wall gives way."""
     table = drift(fitted(pairs_of(grown(sheet(), 51, ["wall_stretch"])))).table
     row = table[(table["against"] == "pressure_Pa") & table["vine"].str.startswith("24mm")].iloc[0]
@@ -38,7 +38,7 @@ def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure() -> None:
 
 
 @pytest.mark.slow
-def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(emptying: Fit) -> None:
+def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(emptying):
     """n and the yield pressures are free, and take what they can upon themselves."""
     found = drift(emptying)
     rows = found.table[found.table["against"] == "growth"]
@@ -48,7 +48,7 @@ def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(emptying: F
     assert best[0] == best.max()
 
 
-def test_every_trial_finds_the_b_it_was_grown_with() -> None:
+def test_every_trial_finds_the_b_it_was_grown_with():
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
     values = per_trial_estimates(found, B, align_trials(found))
@@ -63,7 +63,7 @@ def test_every_trial_finds_the_b_it_was_grown_with() -> None:
 
 
 @pytest.mark.slow
-def test_vines_of_different_exponents_are_told() -> None:
+def test_vines_of_different_exponents_are_told():
     one, other = ([trial for trial in sheet() if (trial.diameter_m > 0.02) == wide] for wide in (False, True))
     fit = fitted(pairs_of([*grown(one, 58, values={"eversion_damping.n": 0.3}), *grown(other, 58)]))
     assert {told.code for told in contradictions((fit,), (), None)} == {"still_drifts"}
@@ -78,7 +78,7 @@ def test_vines_of_different_exponents_are_told() -> None:
 
 
 @pytest.mark.slow
-def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_large_as_replicates_make_them() -> None:
+def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_large_as_replicates_make_them():
     """In the third campaign the noise remembers itself, in the fourth trials scatter little.
 
     With the smaller error of a thousand independent frames mean residuals would stray by 20 of them.
@@ -97,7 +97,7 @@ def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_larg
 
 
 @pytest.mark.slow
-def test_an_emptying_chamber_makes_it_fail(emptying: Fit) -> None:
+def test_an_emptying_chamber_makes_it_fail(emptying):
     failing = locate(emptying)
     assert failing.fails
     worst = failing.by_condition.iloc[0]
@@ -109,7 +109,7 @@ def test_an_emptying_chamber_makes_it_fail(emptying: Fit) -> None:
 
 
 @pytest.mark.slow
-def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign() -> None:
+def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign():
     """Eight millimetres ahead in the middle of the growth of one condition, by hand."""
     pairs = pairs_of(grown(sheet((4,)), 77, damping_scatter=0.005, pressure_scatter=0.002))
     chosen = pairs[4][0].condition
@@ -127,7 +127,7 @@ def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign() -> No
     assert 0.1 < best["lead_position_m"] < 0.18
 
 
-def test_single_trials_are_judged_by_the_scatter_of_the_fit() -> None:
+def test_single_trials_are_judged_by_the_scatter_of_the_fit():
     found = locate(fitted(pairs_of(grown(sheet(replicates=1), 78))))
     assert found.scatter.dof == 0
     assert not found.fails

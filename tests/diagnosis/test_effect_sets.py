@@ -50,14 +50,14 @@ def pairs(worth: float) -> list[LikelihoodRatio]:
 
 
 @pytest.fixture(autouse=True)
-def no_refit_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_refit_succeeds(monkeypatch):
     """Likelihoods and scatter are given; some tests replace this, and campaigns, made once, come before it."""
     monkeypatch.setattr(EffectSets, "_refitted", lambda *_: None)
     monkeypatch.setattr(selection, "robust_ratio", lambda *_: 1.0)
 
 
 @pytest.mark.parametrize(("worth", "enough"), [(3.0, False), (5.9, False), (6.1, True)])
-def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others(worth: float, enough: bool) -> None:
+def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others(worth, enough):
     triple, sets = of(NAMES, TRIPLE), sets_of(pairs(worth))
     assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
     assert bool(sets.superfluous(triple)) != enough
@@ -68,16 +68,14 @@ def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others
 
 
 @pytest.mark.parametrize(("scattered", "worth"), [(2, 5.5), (0, 11.0)])
-def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely_in_its_own_size(
-    scattered: int, worth: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely_in_its_own_size(scattered, worth, monkeypatch):
     monkeypatch.setattr(selection, "robust_ratio", lambda _, names: 2.0 if NAMES[scattered] in names else 1.0)
     triple, sets = of(NAMES, TRIPLE, inflation=4.0), sets_of(pairs(11.0))
     assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
     assert bool(sets.superfluous(triple)) == (worth < 6)
 
 
-def test_a_member_that_is_tried_in_many_shapes_is_asked_for_its_own_threshold() -> None:
+def test_a_member_that_is_tried_in_many_shapes_is_asked_for_its_own_threshold():
     triple = of(NAMES, TRIPLE)
     assert not sets_of(pairs(6.5), {"tail_friction": 6.4}).superfluous(triple)
     assert sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple).facts["required"] == 6.6
@@ -94,9 +92,7 @@ def test_a_member_that_is_tried_in_many_shapes_is_asked_for_its_own_threshold() 
         (5.1, "air_drag", True),
     ],
 )
-def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(
-    gain: float, scattered: str, better: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(gain, scattered, better, monkeypatch):
     """And by twice as much where the size that it adds scatters twice as widely, not another."""
     monkeypatch.setattr(selection, "robust_ratio", lambda _, names: 2.0 if scattered in names else 1.0)
     sets = sets_of([of(NAMES[:1], TRIPLE - 50), of(NAMES[1:2], TRIPLE - 60)], {NAMES[1]: 5.0})
@@ -104,7 +100,7 @@ def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(
     assert sets.is_better(of(NAMES[:2], TRIPLE - 50 + gain**2 / 2, inflation=inflation)) == better
 
 
-def test_sizes_of_several_vines_are_as_many_degrees_of_freedom() -> None:
+def test_sizes_of_several_vines_are_as_many_degrees_of_freedom():
     names = (*NAMES[:2], "film_mass")
     numbers = tuple(SimpleNamespace(key=key) for key in ("film_mass.eps",) * 3 + ("leak.rate", "air_drag.C_D"))
     triple = of(names, TRIPLE, numbers=numbers)
@@ -118,7 +114,7 @@ def test_sizes_of_several_vines_are_as_many_degrees_of_freedom() -> None:
 
 @pytest.mark.parametrize("delta_chi2", [30.0, 600.0, 1420.0, 1500.0, 4e4])
 @pytest.mark.parametrize("degrees", [1, 2, 5])
-def test_significance_is_that_of_the_tail_however_far_out(delta_chi2: float, degrees: int) -> None:
+def test_significance_is_that_of_the_tail_however_far_out(delta_chi2, degrees):
     """Held against the logarithm of the tail probability where that has a closed form."""
     sigmas = in_sigmas(delta_chi2, degrees)
     if degrees == 1:
@@ -143,7 +139,7 @@ def refits_end_at(monkeypatch: pytest.MonkeyPatch, found: Mapping[frozenset[str]
     monkeypatch.setattr(selection, "likelihood_ratio", ratio)
 
 
-def test_a_smaller_set_that_is_better_than_all_of_its_size_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_smaller_set_that_is_better_than_all_of_its_size_is_followed(monkeypatch):
     """Of the pairs one was known; the best comes of taking the first effect out of the three."""
     fits = {NAMES[1:]: TRIPLE - 2.0, (NAMES[0], NAMES[2]): TRIPLE - 90.0, NAMES[:2]: TRIPLE - 45.0}
     refits_end_at(monkeypatch, {frozenset(names): log_likelihood for names, log_likelihood in fits.items()})
@@ -155,9 +151,7 @@ def test_a_smaller_set_that_is_better_than_all_of_its_size_is_followed(monkeypat
 
 
 @pytest.mark.parametrize(("refit", "needed"), [(TRIPLE - 450.0, True), (TRIPLE - 2.0, False)])
-def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(
-    monkeypatch: pytest.MonkeyPatch, refit: float, needed: bool
-) -> None:
+def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(monkeypatch, refit, needed):
     """All pairs are known, 30 σ below the triple; the last one ends higher when it is fitted from the triple."""
     refits_end_at(monkeypatch, {frozenset(NAMES[:2]): refit})
     assert bool(sets_of(pairs(30.0)).superfluous(of(NAMES, TRIPLE))) != needed
@@ -180,17 +174,17 @@ def asked(*names: str, **how: bool) -> Diagnosis:
 
 
 @pytest.fixture(scope="module")
-def three_missing() -> Diagnosis:
+def three_missing():
     return asked(*CANDIDATES, ladder=False, advice=False)
 
 
 @pytest.fixture(scope="module")
-def one_not_asked() -> Diagnosis:
+def one_not_asked():
     return asked(*(name for name in CANDIDATES if name != "latch_release"))
 
 
 @pytest.mark.slow
-def test_three_effects_are_found_one_after_the_other(three_missing: Diagnosis) -> None:
+def test_three_effects_are_found_one_after_the_other(three_missing):
     assert three_missing.verdict == "missing"
     assert set(three_missing.effects) == {"reservoir_depletion", "tail_friction", "latch_release"}
     assert three_missing.final_verdict == "adequate"
@@ -206,9 +200,7 @@ def test_three_effects_are_found_one_after_the_other(three_missing: Diagnosis) -
 @pytest.mark.parametrize(
     ("gained", "named"), [(970.0, [("artefact", "lens")]), (930.0, [("missing", "latch_release")])]
 )
-def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like(
-    monkeypatch: pytest.MonkeyPatch, gained: float, named: list[tuple[str, str]]
-) -> None:
+def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like(monkeypatch, gained, named):
     """Measured: a lens with a fifth order was `latch_release`, with a lens beside it."""
     latch, lens = SimpleNamespace(name="latch_release", kind=""), SimpleNamespace(name="lens", kind="measurement")
     singles = [SimpleNamespace(names=(e.name,), delta_chi2=gain) for e, gain in ((latch, 900.0), (lens, gained))]
@@ -223,9 +215,7 @@ def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like
 
 
 @pytest.mark.slow
-def test_what_lacks_an_effect_that_is_not_asked_stays_unexplained_and_shows_partial_steps(
-    one_not_asked: Diagnosis,
-) -> None:
+def test_what_lacks_an_effect_that_is_not_asked_stays_unexplained_and_shows_partial_steps(one_not_asked):
     assert one_not_asked.verdict == "unexplained"
     assert one_not_asked.effects == one_not_asked.answer_set == ()
     assert one_not_asked.missing_force is not None

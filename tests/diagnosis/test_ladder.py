@@ -32,20 +32,18 @@ def hidden(seed: int, *effects: str) -> Pairs:
 
 
 @pytest.fixture(scope="module")
-def pairs() -> Pairs:
+def pairs():
     return hidden(31, DEPLETION)
 
 
 @pytest.fixture(scope="module")
-def fits(pairs: Pairs) -> tuple[Fit, Fit]:
+def fits(pairs):
     before = vt.fit(vt.base_model(), pairs, profile=False)
     return before, vt.refit(before, before.model + vt.effects.reservoir_depletion)
 
 
 @pytest.mark.slow
-def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(
-    fits: tuple[Fit, Fit], pairs: Pairs
-) -> None:
+def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(fits, pairs):
     table = ladder(fits, ["", DEPLETION])
     assert table["added"].tolist() == ["", DEPLETION]
     before, after = (table.iloc[k] for k in range(2))
@@ -61,7 +59,7 @@ def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(
 
 
 @pytest.mark.slow
-def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs: Pairs) -> None:
+def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs):
     """By hand: the model fitted anew to all other conditions, and laid on the one that was left out."""
     one_vine = [pair for pair in pairs if pair[0].name.startswith("R2")]
     found = vt.fit(vt.base_model(), one_vine, profile=False)
@@ -77,7 +75,7 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs:
     assert by_hand > 1.1 * in_sample(found).rms_m
 
 
-def test_in_sample_error_and_floor_are_those_of_the_comparison(fits: tuple[Fit, Fit], pairs: Pairs) -> None:
+def test_in_sample_error_and_floor_are_those_of_the_comparison(fits, pairs):
     table = compare(fits[0], pairs).table
     errors = in_sample(fits[0])
     assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
@@ -87,7 +85,7 @@ def test_in_sample_error_and_floor_are_those_of_the_comparison(fits: tuple[Fit, 
 
 
 @pytest.mark.slow
-def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(pairs: Pairs) -> None:
+def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(pairs):
     lower = [pair for pair in pairs if "R4_48" not in pair[0].name and pair[0].name.endswith("_1")]
     found = vt.fit(vt.base_model(), lower, profile=False)
     assert sorted(one.trial.name for one in left_out(found).trials) == sorted(trial.name for trial, _ in lower)
@@ -98,7 +96,7 @@ def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vi
 
 
 @pytest.mark.slow
-def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pairs) -> None:
+def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
     single = [pair for pair in pairs if pair[0].name.startswith("R2") or "_38kPa" in pair[0].name]
     found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, single, profile=False)
     table = ladder([found], [""])
@@ -112,9 +110,7 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pai
 
 
 @pytest.mark.slow
-def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(
-    fits: tuple[Fit, Fit], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(fits, monkeypatch):
     stuck = fits[0].trials[4].name
 
     def predicted(fit: Fit, data: Sequence[FitTrial], **told: bool) -> list[TrialFit]:
@@ -129,7 +125,7 @@ def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(
         assert math.isfinite(errors.rms_m)
 
 
-def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:
+def test_of_a_single_condition_nothing_can_be_left_out(pairs):
     found = vt.fit(vt.base_model(), pairs[:3], fixed=["n"], profile=False)
     table = ladder([found], [""])
     assert math.isfinite(table["rms_in_sample_m"].iloc[0])

@@ -63,7 +63,7 @@ ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
 
 
-def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_first_value() -> None:
+def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_first_value():
     directions, variances = covariance_modes(12, 0.4)
     covariance = (directions * variances) @ directions.T
     assert np.diag(covariance) == pytest.approx(np.ones(12))
@@ -76,7 +76,7 @@ def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_fir
 
 
 @pytest.mark.parametrize("knots", [np.linspace(0, 1, 18), np.array([0, 0.01, 0.05, 0.3, 0.5, 1.0])])
-def test_splines_equal_those_of_scipy(knots: np.ndarray) -> None:
+def test_splines_equal_those_of_scipy(knots):
     at = np.concatenate([np.random.default_rng(6).uniform(-0.2, 1.2, 300), knots])
     ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
     expected = BSpline.design_matrix(np.clip(at, 0, 1), ends, 3).toarray()
@@ -84,7 +84,7 @@ def test_splines_equal_those_of_scipy(knots: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_explains_the_misfit(tmp_path: Path) -> None:
+def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_explains_the_misfit(tmp_path):
     """Waves of decreasing length along the growth."""
     pairs = hidden_force(sheet((4,), replicates=2), 131, "waves", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
@@ -113,7 +113,7 @@ def seen(design: Floats, positions: Floats) -> CoefficientLikelihood:
     return CoefficientLikelihood(design.T @ design, design.T @ positions, float(positions @ positions), 0.0, 0.0)
 
 
-def test_marginal_likelihood_equals_that_of_the_normal_distribution() -> None:
+def test_marginal_likelihood_equals_that_of_the_normal_distribution():
     draw = np.random.default_rng(3)
     design = uniform_splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
@@ -138,7 +138,7 @@ def test_marginal_likelihood_equals_that_of_the_normal_distribution() -> None:
     assert choice.log_evidence + normal == pytest.approx(float(np.log(both)), abs=1e-6)
 
 
-def test_one_variable_and_two_have_equal_prior_odds() -> None:
+def test_one_variable_and_two_have_equal_prior_odds():
     design = uniform_splines(np.linspace(0, 1, 60), 12)
     choice = marginal_likelihood(GROWTH, seen(design, np.zeros(60)), 1.0, 2.0)
     single = replace(choice, log_evidence=0.0)
@@ -150,7 +150,7 @@ def test_one_variable_and_two_have_equal_prior_odds() -> None:
     assert weights["growth+speed"] == pytest.approx(0.25)
 
 
-def test_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters() -> None:
+def test_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters():
     """Each length scale and amplitude by the closed form for a normal prior, weighted by its likelihood."""
     draw = np.random.default_rng(11)
     design = uniform_splines(draw.uniform(0, 1, 40), 12)
@@ -180,7 +180,7 @@ def test_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters() -> 
 # The compiled variational equations against the same method in arrays, and against a closed form.
 
 
-def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium() -> None:
+def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     """ẍ = 1 − ω²x from rest: x = (1 − cos ωt)/ω²."""
     omega, time_s = 20.0, np.linspace(0, 0.3, 401)[None]
     moved, sped = integrate_responses(
@@ -193,7 +193,7 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium() 
 # Nonlinear fit of a force: its score against finite differences, and motions beyond the end of growth of the model.
 
 
-def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path: Path) -> None:
+def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
     tracks = slowed.tracks
@@ -228,7 +228,7 @@ def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
     return missing_force(vt.fit(vt.base_model(), pairs, profile=False), learn=False)
 
 
-def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_condition(tmp_path: Path) -> None:
+def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_condition(tmp_path):
     patch = laws_of(tmp_path, "patch", -0.4, 91)
     best = patch.laws.iloc[0]
     assert best["law"] == "patch"
@@ -246,7 +246,7 @@ def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_conditio
 
 
 @pytest.mark.slow
-def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> None:
+def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path):
     best = laws_of(tmp_path, "ripple", -0.5, 92).laws.iloc[0]
     assert best["law"] == "periodic"
     assert float(best["words"].split("every ")[1].split(" mm")[0]) == pytest.approx(60, abs=1)
@@ -254,14 +254,14 @@ def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_friction_that_falls_with_speed_is_identified(tmp_path: Path) -> None:
+def test_a_friction_that_falls_with_speed_is_identified(tmp_path):
     found = laws_of(tmp_path, "stribeck", -1.5, 93)
     assert found.laws["law"].iloc[0] in ("falling_with_speed", "inverse_speed")
     assert found.laws["amplitude_N"].iloc[0] < 0
     assert found.depends_on["speed"] > 0.9
 
 
-def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path: Path) -> None:
+def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
     """With a much tighter integrator tolerance than usual, because a narrow force lies between its usual steps."""
     model = vt.base_model() + vt.effects.reservoir_depletion
     virtual = grown(sheet(payloads_g=(0.0, 20.0), replicates=1), 98, ["reservoir_depletion"])
@@ -313,7 +313,7 @@ def learned(domain: Domain, seed: int) -> LearnedForce:
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)
-def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(domain: Domain, tmp_path: Path) -> None:
+def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(domain, tmp_path):
     force = learned(domain, 4)
     path = tmp_path / f"{table_name(force)}.py"
     path.write_text(table_text(force, "From 24 trials of a bench."), encoding="utf-8")
@@ -359,7 +359,7 @@ LAWS = [
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
-def test_the_effect_file_of_a_law_reproduces_the_law(law: Law, tmp_path: Path) -> None:
+def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
     path = tmp_path / f"proposed_{law.name}.py"
     seen = RankedLaw(law, ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1), 0.0)
     path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
@@ -369,7 +369,7 @@ def test_the_effect_file_of_a_law_reproduces_the_law(law: Law, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path: Path) -> None:
+def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path):
     pairs = hidden_force(sheet((4,)), 101, "growing", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     best = proposal.tied[0]
@@ -380,7 +380,7 @@ def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditio
 
 
 @pytest.mark.slow
-def test_nothing_is_proposed_where_nothing_is_missing() -> None:
+def test_nothing_is_proposed_where_nothing_is_missing():
     proposal = propose(vt.base_model(), pairs_of(grown(sheet((4,)), 102)), lambda _: None)
     assert not proposal.tied
     assert np.isfinite(proposal.rms_left_out_m)

@@ -72,7 +72,7 @@ def shown(fits: Sequence[Fit], pairs: Pairs) -> float:
 
 
 @pytest.fixture(scope="module")
-def dragged() -> tuple[Pairs, list[Fit]]:
+def dragged():
     tube = campaign(Vine(24.0, 200.0, 280.0), (14, 20, 28, 38), 6)
     trials = with_names([replace(trial, chamber_m3=3.7e-3, inlet_m=8e-3) for trial in tube])
     pairs = grown(list(trials), 4001)
@@ -82,13 +82,11 @@ def dragged() -> tuple[Pairs, list[Fit]]:
 
 
 @pytest.fixture(scope="module")
-def advised(dragged: tuple[Pairs, list[Fit]]) -> NextExperiment:
+def advised(dragged):
     return next_experiment(dragged[1])
 
 
-def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_without_a_new_vine(
-    advised: NextExperiment,
-) -> None:
+def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_without_a_new_vine(advised):
     assert not any(trial["new_vine"] for trial in advised.trials)
     assert {trial["inlet_mm"] for trial in advised.trials} - {8.0}
     assert sum(trial["replicates"] for trial in advised.trials) == 4
@@ -98,18 +96,14 @@ def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_witho
     assert sigma == pytest.approx(mean, rel=0.2)
 
 
-def test_the_predicted_separation_agrees_with_that_of_the_trials_once_made(
-    dragged: tuple[Pairs, list[Fit]], advised: NextExperiment
-) -> None:
+def test_the_predicted_separation_agrees_with_that_of_the_trials_once_made(dragged, advised):
     pairs, fits = dragged
     new = grown(as_trials(advised, pairs[0][0]), 4101)
     predicted = advised.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
-def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(
-    dragged: tuple[Pairs, list[Fit]],
-) -> None:
+def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(dragged):
     pairs, fits = dragged
     found = next_experiment(fits, Limits(inlet_mm=(8.0,), trials=5))
     assert any(trial["new_vine"] for trial in found.trials)
@@ -119,7 +113,7 @@ def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
-def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_trials_respect_every_limit(dragged):
     limits = Limits(
         trials=3, pressure_kPa=(10.0, 30.0), payload_g=(0.0, 0.0), diameter_mm=(18.0, 24.0),
         thickness_um=(120.0, 200.0), inlet_mm=(5.0, 8.0), chamber_l=(3.7,), hoop_stress_MPa=1.6,
@@ -138,7 +132,7 @@ def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
     assert sum(entry["replicates"] for entry in found.trials) == 3
 
 
-def test_tied_measurement_errors_call_for_a_measurement_instead_of_trials(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_tied_measurement_errors_call_for_a_measurement_instead_of_trials(dragged):
     found = next_experiment(fits_of(dragged[0], "length_scale", "time_base"))
     assert found.trials == ()
     assert (found.advice.code, found.advice.facts["faults"]) == ("measure_first", ["length_scale", "time_base"])

@@ -108,12 +108,12 @@ def both_act() -> Pairs:
 
 
 @pytest.fixture(scope="module")
-def after() -> MisfitTests:
+def after():
     """The model with the inlet loss alone, fitted to trials that have drag too, held against all other effects."""
     return questioned(both_act(), vt.base_model() + vt.effects.inlet_loss, FALSE_ALARM_LEVEL_LATER_ROUNDS)
 
 
-def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after: MisfitTests) -> None:
+def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after):
     place = after.ranked_shapes("air_drag")[0]
     k = next(k for k, number in enumerate(after.fit.numbers) if number.key == INLET)
     lever = float(levers_of(after.fit, after.products)[k, place])
@@ -125,7 +125,7 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after: 
     assert fell == pytest.approx(lever * drag, rel=0.1)
 
 
-def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth(after: MisfitTests) -> None:
+def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth(after):
     by_effect = {one.effect: one for one in confounders_of(after, ["inlet_loss"])}
     # Linear damping takes the same sign of the force, fold inertia the other: found in refits with either held.
     linear, fold = by_effect["linear_damping"], by_effect["fold_inertia"]
@@ -137,9 +137,7 @@ def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth
 
 
 @pytest.mark.parametrize(("estimate", "sigma"), [(0.3, 0.2), (-0.5, 0.4), (2.0, 5.0)])
-def test_what_trajectories_and_plausibility_say_of_a_size_is_the_posterior_by_quadrature(
-    estimate: float, sigma: float
-) -> None:
+def test_what_trajectories_and_plausibility_say_of_a_size_is_the_posterior_by_quadrature(estimate, sigma):
     parameter = Parameter("C", "C", "1", 1.0, bounds=(0.0, math.inf), plausible=(0.0, 2.0))
 
     def density(size: float) -> float:
@@ -153,7 +151,7 @@ def test_what_trajectories_and_plausibility_say_of_a_size_is_the_posterior_by_qu
     assert quad(density, 0, limit)[0] / whole == pytest.approx(0.95, abs=1e-6)
 
 
-def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour() -> None:
+def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour():
     parameter = Parameter("e", "ε", "1", 0.0, plausible=(-0.1, 0.1))
     precision = 1 / 0.02**2 + (1.959964 / 0.1) ** 2
     for estimate in (0.03, -0.03):
@@ -165,9 +163,7 @@ def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour() 
 # A fit is tested with sensitivities past the end of growth or, where they cannot be computed, with its last ones.
 
 
-def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_columns(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_columns(monkeypatch):
     fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False, thorough=False)
     before = fit_columns(fit)
 

@@ -34,7 +34,7 @@ def grown(name: str, kPa: float, seed: int, diameter_mm: float = 12.0) -> tuple[
 
 
 @pytest.fixture(scope="module")
-def campaign() -> list[tuple[Trial, Track]]:
+def campaign():
     return [grown(f"t{k}", kPa, 20000 + k) for k, kPa in enumerate(PRESSURES_KPA)]
 
 
@@ -75,7 +75,7 @@ def test_a_diagnosis_without_a_cause_names_the_row(campaign):
 
 
 @pytest.fixture(scope="module")
-def adequate(campaign) -> Diagnosis:
+def adequate(campaign):
     return diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
 
 

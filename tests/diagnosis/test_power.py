@@ -30,7 +30,7 @@ from vinetrack.diagnosis.linear_power import (
     score_ratio,
 )
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, Power, Rate
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.experiment.settings import Limits
 from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
@@ -60,12 +60,12 @@ def with_trials(design: CampaignDesign, added: Sequence[Trial]) -> CampaignDesig
 
 
 @pytest.fixture(scope="module")
-def six() -> MisfitTests:
+def six():
     return planned_tests(planned(2))[0]
 
 
 @pytest.fixture(scope="module")
-def power(six: MisfitTests) -> Power:
+def power(six):
     return power_of(six)
 
 
@@ -73,7 +73,7 @@ def place_of(questions: MisfitTests, name: str) -> int:
     return questions.sensitivities.effects.index(name)
 
 
-def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed() -> None:
+def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
     noise_m = 1e-3
     design = replace(planned(2), cameras=(FilmingPlan(500.0, noise_m),) * 6)
     promised = planned_tests(design)[0].fit
@@ -84,7 +84,7 @@ def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed() -> No
     assert precisions[0] == pytest.approx(precisions[1], rel=0.5)
 
 
-def test_detectable_sizes_follow_the_normal_distribution(six: MisfitTests, power: Power) -> None:
+def test_detectable_sizes_follow_the_normal_distribution(six, power):
     assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold  # without noise there is no alarm
     # Fewer trials than a scatter can be told from: only the noise model decides.
     sigma = six.scores.plain_sigma[place_of(six, "tail_friction")]
@@ -96,7 +96,7 @@ def test_detectable_sizes_follow_the_normal_distribution(six: MisfitTests, power
 
 
 @pytest.mark.slow
-def test_four_times_the_trials_halve_the_detectable_size(power: Power) -> None:
+def test_four_times_the_trials_halve_the_detectable_size(power):
     # Where scatter of trials alone is in the way, and positions are known as good as exactly.
     few = power_of(planned_tests(planned(4))[0])["leak"].size_at(0.5)
     many = power_of(planned_tests(planned(16))[0])["leak"].size_at(0.5)
@@ -104,16 +104,14 @@ def test_four_times_the_trials_halve_the_detectable_size(power: Power) -> None:
     assert power["leak"].size_at(0.5) > few
 
 
-def test_two_equivalent_effects_are_confused_with_each_other() -> None:
+def test_two_equivalent_effects_are_confused_with_each_other():
     # A diameter and a pressure that are off by a part act alike but for the film's mass.
     power = power_of(planned_tests(replace(planned(2), candidates=("area_scale", "pressure_gain")))[0])
     assert "pressure_gain" in power["area_scale"].taken_for
     assert "area_scale" in power["pressure_gain"].taken_for
 
 
-def test_a_small_effect_has_the_score_of_linear_theory_and_leaves_what_a_refit_without_it_leaves(
-    six: MisfitTests, power: Power
-) -> None:
+def test_a_small_effect_has_the_score_of_linear_theory_and_leaves_what_a_refit_without_it_leaves(six, power):
     k, start, size = place_of(six, "leak"), noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
     assert score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
     moved_m = size * residual_displacements(six.fit, six.products)[k]
@@ -122,13 +120,13 @@ def test_a_small_effect_has_the_score_of_linear_theory_and_leaves_what_a_refit_w
     assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
 
 
-def test_power_is_unchanged_by_writing_and_reading(power: Power) -> None:
+def test_power_is_unchanged_by_writing_and_reading(power):
     again = Power.from_json(json.loads(json.dumps(power.to_json())))
     assert again == power
     assert again.to_json() == power.to_json()
 
 
-def test_probabilities_invert_sizes() -> None:
+def test_probabilities_invert_sizes():
     sizes = tuple(1 + 0.1 * norm.ppf(PROBABILITIES))
     entry = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
     for probability in (0.1, 0.5, 0.9):
@@ -136,7 +134,7 @@ def test_probabilities_invert_sizes() -> None:
     assert (entry.probability_at(0.1), entry.probability_at(3.0)) == (0.0, 1.0)
 
 
-def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate() -> None:
+def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate():
     answers = [
         SimulatedDiagnosis("leak", "missing", ("leak",)),
         SimulatedDiagnosis("leak", "ambiguous", ("supply_refill", "leak")),
@@ -152,13 +150,13 @@ def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate()
 
 
 @pytest.mark.slow
-def test_a_simulated_campaign_is_diagnosed_with_its_effect() -> None:
+def test_a_simulated_campaign_is_diagnosed_with_its_effect():
     found = simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", (0.02,), 3)
     assert found.failed == ""
     assert found.is_found
 
 
-def test_the_design_of_a_fit_records_as_long_as_its_trials() -> None:
+def test_the_design_of_a_fit_records_as_long_as_its_trials():
     questions, _ = planned_tests(planned(1))
     design = design_of_fit(questions.fit)
     for camera, trial in zip(design.cameras, questions.fit.trials, strict=True):
@@ -173,21 +171,21 @@ LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def few() -> CampaignDesign:
+def few():
     return planned(2, pressures=("14", "24"), candidates=("air_drag", "tail_friction", "leak"))
 
 
 @pytest.fixture(scope="module")
-def few_power(few: CampaignDesign) -> Power:
+def few_power(few):
     return power_of(planned_tests(few)[0], nonlinear=True)
 
 
 @pytest.fixture(scope="module")
-def further(few: CampaignDesign, few_power: Power) -> FurtherTrials:
+def further(few, few_power):
     return further_trials(few, few_power["leak"], 0.6 * few_power["leak"].size_at(0.9), 0.9, LIMITS)
 
 
-def test_the_power_of_a_plan_is_that_of_a_sheet_with_its_trials(few: CampaignDesign, further: FurtherTrials) -> None:
+def test_the_power_of_a_plan_is_that_of_a_sheet_with_its_trials(few, further):
     assert further.before < 0.9 <= further.after
     made = with_trials(few, [added.trial for added in further.trials])
     again = effect_power(planned_tests(made)[0], "leak")
@@ -195,7 +193,7 @@ def test_the_power_of_a_plan_is_that_of_a_sheet_with_its_trials(few: CampaignDes
     assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
 
 
-def test_trials_stay_within_the_limits_come_in_pairs_and_are_no_more_than_needed(further: FurtherTrials) -> None:
+def test_trials_stay_within_the_limits_come_in_pairs_and_are_no_more_than_needed(further):
     fewer = [added.probability for added in further.trials if added.probability < further.target]
     assert len(fewer) == len(further.trials) - 2
     pressures = [added.trial.pressure_Pa for added in further.trials]
@@ -204,9 +202,7 @@ def test_trials_stay_within_the_limits_come_in_pairs_and_are_no_more_than_needed
     assert all(count % 2 == 0 for count in np.unique(pressures, return_counts=True)[1])
 
 
-def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_reported(
-    few: CampaignDesign, few_power: Power
-) -> None:
+def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_reported(few, few_power):
     enough = further_trials(few, few_power["leak"], 1.5 * few_power["leak"].size_at(0.98), 0.9, LIMITS)
     assert enough.trials == ()
     never = further_trials(few, few_power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
@@ -231,7 +227,7 @@ def sizes_with(design: CampaignDesign, settings: list[tuple[float, float]]) -> n
 
 
 @pytest.mark.slow
-def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promised() -> None:
+def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promised():
     """After three trials of one vine at each of two pressures, through a connector that is always the same."""
     design = planned(3, (0.005, 0.02), ("14", "24"), NAMES, chamber_l="3.7", inlet_mm="8")
     found = exploratory_trials(design, power_of(planned_tests(design)[0], nonlinear=True), CONNECTOR_LIMITS)
@@ -247,7 +243,7 @@ def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promise
     assert recommended[2] < 1e-3 * found.now["leak"].largest
 
 
-def test_information_apart_from_the_most_similar_rival() -> None:
+def test_information_apart_from_the_most_similar_rival():
     alone, apart = _alone_and_distinct(np.array([[[4.0, 2.0, 1.0], [2.0, 5.0, 0.0], [1.0, 0.0, 0.5]]]))
     assert alone.tolist() == [[4.0, 5.0, 0.5]]
     assert apart[0] == pytest.approx([4 - 1 / 0.5, 5 - 4 / 4, 0.5 - 1 / 4])

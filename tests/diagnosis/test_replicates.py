@@ -134,7 +134,7 @@ def errors_of(*trials: TrialFit) -> dict[str, float]:
     return position_errors(trials, replicates_of(trials))
 
 
-def test_the_error_of_position_is_that_of_the_growth_and_trials_count_alike() -> None:
+def test_the_error_of_position_is_that_of_the_growth_and_trials_count_alike():
     # 100 moving frames off by 3 mm, and the frame of the release itself: √(100/101) · 3 mm.
     for rest in (10, 500):
         assert errors_of(by_hand("a", 3e-3, rest=rest))["rms_position_m"] == pytest.approx(3e-3 * np.sqrt(100 / 101))
@@ -142,12 +142,12 @@ def test_the_error_of_position_is_that_of_the_growth_and_trials_count_alike() ->
     assert error == pytest.approx(np.sqrt((1e-6 * 400 / 401 + 9e-6 * 40 / 41) / 2))
 
 
-def test_one_trial_has_no_floor() -> None:
+def test_one_trial_has_no_floor():
     assert np.isnan([errors_of(by_hand("a", 1e-3))[name] for name in ("replicate_floor_m", "ratio")]).all()
 
 
 @pytest.mark.parametrize("n_trials", [2, 3, 5])
-def test_the_floor_is_the_scatter_of_single_trials_for_any_number_of_them(n_trials: int) -> None:
+def test_the_floor_is_the_scatter_of_single_trials_for_any_number_of_them(n_trials):
     draw = np.random.default_rng(11)
     floors = [
         errors_of(*(by_hand(f"t{i}", 1e-3 * draw.standard_normal(400), end_s=0.4) for i in range(n_trials)))
@@ -158,7 +158,7 @@ def test_the_floor_is_the_scatter_of_single_trials_for_any_number_of_them(n_tria
     assert found_m == pytest.approx(1e-3, rel=0.025)
 
 
-def test_the_band_is_that_of_the_replicates() -> None:
+def test_the_band_is_that_of_the_replicates():
     trials = [by_hand("a", np.full(100, 1e-3)), by_hand("b", np.full(100, -1e-3))]
     table = trajectory_table(trials, replicates_of(trials))
     last = table[table["trial"] == "a"].iloc[-1]
@@ -168,7 +168,7 @@ def test_the_band_is_that_of_the_replicates() -> None:
 
 
 @pytest.mark.slow
-def test_a_model_that_lacks_nothing_stands_at_the_floor() -> None:
+def test_a_model_that_lacks_nothing_stands_at_the_floor():
     """Two vines, four pressures, four replicates that scatter; the model is the one they were grown with."""
     pairs, _ = small_campaign(seed=11, replicates=4)
     true_model = vt.compare(vt.fit(vt.base_model(), pairs, profile=False))
@@ -182,7 +182,7 @@ def test_a_model_that_lacks_nothing_stands_at_the_floor() -> None:
     assert {(trial.pressure_deviation, trial.damping_deviation) for trial in true_model.trials} == {(0.0, 0.0)}
 
 
-def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model() -> None:
+def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model():
     draw = np.random.default_rng(12)
     trial = replace(vine_trial("a", 28.0, payload_kg=0.0356), vine="v", condition="c")
     track, *_ = filmed(trial, draw)

@@ -74,13 +74,13 @@ def questioned(
 
 
 @pytest.mark.parametrize("scatter", [1.0, 3.0])
-def test_scores_are_as_large_as_they_say_however_much_trials_scatter(scatter: float) -> None:
+def test_scores_are_as_large_as_they_say_however_much_trials_scatter(scatter):
     draw = np.random.default_rng(20600)
     z = np.concatenate([scores(draw, 20, 4, scatter).z for _ in range(300)])
     assert 0.8 < np.std(z) < 1.15
 
 
-def test_a_size_explains_its_own_part_of_how_trials_scatter() -> None:
+def test_a_size_explains_its_own_part_of_how_trials_scatter():
     draw = np.random.default_rng(20601)
     campaigns = [scores(draw, 24, 3, sizes=[8.0, 0.0, 0.0]) for _ in range(100)]
     assert np.median([one.robust_sigma[0] / one.plain_sigma[0] for one in campaigns]) < 1.3
@@ -88,7 +88,7 @@ def test_a_size_explains_its_own_part_of_how_trials_scatter() -> None:
 
 
 @pytest.mark.parametrize("scatter", [1.0, 3.0])
-def test_the_best_of_all_candidates_is_a_false_alarm_in_one_campaign_of_a_hundred_at_most(scatter: float) -> None:
+def test_the_best_of_all_candidates_is_a_false_alarm_in_one_campaign_of_a_hundred_at_most(scatter):
     draw = np.random.default_rng(20602)
     campaigns = [questioned(scores(draw, 12, 4, scatter)) for _ in range(2000)]
     # Their cosines are all near 0: one family of thresholds serves them all.
@@ -96,7 +96,7 @@ def test_the_best_of_all_candidates_is_a_false_alarm_in_one_campaign_of_a_hundre
     assert alarms <= 20
 
 
-def test_a_candidate_of_many_shapes_is_no_more_often_a_false_alarm_than_all_should_be_together() -> None:
+def test_a_candidate_of_many_shapes_is_no_more_often_a_false_alarm_than_all_should_be_together():
     draw = np.random.default_rng(20604)
     named = ("of_many",) * 20 + ("of_one",)
     campaigns = [questioned(scores(draw, 24, 21), level=0.02, effects=named) for _ in range(500)]
@@ -105,7 +105,7 @@ def test_a_candidate_of_many_shapes_is_no_more_often_a_false_alarm_than_all_shou
 
 
 @pytest.mark.parametrize(("trials", "probes", "scatter"), [(24, 8, 1.0), (24, 8, 3.0), (6, 12, 1.0)])
-def test_probes_of_nothing_find_structure_as_often_as_they_say(trials: int, probes: int, scatter: float) -> None:
+def test_probes_of_nothing_find_structure_as_often_as_they_say(trials, probes, scatter):
     draw = np.random.default_rng(20604)
     found = [structure_from_scores(scores(draw, trials, probes, scatter)) for _ in range(400)]
     assert np.mean([one.p < 0.05 for one in found]) < 0.09
@@ -114,14 +114,14 @@ def test_probes_of_nothing_find_structure_as_often_as_they_say(trials: int, prob
         assert np.mean([one.p < 0.2 for one in found]) > 0.05
 
 
-def test_six_trials_hear_a_force_of_thirty_standard_errors_that_one_probe_feels() -> None:
+def test_six_trials_hear_a_force_of_thirty_standard_errors_that_one_probe_feels():
     draw, level = np.random.default_rng(9), 0.1 * FALSE_ALARM_LEVEL_LATER_ROUNDS
     loud = [structure_from_scores(scores(draw, 6, 12, sizes=[30 / math.sqrt(6), *[0] * 11])) for _ in range(40)]
     assert all(one.p < level and one.smallest_probe_p < level for one in loud)
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["all feel a little", "one feels alone"])
-def test_the_sum_over_probes_and_the_loudest_each_hear_what_the_other_misses(alone: bool) -> None:
+def test_the_sum_over_probes_and_the_loudest_each_hear_what_the_other_misses(alone):
     """At six standard errors in one of 24 the sum hears one campaign in eight, the smallest_probe_p six of seven."""
     draw, heard = np.random.default_rng(20606 if alone else 20605), []
     sizes = [6.0, *[0] * 23] if alone else 3.0 * np.resize([1, -1], 24)
@@ -134,9 +134,7 @@ def test_the_sum_over_probes_and_the_loudest_each_hear_what_the_other_misses(alo
     assert np.mean(heard) > 0.6
 
 
-def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselves(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselves(monkeypatch):
     of = scores(np.random.default_rng(20607), 12, 2)
     chance = {"between_conditions_p": 1.0, "noise_in_motion_p": 1.0}
     for name in chance:
@@ -163,8 +161,8 @@ def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselve
     ids=["slow errors of a film", "noise alone", "an unknown lens", "more than either", "within the noise"],
 )
 def test_a_misfit_no_larger_than_the_slow_errors_of_tracks_is_not_far_off(
-    chi2: float, residual_m: float, slow: bool, systematic_m: float, exceeds: bool
-) -> None:
+    chi2, residual_m, slow, systematic_m, exceeds
+):
     """Of 100 mm of growth. Nothing is then sought beyond a model that passes: 14 s instead of 71 for 24 films."""
     seen = {"lead_position_m": np.array([0.0, 0.1]), "slow_m": 0.0 if slow else None, "trace": None}
     track = SimpleNamespace(position_systematic_m=systematic_m, **seen)
@@ -173,7 +171,7 @@ def test_a_misfit_no_larger_than_the_slow_errors_of_tracks_is_not_far_off(
     assert misfit_tests.exceeds_slow_errors(fit) == exceeds
 
 
-def test_scores_that_a_specimen_shares_count_once() -> None:
+def test_scores_that_a_specimen_shares_count_once():
     """Ten specimens of four trials each, whose scores are the same, tell as much as ten trials."""
     draw = np.random.default_rng(8)
     groups = [f"tube {k // 4}" for k in range(40)]
@@ -187,7 +185,7 @@ def test_scores_that_a_specimen_shares_count_once() -> None:
 
 
 @pytest.mark.parametrize(("trials", "scatter", "least"), [(12, 0.0, 0.92), (8, 5.0, 0.92)])
-def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials: int, scatter: float, least: float) -> None:
+def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter, least):
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
     friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, cast(Any, None)
@@ -206,7 +204,7 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials: int, sc
     assert least < np.mean(held) < 0.99
 
 
-def test_systematic_errors_that_imitate_a_shape_are_integrated_out() -> None:
+def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
     together = scores(np.random.default_rng(20609), 12, 5)
     turn = _marginalisation(together.information, 3)
@@ -232,7 +230,7 @@ def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> Like
 
 
 @pytest.mark.parametrize(("inflation", "names"), [(1.0, ["air_drag"]), (4.0, ["air_drag", "inlet_loss"])])
-def test_hypotheses_are_excluded_by_less_where_trials_scatter_more(inflation: float, names: list[str]) -> None:
+def test_hypotheses_are_excluded_by_less_where_trials_scatter_more(inflation, names):
     both = [hypothesis("air_drag", -100.0, inflation), hypothesis("inlet_loss", -110.0)]
     assert [one.label for one in answer_set(both)[0]] == names
     weights = weights_of(both)
@@ -240,7 +238,7 @@ def test_hypotheses_are_excluded_by_less_where_trials_scatter_more(inflation: fl
 
 
 @pytest.mark.parametrize(("values", "named"), [([0.5], True), ([2.0], False), ([0.5, 2.0], False), ([0.5, 0.4], True)])
-def test_a_size_smaller_than_its_error_in_every_vine_is_compatible_with_none(values: list[float], named: bool) -> None:
+def test_a_size_smaller_than_its_error_in_every_vine_is_compatible_with_none(values, named):
     numbers = (Number("air_drag.C_D", "", "C_D", "1", v, 0.8, v - 1.6, v + 1.6, math.inf, "linear") for v in values)
     found = likelihood_ratio(known_fit(-120.0), [vt.effects.air_drag], known_fit(-100.0, tuple(numbers)))
     assert (found.reason.code == "size_may_be_zero") == named
@@ -248,9 +246,7 @@ def test_a_size_smaller_than_its_error_in_every_vine_is_compatible_with_none(val
 
 
 @pytest.mark.parametrize(("ratio", "inflation"), [(0.5, 1.0), (2.0, 4.0), (3.0, 9.0)])
-def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(
-    ratio: float, inflation: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(ratio, inflation, monkeypatch):
     """What trials scatter more than the noise says is taken off; as a variance it counts six times at most."""
     drag = Number("air_drag.C_D", "", "C_D", "1", 1.0, 0.1, 0.8, 1.2, math.inf, "linear")
     after = known_fit(-100.0, (drag,))
@@ -290,15 +286,13 @@ def alike_within() -> np.ndarray:
     ],
     ids=["of either sign", "of one sign", "Šidák's share", "the same curve counts once", "the silent take no share"],
 )
-def test_thresholds_are_quantiles_of_the_normal(
-    cosines: np.ndarray, names: str, level: float, sign: int, share: float
-) -> None:
+def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, share):
     family = family_test(cosines, [sign] * len(names), list(names), level)
     assert family.threshold("a") == pytest.approx(norm.isf(share), abs=0.01)
 
 
 @pytest.mark.slow
-def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share() -> None:
+def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share():
     """Against two million draws from another generator."""
     cosines, level = alike_within(), 3e-3
     family = family_test(cosines, SIGNS, NAMES, level)
@@ -319,9 +313,7 @@ def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share(
 
 
 @pytest.mark.parametrize(("bound", "adapting"), [(math.nan, [0, 1]), (0.0, [0])])
-def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_adapt(
-    monkeypatch: pytest.MonkeyPatch, bound: float, adapting: list[int]
-) -> None:
+def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_adapt(monkeypatch, bound, adapting):
     draw = np.random.default_rng(5)
     n = 60
     columns = draw.standard_normal((n, 4))  # two parameters, the residual, one effect
@@ -370,7 +362,7 @@ def fitted(value: float, sigma: float) -> Any:
 
 
 @pytest.mark.parametrize(("value", "sigma"), [(300.0, 200.0), (7.1e3, 1.7e3), (-1.5e3, 30.0)])
-def test_the_marginal_likelihood_is_the_integral_over_the_prior(value: float, sigma: float) -> None:
+def test_the_marginal_likelihood_is_the_integral_over_the_prior(value, sigma):
     def inside(delta: float) -> float:
         return math.exp(-10 - 0.5 * ((delta - value) / sigma) ** 2) * norm.pdf(delta, 0.0, 1e3)
 
@@ -378,20 +370,20 @@ def test_the_marginal_likelihood_is_the_integral_over_the_prior(value: float, si
     assert log_evidence(fitted(value, sigma), {"g.delta": GAUGE}) == pytest.approx(math.log(whole), abs=1e-6)
 
 
-def test_a_gauge_seven_kilopascals_off_is_a_surprise_and_one_within_two_is_none() -> None:
+def test_a_gauge_seven_kilopascals_off_is_a_surprise_and_one_within_two_is_none():
     # z² = 7.1² / (1.7² + 1²) = 12.96 with a prior of 1 kPa; less 4 at the edge of the plausible range.
     assert prior_penalty(fitted(7.1e3, 1.7e3), {"g.delta": GAUGE}) == pytest.approx(12.96 - 4, abs=0.01)
     assert prior_penalty(fitted(1.9e3, 100.0), {"g.delta": GAUGE}) == 0
     assert prior_penalty(fitted(7.1e3, 5e3), {"g.delta": GAUGE}) == 0
 
 
-def test_a_number_of_which_the_data_say_nothing_costs_nothing_and_weights_follow_the_evidence() -> None:
+def test_a_number_of_which_the_data_say_nothing_costs_nothing_and_weights_follow_the_evidence():
     assert log_evidence(fitted(0.0, 1e7), {"g.delta": GAUGE}) == pytest.approx(-10, abs=1e-6)
     assert posterior_weights([-10.0, -10.0 - math.log(3), -800.0]) == pytest.approx([0.75, 0.25, 0.0])
     assert posterior_weights([]) == []
 
 
-def test_any_phase_of_a_swing_is_plausible() -> None:
+def test_any_phase_of_a_swing_is_plausible():
     """A phase of −3.67 rad is one of 2.61."""
     of = {parameter.name: parameter for parameter in catalogue()["supply_pulsation"].parameters}
     assert all(is_plausible(of["phi"], phase_rad, 0.0) for phase_rad in (-3.67, 6.9, 3.0))

@@ -56,18 +56,18 @@ def wandering(*, at_rest: bool) -> Pairs:
     return spoilt
 
 
-def test_replicates_that_deviate_together_are_seen() -> None:
+def test_replicates_that_deviate_together_are_seen():
     assert between_conditions_p(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
 
 
 @pytest.mark.slow
-def test_replicates_that_scatter_and_noise_that_is_the_same_at_rest_are_none() -> None:
+def test_replicates_that_scatter_and_noise_that_is_the_same_at_rest_are_none():
     complete = [fitted(grown(seed=seed)) for seed in (32, 33, 34)]
     assert all(between_conditions_p(fit) > 0.05 for fit in complete)
     assert all(noise_in_motion_p(fit) > 1e-2 for fit in [*complete, fitted(wandering(at_rest=True))])
 
 
-def test_a_scatter_that_replicates_have_too_is_none_of_the_model() -> None:
+def test_a_scatter_that_replicates_have_too_is_none_of_the_model():
     """Tubes of which no two are alike scatter as a model does that bends each trial, but not by condition."""
     trials = with_names(campaign(isometric_vine(4), (14, 17, 20, 24, 28, 33), 2, prefix="a"))
     loose = fitted(of_another_film({}, 0.08, trials))
@@ -78,14 +78,14 @@ def test_a_scatter_that_replicates_have_too_is_none_of_the_model() -> None:
 
 
 @pytest.mark.parametrize("replicate", [0, 1])
-def test_without_replicates_a_scatter_may_be_that_of_the_model(replicate: int) -> None:
+def test_without_replicates_a_scatter_may_be_that_of_the_model(replicate):
     fit = fitted(of_another_film({}, 0.08)[replicate::2])
     assert len({trial.trial.condition for trial in fit.trials}) == len(fit.trials)
     assert fit.state.spread[1] > CAREFUL_DAMPING_SCATTER
     assert has_excess_scatter(fit)
 
 
-def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model() -> None:
+def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model():
     """Two in a hundred between conditions are significant among fifty replicates each, and no reason to search."""
     fit = fitted(of_another_film({}, 0.08, with_names(campaign(isometric_vine(4), (14, 17, 20, 24, 28, 33), 2))))
     draw = np.random.default_rng(20750)
@@ -96,7 +96,7 @@ def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model()
     assert not has_excess_scatter(replace(fit, trials=tuple(trials)))
 
 
-def test_what_is_louder_in_motion_than_at_rest_is_heard_where_positions_do_not_come_from_a_film() -> None:
+def test_what_is_louder_in_motion_than_at_rest_is_heard_where_positions_do_not_come_from_a_film():
     spoilt = wandering(at_rest=False)
     assert noise_in_motion_p(fitted(spoilt)) < 1e-5
     filmed = [
@@ -107,7 +107,7 @@ def test_what_is_louder_in_motion_than_at_rest_is_heard_where_positions_do_not_c
 
 
 @pytest.mark.parametrize(("heavy", "most"), [(False, 0.02), (True, 0.04)])
-def test_heavy_tails_alone_are_not_louder_in_motion(heavy: bool, most: float) -> None:
+def test_heavy_tails_alone_are_not_louder_in_motion(heavy, most):
     """600 campaigns in which nothing differs: few alarms at 1 %, also where single stretches are far louder."""
     draw, alarms = np.random.default_rng(20732), 0
     for _ in range(600):

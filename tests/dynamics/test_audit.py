@@ -11,7 +11,7 @@ from by_hand import LOADED
 
 from vinetrack.core.records import Bend, Kinematics, Trial
 from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, measured_motion
-from vinetrack.dynamics.model import Model, base_model
+from vinetrack.dynamics.model import base_model
 from vinetrack.dynamics.simulate import simulate
 
 A = math.pi * 24e-3**2 / 4
@@ -33,7 +33,7 @@ def row(found: Audit, term: str) -> pd.Series:
     return rows.iloc[0]
 
 
-def test_terms_by_hand() -> None:
+def test_terms_by_hand():
     motion = steady(trial())
     found = audit(BASE, [motion])
     # ¼ × 1.2 × A × 1 × 2² over ½ × 28000 × A = 1.2/14000
@@ -68,9 +68,7 @@ def test_terms_by_hand() -> None:
     ],
     ids=["in the model", "in the measured pressure"],
 )
-def test_what_is_in_the_model_or_the_measured_pressure_is_not_audited(
-    model: Model, pressure: np.ndarray | None, absent: set[str]
-) -> None:
+def test_what_is_in_the_model_or_the_measured_pressure_is_not_audited(model, pressure, absent):
     found = audit(model, [steady(trial(), pressure=pressure)])
     assert not absent & set(found.table["term"])
     assert "reservoir" not in {each.rule for each in found.violations}
@@ -91,13 +89,13 @@ def bent(degrees: float) -> tuple[Bend, Bend]:
     ],
     ids=["drag", "length", "bends", "reservoir"],
 )
-def test_each_rule_is_violated_beyond_its_limit(rule: str, kept: AuditedMotion, broken: AuditedMotion) -> None:
+def test_each_rule_is_violated_beyond_its_limit(rule, kept, broken):
     assert rule not in {each.rule for each in audit(BASE, [kept]).violations}
     assert rule in {each.rule for each in audit(BASE, [broken]).violations}
 
 
 @pytest.mark.parametrize(("P", "onset_s", "within_s"), [(7e3, 0.0, 4e-3), (14e3, 24e-3, 1e-3), (28e3, 145e-3, 2e-3)])
-def test_compression_in_the_tail_is_found(P: float, onset_s: float, within_s: float) -> None:
+def test_compression_in_the_tail_is_found(P, onset_s, within_s):
     of = trial(pressure_Pa=P)
     spread = np.linspace(0.0, 1.0, 200) ** 2
     times = simulate(BASE, of, 30.0 * spread).end_time_s * spread[:-1]
@@ -112,7 +110,7 @@ def test_compression_in_the_tail_is_found(P: float, onset_s: float, within_s: fl
     assert not any(violation.rule == "tension" for violation in free.violations)
 
 
-def test_a_measured_motion_starts_at_release_and_at_zero() -> None:
+def test_a_measured_motion_starts_at_release_and_at_zero():
     t = np.arange(10) * 0.01
     y = 0.5 + np.maximum(t - 0.03, 0.0)
     v = (t >= 0.03).astype(float)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -21,7 +20,7 @@ from vinetrack.dynamics.simulate import prepare, simulate_many
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue, load_effect, own_effects
 
 
-def test_removing_by_effect_or_by_name_removes_its_values() -> None:
+def test_removing_by_effect_or_by_name_removes_its_values():
     larger = (base_model() + effects.reservoir_depletion).with_values(
         {"reservoir_depletion.gamma": 1.2, "eversion_damping.B": 2.0}
     )
@@ -34,7 +33,7 @@ def test_removing_by_effect_or_by_name_removes_its_values() -> None:
             twice()
 
 
-def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine() -> None:
+def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine():
     assert base_model().parameter_names == ("gravity.g", "eversion_damping.B", "eversion_damping.n")
     assert base_model().parameters_for("any").tolist() == [9.81, 3.0, 0.37]
     model = base_model().with_values({"eversion_damping.n": 0.5})
@@ -44,7 +43,7 @@ def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine() ->
         model.parameters_for("other")
 
 
-def test_effects_of_size_zero_and_replaced_ones_do_not_act() -> None:
+def test_effects_of_size_zero_and_replaced_ones_do_not_act():
     model = base_model() + effects.reservoir_depletion + effects.supply_refill + effects.air_drag
     rows = np.array([model.parameters_for(""), model.with_values({"air_drag.C_D": 0.0}).parameters_for("")])
     acting = dict(zip(model.names, effects_on(model, rows).T.tolist(), strict=True))
@@ -52,7 +51,7 @@ def test_effects_of_size_zero_and_replaced_ones_do_not_act() -> None:
     assert acting == {**always, "air_drag": [True, False], "reservoir_depletion": [False, False]}
 
 
-def test_terms_along_a_motion_by_hand() -> None:
+def test_terms_along_a_motion_by_hand():
     """At y = 0.1 m and ẏ = 2 m/s, with B 6.44 and n 0.37, everything worked out on paper."""
     model = base_model().with_values({"eversion_damping.B": 6.44})
     terms = evaluate(model, LOADED.trial(), np.array([0.05]), np.array([0.1]), np.array([2.0]))
@@ -65,7 +64,7 @@ def test_terms_along_a_motion_by_hand() -> None:
     assert terms.acceleration_m_s2[0] == pytest.approx((sum(tip.values()) / 2 + mass * 9.81) / mass, rel=1e-12)
 
 
-def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp_path: Path) -> None:
+def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp_path):
     own = own_effects([write_effect(tmp_path)])
     named_as_another = load_effect(write_effect(tmp_path).rename(tmp_path / "air_drag.py"))
     assert named_as_another.name in catalogue()
@@ -74,7 +73,7 @@ def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp
         assert shared_host(several) is None
 
 
-def test_a_tail_that_may_go_slack_is_not_compiled_with_the_whole_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tail_that_may_go_slack_is_not_compiled_with_the_whole_catalogue(monkeypatch):
     asked: list[tuple[int, bool]] = []
 
     def noted(effects: tuple[Effect, ...], tail_free: bool) -> ModuleType:
@@ -88,7 +87,7 @@ def test_a_tail_that_may_go_slack_is_not_compiled_with_the_whole_catalogue(monke
     assert asked == [(len(catalogue()) + 1, False), (len(model.effects), True)]
 
 
-def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch):
     sizes = {"eversion_damping.B": 6.44, "eversion_damping.n": N, "reservoir_depletion.gamma": 1.3, "air_drag.C_D": 1.1}
     model: Model = (base_model() + "reservoir_depletion" + "air_drag").with_values(sizes)
     trials = [LOADED.trial(chamber_m3=3.7e-3), BARE.trial(chamber_m3=3.7e-3, growth_angle_rad=1.0)]

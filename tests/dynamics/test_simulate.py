@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ VINE = replace(LOADED, payload_kg=0.0)
 MODEL = base_model().with_values({"eversion_damping.B": HANGING.B, "eversion_damping.n": N})
 
 
-def test_a_dropped_ball_falls_half_g_t_squared() -> None:
+def test_a_dropped_ball_falls_half_g_t_squared():
     ball = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
     times_s = np.linspace(0, 2, 41)
     found = simulate(make_model(["gravity"]), ball, times_s)
@@ -44,7 +43,7 @@ def test_a_dropped_ball_falls_half_g_t_squared() -> None:
     ],
     ids=["n 0.2", "n 0.6", "n 1", "n 1.7", "upward", "small", "near yield"],
 )
-def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial: Trial, B: float, n: float, rel: float) -> None:
+def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial, B, n, rel):
     area, film = math.pi * trial.diameter_m**2 / 4, 1200 * math.pi * trial.diameter_m * trial.thickness_m
     gas = (trial.pressure_Pa + ATM) / RT_AIR * area * trial.length_m
     floor = film * math.pi * trial.thickness_m + gas / 4
@@ -67,13 +66,13 @@ def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial: Trial, B:
     assert found.end_lead_velocity_m_s == pytest.approx(truth.state(end)[1] / 2, rel=1e-3)  # type: ignore[attr-defined]
 
 
-def test_the_result_does_not_depend_on_the_requested_times() -> None:
+def test_the_result_does_not_depend_on_the_requested_times():
     many = simulate(MODEL, VINE, np.linspace(0, 0.5, 501))
     few = simulate(MODEL, VINE, np.array([0.1, 0.25, 0.5]))
     np.testing.assert_allclose(few.lead_position_m, many.lead_position_m[[100, 250, 500]], rtol=0, atol=1e-9)
 
 
-def test_many_at_once_agree_with_each_alone() -> None:
+def test_many_at_once_agree_with_each_alone():
     trials = [VINE, LOADED, replace(VINE, pressure_Pa=3.1e3)]
     times = [np.linspace(0, t, 20) for t in (0.3, 0.5, 2.0)]
     traces = [None, (np.array([0.0, 1.0]), np.array([14e3, 10e3])), None]
@@ -102,7 +101,7 @@ def breakpoints(rig):
 '''
 
 
-def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path: Path) -> None:
+def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path):
     """A ball that falls by g, and beyond 0.1 m is drawn on by k (y − 0.1 m): m z̈ = m g + k z."""
     (tmp_path / "band.py").write_text(BAND)
     model = make_model(["gravity"]) + effects.load_effect(tmp_path / "band.py")
@@ -164,7 +163,7 @@ def by_hand(
 
 
 @pytest.mark.parametrize("case", [7e3, 14e3, 28e3, "rubs", "chamber"])
-def test_the_tip_follows_its_own_law_while_the_payload_falls(case: float | str) -> None:
+def test_the_tip_follows_its_own_law_while_the_payload_falls(case):
     # Effects at no size: one compiled model for all cases.
     sizes = {"payload_friction.mu_p": 0.0, "supply_refill.tau": 0.0, "supply_refill.gamma": 0.0}
     P, trace, tau, down, mu, last_s, expected = 20e3, None, 0.5, 1.0, 0.0, 0.15, 1
@@ -188,7 +187,7 @@ def test_the_tip_follows_its_own_law_while_the_payload_falls(case: float | str) 
     np.testing.assert_allclose(got.lead_position_m, np.minimum(truth, L), rtol=0, atol=1e-5 * min(truth[-1], L))
 
 
-def test_below_the_yield_pressure_the_payload_falls_and_the_tip_stays() -> None:
+def test_below_the_yield_pressure_the_payload_falls_and_the_tip_stays():
     trial = HANGING.trial(pressure_Pa=2e3, tail_slack="free")
     got = simulate(MODEL, trial, np.linspace(0, 0.2, 20))
     assert got.slack_from_s == 0.0
@@ -198,7 +197,7 @@ def test_below_the_yield_pressure_the_payload_falls_and_the_tip_stays() -> None:
     assert simulate(MODEL, taut, np.linspace(0, 0.2, 20)).lead_position_m[-1] > 1e-5
 
 
-def test_a_slack_phase_that_fails_states_the_time() -> None:
+def test_a_slack_phase_that_fails_states_the_time():
     """No step meets a tolerance of nothing: the tail goes slack at release and gets no further."""
     trial = HANGING.trial(pressure_Pa=7e3, tail_slack="free")
     with pytest.raises(SimulationError):

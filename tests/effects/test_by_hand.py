@@ -14,7 +14,7 @@ from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import make_model
 
 
-def test_capstan_friction_as_printed_is_a_constant() -> None:
+def test_capstan_friction_as_printed_is_a_constant():
     vine = LOADED
 
     def acceleration(_t: float, x: float, v: float) -> float:
@@ -28,7 +28,7 @@ def test_capstan_friction_as_printed_is_a_constant() -> None:
     assert_same_motion(vine, sizes, acceleration, share=0.45, bends=bends, mass_loss="as_printed")
 
 
-def test_gauge_then_chamber_then_leak_then_inlet_then_stretch() -> None:
+def test_gauge_then_chamber_then_leak_then_inlet_then_stretch():
     vine = LOADED
     sizes = {"pressure_gain.eps": 0.02, "pressure_gauge.delta": 700.0, "leak.rate": 2.0, "inlet_loss.K": 1.5}
     sizes |= {"wall_stretch.kappa": 4e-6, "supply_refill.tau": 0.05, "supply_refill.gamma": 1.4}
@@ -55,7 +55,7 @@ def test_gauge_then_chamber_then_leak_then_inlet_then_stretch() -> None:
     assert_same_motion(vine, sizes, acceleration, chamber=(P_0, rate))
 
 
-def test_the_order_in_which_a_model_is_put_together_does_not_matter() -> None:
+def test_the_order_in_which_a_model_is_put_together_does_not_matter():
     names = ["inlet_loss", "leak", "wall_stretch", "reservoir_depletion", "pressure_gauge", "pressure_gain"]
     base = ["pressure_drive", "gravity", "eversion_damping", "yield_pressure"]
     motion = (np.linspace(0, 0.1, 30), np.linspace(0, 0.25, 30), np.linspace(0, 3, 30))
@@ -66,7 +66,7 @@ def test_the_order_in_which_a_model_is_put_together_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("name", ["reservoir_depletion.gamma", "leak.rate", "supply_refill.tau"])
-def test_a_measured_pressure_already_holds_what_happens_in_the_chamber(name: str) -> None:
+def test_a_measured_pressure_already_holds_what_happens_in_the_chamber(name):
     times = np.linspace(0, 0.15, 50)
     trace = (np.array([0.0, 0.1, 0.2]), np.array([28e3, 24e3, 25e3]))
     plain = simulated(LOADED, {}, times, trace).lead_position_m
@@ -108,7 +108,7 @@ def by_hand(times: np.ndarray) -> tuple[np.ndarray, list[tuple[float, float]]]:
     return y, moving
 
 
-def test_stick_and_slip_under_a_pressure_that_rises_and_falls() -> None:
+def test_stick_and_slip_under_a_pressure_that_rises_and_falls():
     times = np.linspace(0, 1.0, 501)
     truth, moving = by_hand(times)
     got = simulated(LEVEL, {"static_yield.P_s": P_S}, times, UP_AND_DOWN)
@@ -122,7 +122,7 @@ def test_stick_and_slip_under_a_pressure_that_rises_and_falls() -> None:
 TIMES = np.linspace(0, 0.15, 50)
 
 
-def test_below_p_s_it_never_starts_and_released_above_it_leaves_no_trace() -> None:
+def test_below_p_s_it_never_starts_and_released_above_it_leaves_no_trace():
     got = simulated(LEVEL, {"static_yield.P_s": 30e3}, TIMES)
     assert got.status == "stalled"
     assert np.all(got.lead_position_m == 0)
@@ -135,7 +135,7 @@ FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
 
 
 @pytest.mark.parametrize("first", [{"perspective.k": 0.2}, {"tail_stretch.compliance": 5e-8}], ids=["lens", "stretch"])
-def test_the_scale_stretches_last(first: dict[str, float]) -> None:
+def test_the_scale_stretches_last(first):
     seen = simulated(LOADED, first, TIMES).observed_position_m
     got = simulated(LOADED, {**first, "length_scale.eps": 0.05}, TIMES).observed_position_m
     np.testing.assert_allclose(got, 1.05 * seen, rtol=1e-12)
@@ -143,18 +143,18 @@ def test_the_scale_stretches_last(first: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("delta", [6e-3, -20e-3], ids=["more", "less"])
 @pytest.mark.parametrize("vine", [LOADED, LEVEL], ids=["hangs", "level"])
-def test_a_payload_that_weighs_other_than_stated(vine: Vine, delta: float) -> None:
+def test_a_payload_that_weighs_other_than_stated(vine, delta):
     """Such as a mount that was not weighed; less by far more than all of the film weighs, too."""
     true = Vine(**{**vine.__dict__, "payload": vine.payload + delta})
     assert_same_motion(vine, {"payload_mass.delta": delta}, lambda _t, x, v: true.base(x, v) / true.m(x))
 
 
 @pytest.mark.parametrize(("stated", "true"), [(LEVEL, LOADED), (LOADED, LEVEL)], ids=["hangs", "level"])
-def test_a_growth_angle_counted_from_the_level_has_the_weight_of_the_other_direction(stated: Vine, true: Vine) -> None:
+def test_a_growth_angle_counted_from_the_level_has_the_weight_of_the_other_direction(stated, true):
     assert_same_motion(stated, {"growth_angle.f": 1.0}, lambda _t, x, v: true.base(x, v) / true.m(x))
 
 
-def test_a_lens_bends_about_the_middle_of_the_picture() -> None:
+def test_a_lens_bends_about_the_middle_of_the_picture():
     plain = simulated(LOADED, {}, TIMES).lead_position_m
     got = simulated(LOADED, {"lens.k3": -0.7, "lens.y_c": 0.1}, TIMES).observed_position_m
     np.testing.assert_allclose(got, plain - 0.7 * ((plain - 0.1) ** 3 + 0.1**3), rtol=1e-12)
@@ -163,9 +163,7 @@ def test_a_lens_bends_about_the_middle_of_the_picture() -> None:
 @pytest.mark.parametrize("phase_s", [0.0, 2.1e-4, 4.9e-4])
 @pytest.mark.parametrize("delay", [1.5e-3, -1.5e-3, 1e-6])
 @pytest.mark.parametrize("vine", [LOADED, FAST], ids=["2 m/s", "60 m/s"])
-def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read(
-    vine: Vine, delay: float, phase_s: float
-) -> None:
+def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read(vine, delay, phase_s):
     fine = np.linspace(-0.01, 0.3, 400_001)
     ended = simulated(vine, {}, fine)
     y = ended.lead_position_m
@@ -177,7 +175,7 @@ def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read(
 
 
 @pytest.mark.parametrize("delay", [1.5e-3, -1.5e-3])
-def test_a_rolling_shutter_reads_what_the_lens_bends(delay: float) -> None:
+def test_a_rolling_shutter_reads_what_the_lens_bends(delay):
     lens = {"lens.k3": -0.7, "lens.y_c": 0.1}
     fine = np.linspace(-0.01, 0.1, 200_001)
     bent = simulated(LOADED, lens, fine).observed_position_m
@@ -190,7 +188,7 @@ def test_a_rolling_shutter_reads_what_the_lens_bends(delay: float) -> None:
 @pytest.mark.parametrize("phase_s", [0.0, 2.1e-4])
 @pytest.mark.parametrize("over_s", [5e-4, 4.8e-3])
 @pytest.mark.parametrize("vine", [LOADED, FAST], ids=["2 m/s", "60 m/s"])
-def test_a_moving_average_reports_the_mean_about_every_instant(vine: Vine, over_s: float, phase_s: float) -> None:
+def test_a_moving_average_reports_the_mean_about_every_instant(vine, over_s, phase_s):
     fine = np.linspace(-0.02, 0.3, 640_001)
     ended = simulated(vine, {}, fine)
     y = ended.lead_position_m
@@ -202,7 +200,7 @@ def test_a_moving_average_reports_the_mean_about_every_instant(vine: Vine, over_
     assert np.max(np.abs(got - np.interp(times, fine, y))) > 20 * over_s**2  # a ÿ of 500 m/s², or the release
 
 
-def test_a_supply_that_rises_starts_the_vine_once_it_overcomes_the_yield_pressure() -> None:
+def test_a_supply_that_rises_starts_the_vine_once_it_overcomes_the_yield_pressure():
     vine, tau = LEVEL, 8e-3
 
     def acceleration(t: float, x: float, v: float) -> float:
@@ -217,7 +215,7 @@ def test_a_supply_that_rises_starts_the_vine_once_it_overcomes_the_yield_pressur
     assert simulated(vine, {}, times).lead_position_m[20] > got[20] + 5e-3
 
 
-def test_the_clock_of_a_trace_shifts_the_pressure_that_drives() -> None:
+def test_the_clock_of_a_trace_shifts_the_pressure_that_drives():
     delay, clock, pressure = 4e-3, np.array([0.0, 5e-3, 0.02, 0.3]), np.array([0.0, 0.0, 28e3, 28e3])
     late = simulated(LOADED, {}, TIMES, (clock + delay, pressure)).lead_position_m
     got = simulated(LOADED, {"trace_clock.delta": delay}, TIMES, (clock, pressure)).observed_position_m

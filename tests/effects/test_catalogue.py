@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import vinetrack.effects as effects
-from vinetrack.effects import BASE_EFFECTS, Effect, State, catalogue, find_effect, load_effect
+from vinetrack.effects import BASE_EFFECTS, State, catalogue, find_effect, load_effect
 from vinetrack.effects._catalogue import _RIG, _STATE
 
 FOLDER = Path(effects.__file__).parent
@@ -20,13 +20,13 @@ PARAMETERS = [(effect, parameter) for effect in ALL for parameter in effect.para
 each_effect = pytest.mark.parametrize("effect", ALL, ids=lambda effect: effect.name)
 
 
-def test_the_folder_is_the_catalogue_with_the_base_first() -> None:
+def test_the_folder_is_the_catalogue_with_the_base_first():
     assert set(catalogue()) == {path.stem for path in FILES}
     assert tuple(catalogue())[:4] == BASE_EFFECTS
 
 
 @each_effect
-def test_a_file_names_describes_and_works_out_its_effect(effect: Effect) -> None:
+def test_a_file_names_describes_and_works_out_its_effect(effect):
     assert effect.name == effect.path.stem
     assert getattr(effects, effect.name) == effect == find_effect(effect.name)
     assert all((effect.summary, effect.formula, "Source:" in effect.text))
@@ -43,7 +43,7 @@ def test_a_file_names_describes_and_works_out_its_effect(effect: Effect) -> None
 
 
 @pytest.mark.parametrize(("effect", "parameter"), PARAMETERS, ids=[f"{e.name}-{p.name}" for e, p in PARAMETERS])
-def test_parameters_have_symbol_unit_meaning_and_bounds_that_hold_the_default(effect: Effect, parameter) -> None:
+def test_parameters_have_symbol_unit_meaning_and_bounds_that_hold_the_default(effect, parameter):
     assert effect.parameters.count(parameter) == 1
     assert all((parameter.symbol, parameter.unit, parameter.meaning))
     low, high = parameter.bounds
@@ -55,7 +55,7 @@ def test_parameters_have_symbol_unit_meaning_and_bounds_that_hold_the_default(ef
 
 
 @each_effect
-def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect: Effect) -> None:
+def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect):
     sizes = [parameter.default for parameter in effect.parameters]
     factors = np.array([0.5, 1.0, 1.7])
     rows = State(*(np.asarray(value * factors) for value in _STATE))
@@ -67,7 +67,7 @@ def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect: E
         assert np.isfinite(float(hook(rest, _RIG, *sizes)))
 
 
-def test_effects_are_told_apart_by_name_and_file(tmp_path: Path) -> None:
+def test_effects_are_told_apart_by_name_and_file(tmp_path):
     twin = tmp_path / "gravity.py"
     twin.write_text((FOLDER / "gravity.py").read_text())
     assert {load_effect(FOLDER / "gravity.py")} == {effects.gravity}

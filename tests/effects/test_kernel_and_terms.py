@@ -53,7 +53,7 @@ def accelerations(
 @pytest.mark.slow
 @pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])
 @pytest.mark.parametrize("name", [*catalogue(), "all"])
-def test_each_effect_and_all_together(name: str, vine: Vine) -> None:
+def test_each_effect_and_all_together(name, vine):
     every = [other for other, effect in catalogue().items() if effect.kind != "base" and other != "supply_refill"]
     names = every if name == "all" else [name]
     # A payload that weighs far less than stated: nothing is taken from the film.
@@ -80,7 +80,7 @@ print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist()
 
 
 @pytest.mark.slow
-def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_path: Path) -> None:
+def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_path):
     copy, cache = tmp_path / "elsewhere", tmp_path / "cache"
     shutil.copytree(PACKAGE, copy / "vinetrack", ignore=shutil.ignore_patterns("__pycache__"))
     said, compiled = [], []
@@ -100,7 +100,7 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
 
 
 @pytest.mark.parametrize("tau", [1e-4, 0.02, 1.0])
-def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau: float) -> None:
+def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau):
     sizes = {"supply_refill.tau": tau, "supply_refill.gamma": 1.4, "eversion_damping.B": LOADED.B}
     model = whole_catalogue(sizes)
     times = np.linspace(0, 0.15, 1501)
@@ -113,7 +113,7 @@ def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau: flo
     assert np.max(np.abs((slope - rate)[5:-5])) < 2e-3 * np.max(np.abs(1.4 * 129e3 * A * ydot / 3.7e-3))
 
 
-def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice() -> None:
+def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice():
     # At the end a bare vine's moving mass is its fold, λπt, and a quarter of the gas ρ_gas A L; nothing on top of it.
     vine, rest = BARE, np.zeros(1)
     model = whole_catalogue({"gas_inertia.factor": 1.0})
@@ -143,7 +143,7 @@ def mixture(seed: int) -> tuple[Vine, dict[str, float]]:
     return vine, sizes
 
 
-def test_the_usual_tolerance_gives_what_a_thousandth_of_it_gives() -> None:
+def test_the_usual_tolerance_gives_what_a_thousandth_of_it_gives():
     for seed in range(60):
         vine, sizes = mixture(seed)
         model = whole_catalogue(sizes)
@@ -153,7 +153,7 @@ def test_the_usual_tolerance_gives_what_a_thousandth_of_it_gives() -> None:
         assert np.max(np.abs(usual - exact)) <= 1e-5 * max(exact[-1], 0.1 * vine.L), seed
 
 
-def test_a_vine_that_stops_and_creeps_on_is_nowhere_else_meanwhile() -> None:
+def test_a_vine_that_stops_and_creeps_on_is_nowhere_else_meanwhile():
     # Seed 1025: friction brings it to rest between two frames while the drive exceeds what holds it by a hair.
     vine, sizes = mixture(1025)
     found = simulate(whole_catalogue(sizes), vine.trial(), TIMES).lead_position_m

@@ -7,7 +7,6 @@ It lives in `benchmarks/hidden` and shares no code with the model; what it makes
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,7 +89,7 @@ def test_a_force_of_no_catalogue_is_the_one_that_scoring_knows(name):
     np.testing.assert_allclose(other[seen, 1], theirs[seen], atol=2e-6 if name == "changed_film" else 1e-7)
 
 
-def test_a_campaign_written_to_a_folder_is_read_back(tmp_path: Path):
+def test_a_campaign_written_to_a_folder_is_read_back(tmp_path):
     campaign = make("bends:capstan_friction", 903)
     write_folder(campaign, tmp_path)
     experiment = vt.read_experiment(tmp_path)

@@ -49,7 +49,7 @@ def written(folder: Path, text: str = BRUSH, name: str = "brush.py") -> Path:
     return path
 
 
-def test_it_is_simulated_like_any_other(tmp_path: Path) -> None:
+def test_it_is_simulated_like_any_other(tmp_path):
     brush = own_effects([written(tmp_path)])
     model = make_model([*base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
     travel = followed(lambda _t, x, v: (LOADED.base(x, v) - 0.8 * max(x, 0.0) ** 0.5) / LOADED.m(x), 1.8 * LOADED.L)
@@ -65,7 +65,7 @@ def copies(folder: Path, text: str) -> list[Effect]:
     return [own_effects([written(folder / name, text)])["brush"] for name in "ab"]
 
 
-def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(tmp_path: Path) -> None:
+def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(tmp_path):
     one, other = copies(tmp_path, BRUSH)
     assert kernel((base_model() + one).effects) is kernel((base_model() + other).effects)
     for effect, name in ((one, "a"), (other, "b")):
@@ -76,7 +76,7 @@ def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(
 @pytest.mark.parametrize(
     "line", ["from pathlib import Path", "import brushes", "from .brushes import q", "PLACE = __file__"]
 )
-def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path: Path, line: str) -> None:
+def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path, line):
     """A table or a module beside a file may be another beside its copy."""
     assert _is_independent_of_path(BRUSH.encode())
     assert not _is_independent_of_path(f"{BRUSH}\n{line}\n".encode())
@@ -85,7 +85,7 @@ def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path: Path, line: 
         assert kernel((base_model() + one).effects) is not kernel((base_model() + other).effects)
 
 
-def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path, monkeypatch):
     """The numbers of a module are constants of the compiled form: an old form would go on with the old ones."""
     monkeypatch.syspath_prepend(tmp_path)
     grips, table = tmp_path / "brush_grips.py", tmp_path / "brush_table.py"
@@ -130,7 +130,7 @@ def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeyp
         ('Parameter("q", "q", "N/√m", 0.8, bounds=(0.0, 10.0), meaning="grip of the bristles"),', "3,"),
     ],
 )
-def test_a_file_that_is_no_effect_is_refused_in_one_line_that_names_it(tmp_path: Path, old: str, new: str) -> None:
+def test_a_file_that_is_no_effect_is_refused_in_one_line_that_names_it(tmp_path, old, new):
     assert old in BRUSH
     path = written(tmp_path, BRUSH.replace(old, new))
     with pytest.raises(EffectError) as caught:
@@ -138,7 +138,7 @@ def test_a_file_that_is_no_effect_is_refused_in_one_line_that_names_it(tmp_path:
     assert str(caught.value).startswith(str(path))
 
 
-def test_capitals_missing_files_and_two_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_capitals_missing_files_and_two_of_one_name_are_refused(tmp_path):
     paths = [effect.path for effect in copies(tmp_path, BRUSH)]
     for refused in ([written(tmp_path, name="Brush.py")], [tmp_path / "brush.py"], paths):
         with pytest.raises(EffectError):
@@ -146,11 +146,11 @@ def test_capitals_missing_files_and_two_of_one_name_are_refused(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", catalogue())
-def test_the_catalogue_passes_what_is_asked_of_a_users_own(name: str) -> None:
+def test_the_catalogue_passes_what_is_asked_of_a_users_own(name):
     assert list(behaviour_faults(catalogue()[name])) == []
 
 
-def test_the_command_lists_it_and_draws_the_effects_of_the_catalogue(tmp_path: Path) -> None:
+def test_the_command_lists_it_and_draws_the_effects_of_the_catalogue(tmp_path):
     def run(*arguments: object) -> Result:
         return CliRunner().invoke(app, ["effects", *map(str, arguments)], catch_exceptions=False)
 
@@ -169,21 +169,19 @@ def test_the_command_lists_it_and_draws_the_effects_of_the_catalogue(tmp_path: P
     assert not {"drag.doc", "all.png"} & {path.name for path in tmp_path.iterdir()}
 
 
-def test_effects_of_one_name_are_read_again_when_their_file_changes(tmp_path: Path) -> None:
+def test_effects_of_one_name_are_read_again_when_their_file_changes(tmp_path):
     first = load_effect(written(tmp_path))
     second = load_effect(written(tmp_path, BRUSH.replace("0.8, bounds", "0.9, bounds")))
     assert (first.parameters[0].default, second.parameters[0].default) == (0.8, 0.9)
 
 
 @pytest.fixture
-def effect_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def effect_file(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     return Path(shutil.copy(air_drag.path, tmp_path / "wake.py"))
 
 
-def test_it_is_named_with_its_hash_before_it_runs_and_remembered_until_it_changes(
-    effect_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_named_with_its_hash_before_it_runs_and_remembered_until_it_changes(effect_file, capsys):
     load_effect(effect_file)
     told = capsys.readouterr().err
     load_effect(effect_file)
@@ -196,7 +194,7 @@ def test_it_is_named_with_its_hash_before_it_runs_and_remembered_until_it_change
     assert str(effect_file) in capsys.readouterr().err
 
 
-def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
     assert load_effect(effect_file).name == "wake"  # a home that cannot be written stops nothing
     monkeypatch.setenv("VINETRACK_OWN_EFFECTS", "known")

@@ -26,7 +26,7 @@ Campaign = tuple[Fit, list[tuple[Trial, Track]], list[dict[str, float]]]
 
 
 @pytest.fixture(scope="module")
-def campaign() -> Campaign:
+def campaign():
     """Sixteen trials; B scatters by 3 %, P by 1 %, noise 0.1 mm with ρ = 0.4."""
     pairs, truth = small_campaign(seed=3, rho=0.4)
     return vt.fit(vt.base_model(), pairs), pairs, truth
@@ -42,7 +42,7 @@ def ball(seed: int, first_frame: int = 0, count: int = 120) -> tuple[Trial, Trac
     return trial, as_track(time_s, 0.02 + fallen + 2e-4 * draw.standard_normal(count))
 
 
-def test_the_numbers_of_a_campaign_are_estimated_within_their_errors(campaign: Campaign) -> None:
+def test_the_numbers_of_a_campaign_are_estimated_within_their_errors(campaign):
     fit, pairs, truth = campaign
     known = {f"B[{t.vine}]": B_TRUE[round(t.diameter_m * 1e3, 3)] for t, _ in pairs} | {"n": N_TRUE}
     numbers = {name: fit[name if name == "n" else f"eversion_damping.{name}"] for name in known}
@@ -63,7 +63,7 @@ def test_the_numbers_of_a_campaign_are_estimated_within_their_errors(campaign: C
     assert fit.spreads["pressure"].value < 0.02
 
 
-def test_noise_and_its_correlation_are_estimated_and_whitened_away(campaign: Campaign) -> None:
+def test_noise_and_its_correlation_are_estimated_and_whitened_away(campaign):
     fit = campaign[0]
     assert fit.noise_m == pytest.approx(NOISE_M, rel=0.05)
     assert fit.noise_correlation == pytest.approx(0.4, abs=0.03)
@@ -74,7 +74,7 @@ def test_noise_and_its_correlation_are_estimated_and_whitened_away(campaign: Cam
     assert abs(neighbours) < 0.03
 
 
-def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign: Campaign) -> None:
+def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign):
     fit, pairs, _ = campaign
     trial = replace(pairs[2][0], name="left_out", pressure_Pa=19e3)
     track, release_s, origin_m = filmed(trial, np.random.default_rng(8))
@@ -87,7 +87,7 @@ def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign:
     assert found.rms_m < 4e-3
 
 
-def test_positions_without_any_noise_are_predicted_like_others(campaign: Campaign) -> None:
+def test_positions_without_any_noise_are_predicted_like_others(campaign):
     data = campaign[0].predictor.data[:2]
     exact = [replace(trial_data, noise_m=0.0) for trial_data in data]
     others = predict_prepared(campaign[0], data, from_rest=True)
@@ -96,14 +96,14 @@ def test_positions_without_any_noise_are_predicted_like_others(campaign: Campaig
         assert found.release_s == pytest.approx(other.release_s, abs=1e-4)
 
 
-def test_a_refit_stays_at_the_solution_or_comes_back_to_it(campaign: Campaign) -> None:
+def test_a_refit_stays_at_the_solution_or_comes_back_to_it(campaign):
     again = vt.refit(campaign[0])
     assert again.log_likelihood == pytest.approx(campaign[0].log_likelihood, abs=0.05)
     assert again.iterations <= 3
     assert vt.refit(campaign[0], afresh=True).log_likelihood == pytest.approx(campaign[0].log_likelihood, abs=0.3)
 
 
-def test_a_fixed_parameter_stays_and_the_likelihood_falls(campaign: Campaign) -> None:
+def test_a_fixed_parameter_stays_and_the_likelihood_falls(campaign):
     fit = campaign[0]
     held = vt.refit(fit, start={"eversion_damping.n": fit["n"].value + 3 * fit["n"].sigma}, fixed=("n",))
     assert [number.key for number in held.numbers if number.symbol == "n"] == []
@@ -111,13 +111,13 @@ def test_a_fixed_parameter_stays_and_the_likelihood_falls(campaign: Campaign) ->
     assert 2 * (fit.log_likelihood - held.log_likelihood) == pytest.approx(9, rel=0.3)
 
 
-def test_one_B_for_all_vines_if_requested(campaign: Campaign) -> None:
+def test_one_B_for_all_vines_if_requested(campaign):
     shared = vt.fit(vt.base_model(), campaign[1][:8], shared={"B": "all"}, profile=False)
     assert [number.vine for number in shared.numbers if number.symbol == "B"] == [""]
     assert abs(shared["B"].value - B_TRUE[24.0]) < 3 * shared["B"].sigma
 
 
-def test_a_parameter_at_its_bound_has_an_interval_by_profile() -> None:
+def test_a_parameter_at_its_bound_has_an_interval_by_profile():
     """No chamber depletes, and the model lets it do so at least isothermally."""
     pairs = [(replace(t, chamber_m3=3.7e-3), track) for t, track in small_campaign(seed=5, replicates=1)[0]]
     gamma = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs)["gamma"]
@@ -125,7 +125,7 @@ def test_a_parameter_at_its_bound_has_an_interval_by_profile() -> None:
     assert (gamma.low, gamma.method) == (0.6, "profile")
 
 
-def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch):
     """Behind a lens, of which the profile knows nothing: it was three quarters as wide."""
     pairs = [(replace(t, position_systematic_m=1e-3), track) for t, track in small_campaign(seed=5, replicates=2)[0]]
     linear = vt.fit(vt.base_model(), pairs, profile=False)
@@ -137,7 +137,7 @@ def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch: 
     assert n.low < n.value < n.high
 
 
-def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campaign) -> None:
+def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign):
     # n is held too low, so that a drag is wanted; the fold's inertia acts the other way and stays at nothing.
     low = {"eversion_damping.n": N_TRUE - 0.06}
     plain = vt.fit(vt.base_model(), campaign[1], fixed=("n",), start=low, profile=False)
@@ -151,7 +151,7 @@ def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campai
     [([ball(1), ball(2)], 0.005), ([ball(3, first_frame=25, count=90)], math.inf)],
     ids=["from rest", "in flight"],
 )
-def test_a_falling_ball_gives_g(balls: list[tuple[Trial, Track]], most: float) -> None:
+def test_a_falling_ball_gives_g(balls, most):
     fit = vt.fit(vt.make_model(["gravity"]), balls, free=("g",))
     g = fit["g"]
     assert abs(g.value - 9.80665) < 3 * g.sigma
@@ -159,14 +159,14 @@ def test_a_falling_ball_gives_g(balls: list[tuple[Trial, Track]], most: float) -
     assert fit.trials[0].release_s == pytest.approx(0.0513, abs=4 * fit.trials[0].release_sigma_s)
 
 
-def test_a_parameter_without_influence_has_no_error() -> None:
+def test_a_parameter_without_influence_has_no_error():
     pairs, _ = small_campaign(seed=5, replicates=1)
     level = [(replace(trial, growth_angle_rad=math.pi / 2), track) for trial, track in pairs[:4]]
     fit = vt.fit(vt.base_model(), level, free=("g",))
     assert math.isinf(fit["g"].sigma)
 
 
-def test_missing_frames_begin_a_new_stretch_and_change_little(campaign: Campaign) -> None:
+def test_missing_frames_begin_a_new_stretch_and_change_little(campaign):
     fit, pairs, _ = campaign
     kept = [np.arange(track.time_s.size) % 50 != 37 for _, track in pairs]
     holed = [(t, as_track(x.time_s[k], x.lead_position_m[k])) for (t, x), k in zip(pairs, kept, strict=True)]
@@ -176,7 +176,7 @@ def test_missing_frames_begin_a_new_stretch_and_change_little(campaign: Campaign
     assert abs(again["n"].value - fit["n"].value) < fit["n"].sigma
 
 
-def test_points_flagged_unusable_are_not_used(campaign: Campaign) -> None:
+def test_points_flagged_unusable_are_not_used(campaign):
     fit, pairs, _ = campaign
     spoilt = []
     for trial, track in pairs:
@@ -187,7 +187,7 @@ def test_points_flagged_unusable_are_not_used(campaign: Campaign) -> None:
     assert abs(again["n"].value - fit["n"].value) < 0.3 * fit["n"].sigma
 
 
-def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept() -> None:
+def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept():
     trial = vine_trial("end", 22)
     time_s = np.arange(400) / FPS
     position = grown_position(trial, time_s - 0.02, B_TRUE[24.0])
@@ -202,7 +202,7 @@ def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept() -> Non
     assert np.count_nonzero(travel > 0.99 * trial.length_m) >= 5
 
 
-def test_a_measured_pressure_replaces_the_set_pressure() -> None:
+def test_a_measured_pressure_replaces_the_set_pressure():
     draw = np.random.default_rng(2)
     pairs = []
     for P in (14, 20, 28, 36):
@@ -215,14 +215,14 @@ def test_a_measured_pressure_replaces_the_set_pressure() -> None:
     assert fit["B"].value == pytest.approx(B_TRUE[24.0], rel=0.1)
 
 
-def test_too_few_trials_for_a_between_trial_standard_deviation_have_the_usual_one() -> None:
+def test_too_few_trials_for_a_between_trial_standard_deviation_have_the_usual_one():
     trial = replace(vine_trial("one", 22), vine="v")
     fit = vt.fit(vt.base_model(), [(trial, filmed(trial, np.random.default_rng(4))[0])], fixed=("n",))
     assert not fit.spreads["B"].estimated
     assert fit["B"].sigma / fit["B"].value > 0.03
 
 
-def test_trials_without_usable_motion_are_left_out_and_named(campaign: Campaign) -> None:
+def test_trials_without_usable_motion_are_left_out_and_named(campaign):
     """One that never moves, one that moves below its yield pressure, one with three usable points in motion of four."""
     pairs = campaign[1]
     still = as_track(np.arange(200) / FPS, NOISE_M * ar1(200, 0.0, np.random.default_rng(1)))
@@ -238,14 +238,14 @@ def test_trials_without_usable_motion_are_left_out_and_named(campaign: Campaign)
         vt.fit(vt.base_model(), odd[:1])
 
 
-def test_two_yield_pressures_stated_for_one_vine_are_two_parameters() -> None:
+def test_two_yield_pressures_stated_for_one_vine_are_two_parameters():
     pairs, _ = small_campaign(seed=5, replicates=1)
     four = [(replace(t, vine="v", yield_pressure_Pa=3e3 if k < 2 else 3.1e3), x) for k, (t, x) in enumerate(pairs[:4])]
     fit = vt.fit(vt.base_model(), four, profile=False)
     assert [n.vine for n in fit.numbers if n.symbol == "P_y"] == ["v, 3 kPa", "v, 3.1 kPa"]
 
 
-def test_watch_is_called_with_every_step_and_may_end_the_fit() -> None:
+def test_watch_is_called_with_every_step_and_may_end_the_fit():
     pairs, _ = small_campaign(seed=31)
     pairs = [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
     watch = Mock()
@@ -293,7 +293,7 @@ def test_the_yield_pressure_is_estimated_instead_of_a_release():
         assert 0.1 < begins < 0.25
 
 
-def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch: pytest.MonkeyPatch):
+def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch):
     whole, calls = Predictor.linearise, []
 
     def breaks_later(self: Predictor, theta: Floats, own: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
@@ -316,13 +316,13 @@ def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypa
     [{"growth_angle_rad": math.pi / 2}, {"growth_angle_rad": math.pi}, {"payload_kg": 0.0}],
     ids=["sideways", "up", "weightless"],
 )
-def test_gravity_moves_no_such_ball(change: dict[str, float]) -> None:
+def test_gravity_moves_no_such_ball(change):
     trial, track = ball(20400)
     with pytest.raises(FitError):
         vt.fit(vt.make_model(["gravity"]), [(replace(trial, **change), track)])
 
 
-def test_pressures_below_those_of_the_yield_and_unknown_parameters_are_refused() -> None:
+def test_pressures_below_those_of_the_yield_and_unknown_parameters_are_refused():
     pairs, _ = small_campaign(seed=8, replicates=1)
     with pytest.raises(FitError):
         vt.fit(vt.base_model(), [(replace(t, yield_pressure_Pa=1.5 * t.pressure_Pa), track) for t, track in pairs])
@@ -333,7 +333,7 @@ def test_pressures_below_those_of_the_yield_and_unknown_parameters_are_refused()
 # Fits to a subset of the trials, started from the fit of all, compared with fits from scratch.
 
 
-def test_leaving_out_a_condition_agrees_with_a_fit_from_scratch(campaign: Campaign) -> None:
+def test_leaving_out_a_condition_agrees_with_a_fit_from_scratch(campaign):
     whole, pairs, _ = campaign
     rest = [pair for pair in pairs if pair[0].condition != pairs[0][0].condition]
     warm = fit_subset(whole, [trial.name for trial, _ in rest])
@@ -345,7 +345,7 @@ def test_leaving_out_a_condition_agrees_with_a_fit_from_scratch(campaign: Campai
         assert one.sigma == pytest.approx(other.sigma, rel=0.05)
 
 
-def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(campaign: Campaign) -> None:
+def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(campaign):
     whole, pairs, _ = campaign
     stays = pairs[0][0].vine
     alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
@@ -357,7 +357,7 @@ def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(campaign: Campaig
             fit_subset(whole, keep)
 
 
-def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(campaign: Campaign) -> None:
+def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(campaign):
     whole, pairs, _ = campaign
     names = [trial.name for trial in whole.trials][:9]
     held = fit_subset(whole, names, hold_spreads=True, hold_noise=True)
@@ -368,7 +368,7 @@ def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(cam
     assert part.noise_correlation == 0.3
 
 
-def test_yield_pressures_without_error_are_no_parameters(campaign: Campaign) -> None:
+def test_yield_pressures_without_error_are_no_parameters(campaign):
     exact = [(replace(trial, yield_pressure_sigma_Pa=0.0), track) for trial, track in campaign[1][:12]]
     found = vt.fit(vt.base_model(), exact, profile=False)
     part = fit_subset(found, [trial.name for trial, _ in exact[:9]])
@@ -378,7 +378,7 @@ def test_yield_pressures_without_error_are_no_parameters(campaign: Campaign) -> 
 
 
 @pytest.mark.slow
-def test_film_influence_agrees_with_refits_with_heavier_film() -> None:
+def test_film_influence_agrees_with_refits_with_heavier_film():
     pairs = small_campaign(11, damping=5e-3, pressure=1e-3)[0]
     fit = vt.fit(vt.base_model(), pairs, profile=False)
     squares = np.zeros(len(fit.numbers))

@@ -29,7 +29,7 @@ def without_noise(pressure_Pa: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sigma_Pa", [30.0, 100.0, 300.0])
-def test_most_of_the_noise_is_removed(sigma_Pa: float):
+def test_most_of_the_noise_is_removed(sigma_Pa):
     # A line through 33 samples leaves 1/√33 = 0.17 of the noise in its middle; corners keep more.
     lefts = []
     for seed in range(10):
@@ -59,7 +59,7 @@ def emptied(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("offset", [0.0, 12.4, -7.8])
-def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset: float):
+def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset):
     """Read every eighth frame; the sixth trial has a clock of its own, 20 frames on."""
     traces, growths = [], []
     for seed in range(12):
@@ -88,7 +88,7 @@ def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset: float)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("exponent", [1.0, 1.4])
-def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent: float):
+def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent):
     """Twenty traces with 5 Pa of noise: their mean is off by no more than a fifth of a pascal."""
     pressure_Pa = 115e3 * (1 + 0.2 * GROWTH_M / exponent) ** -exponent - 101_325.0
     draws = [np.random.default_rng(300 + seed).standard_normal(TIMES_S.size) for seed in range(20)]
@@ -135,7 +135,7 @@ def test_stated_errors_cover_the_actual_errors():
 
 
 @pytest.mark.parametrize("per_reading", [3.4, 5.0, 18.0])
-def test_readings_of_an_interpolated_trace_are_recovered(per_reading: float):
+def test_readings_of_an_interpolated_trace_are_recovered(per_reading):
     draw = np.random.default_rng(3)
     read_at = np.arange(0.3, 400.0, per_reading)
     readings_Pa = 20e3 + 100.0 * draw.standard_normal(read_at.size)
@@ -154,7 +154,7 @@ def test_readings_of_an_interpolated_trace_are_recovered(per_reading: float):
 
 @pytest.mark.parametrize("digit_Pa", [0.01, 1.0, 10.0])
 @pytest.mark.parametrize("per_reading", [5.0, 40.0])
-def test_readings_are_recovered_from_samples_rounded_after_interpolation(per_reading: float, digit_Pa: float):
+def test_readings_are_recovered_from_samples_rounded_after_interpolation(per_reading, digit_Pa):
     draw = np.random.default_rng(11)
     read_at = np.arange(0.3, 600.0, per_reading)
     readings_Pa = 20e3 + 100.0 * draw.standard_normal((8, read_at.size))
@@ -170,7 +170,7 @@ def test_readings_are_recovered_from_samples_rounded_after_interpolation(per_rea
 
 
 @pytest.mark.parametrize("per_reading", [5.3, 13.4])
-def test_readings_in_coarse_steps_are_recovered_although_many_are_equal(per_reading: float):
+def test_readings_in_coarse_steps_are_recovered_although_many_are_equal(per_reading):
     draw = np.random.default_rng(13)
     read_at = np.arange(0.3, 600.0, per_reading)
     readings_Pa = 100.0 * np.round((20e3 + 60.0 * draw.standard_normal(read_at.size)) / 100.0)
@@ -220,7 +220,7 @@ def test_readings_that_are_nearly_all_equal_are_handled():
 
 
 @pytest.mark.parametrize("digit_Pa", [1.0, 10.0, 100.0])
-def test_noise_of_about_a_digit_is_not_taken_for_readings(digit_Pa: float):
+def test_noise_of_about_a_digit_is_not_taken_for_readings(digit_Pa):
     draw = np.random.default_rng(12)
     falls = 20e3 * (1 + TIMES_S / 0.4) ** -0.01
     for sigma_Pa in (0.0, 0.3 * digit_Pa, digit_Pa, 100.0 * digit_Pa):
@@ -243,7 +243,7 @@ def test_noise_behind_a_filter_is_detected_as_correlated():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("per_reading", [1, 6])
-def test_steady_pressures_stay_nearly_constant(per_reading: int):
+def test_steady_pressures_stay_nearly_constant(per_reading):
     """By a gauge that is read at every frame, or at every sixth and joined by lines."""
     draw = np.random.default_rng(6)
     tracks = []

@@ -76,7 +76,7 @@ def crossed(columns: list[np.ndarray]) -> np.ndarray:
     return all_products(columns, [np.arange(len(columns[0])) == 0] * len(columns))
 
 
-def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
+def test_cross_products_agree_with_the_dense_inverse_covariance():
     columns = np.random.default_rng(0).standard_normal((30, 4))
     first = np.zeros(30, dtype=bool)
     first[[0, 17]] = True
@@ -88,7 +88,7 @@ def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
 
 
 @pytest.mark.parametrize(("flat_sd", "moved"), [(50.0, 0.0), (0.5, 2.0)])
-def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd: float, moved: float) -> None:
+def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd, moved):
     """Also where the data have moved release and origin far from their priors."""
     n_trials, count, keys, spread = 3, 12, 2, 0.7
     columns = columns_of(n_trials, count, keys, seed=2)
@@ -112,7 +112,7 @@ def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd: float, 
     assert found == pytest.approx(direct, rel=1e-8)
 
 
-def test_residuals_at_zero_deviations_are_restored() -> None:
+def test_residuals_at_zero_deviations_are_restored():
     columns = columns_of(3, 15, 2, seed=8)
     state = replace(state_of(3, 2, 0.5), trial_effects=np.random.default_rng(9).standard_normal((3, 4)))
     whole = [c.copy() for c in columns]
@@ -123,7 +123,7 @@ def test_residuals_at_zero_deviations_are_restored() -> None:
     assert at_prior_means(white, frame, state, -1) == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
 
 
-def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -> None:
+def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions():
     """Squares of 1e12 times the noise, of which that of the noise is left: held against exact fractions.
 
     With the inverse of I + S Z S written out, 30 trials of 16 µm were credited with 250 in ln L.
@@ -152,7 +152,7 @@ def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -
     assert log_det == pytest.approx(math.log(determinant), rel=1e-9)
 
 
-def test_collinear_parameters_are_left_to_least_squares() -> None:
+def test_collinear_parameters_are_left_to_least_squares():
     draw = np.random.default_rng(10)
     rows, seen = draw.standard_normal((30, 4)), draw.standard_normal(30)
     twice = np.column_stack([rows, rows[:, 1]])
@@ -161,7 +161,7 @@ def test_collinear_parameters_are_left_to_least_squares() -> None:
     assert step[1] == pytest.approx(step[4])
 
 
-def test_the_restricted_likelihood_adds_the_information() -> None:
+def test_the_restricted_likelihood_adds_the_information():
     columns = columns_of(4, 20, 2, seed=3)
     frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
     part = marginal(crossed(columns), frame, state)
@@ -170,7 +170,7 @@ def test_the_restricted_likelihood_adds_the_information() -> None:
     assert more == pytest.approx(-np.linalg.slogdet(covariance_of_numbers.covariance)[1], rel=1e-8)
 
 
-def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
+def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance():
     """So are the error of the common level, which is that of a mean of trials, and its degrees of freedom."""
     n_trials, count, draw = 12, 25, np.random.default_rng(4)
     levels = 2.0 + 0.05 * draw.standard_normal(n_trials)
@@ -187,7 +187,7 @@ def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() 
 
 
 @pytest.mark.parametrize("start", [(0.04, 1e-3), (0.04, 0.1), (1e-3, 0.1), (1e-5, 1e-5)])
-def test_two_between_trial_standard_deviations_are_found_from_any_start(start: tuple[float, float]) -> None:
+def test_two_between_trial_standard_deviations_are_found_from_any_start(start):
     # Pressure and B move a trial alike but for a tenth, so that one can stand for the other.
     n_trials, count, draw = 24, 40, np.random.default_rng(31)
     slope, bend = np.linspace(0, 1, count), np.linspace(-1, 1, count) ** 2
@@ -204,7 +204,7 @@ def test_two_between_trial_standard_deviations_are_found_from_any_start(start: t
     assert damping == pytest.approx(0.02, rel=0.4)
 
 
-def test_noise_is_estimated_without_the_bias_of_fitted_parameters() -> None:
+def test_noise_is_estimated_without_the_bias_of_fitted_parameters():
     draw = np.random.default_rng(7)
     n_trials, count, rho = 300, 30, 0.4
     columns = []
@@ -223,9 +223,7 @@ def test_noise_is_estimated_without_the_bias_of_fitted_parameters() -> None:
 
 
 @pytest.mark.parametrize(("louder", "lowest", "highest"), [(1.0, 0.0, 0.5), (5.0, 0.8, 1.2)])
-def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_differences(
-    louder: float, lowest: float, highest: float
-) -> None:
+def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_differences(louder, lowest, highest):
     """Of twelve points σ² scatters by 41 % of itself; what half of the trials have 25 times over is no chance."""
     draw = np.random.default_rng(20670)
     n_trials, count = 40, 12
@@ -239,14 +237,14 @@ def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_diffe
     assert np.mean(variance) == pytest.approx(np.mean(alone), rel=0.1)
 
 
-def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge() -> None:
+def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge():
     frame = replace(frame_of(3, 25, 1), gauge_error=np.array([0.0, 4e-3, 0.0]))
     assert trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(
         np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]])
     )
 
 
-def test_collinear_parameters_are_detected() -> None:
+def test_collinear_parameters_are_detected():
     columns = columns_of(4, 25, 3, seed=10)
     for c in columns:
         c[:, 6] = 2 * c[:, 5]
@@ -260,7 +258,7 @@ def test_collinear_parameters_are_detected() -> None:
     assert np.isfinite(found.covariance[0, 0])
 
 
-def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None:
+def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate():
     # χ² with two degrees of freedom exceeds 5.9915 in 5 % of cases, a single number 1.96 standard errors as often.
     assert _deviate(np.array([math.sqrt(5.991465), 0.0]), np.eye(2)) == pytest.approx(1.959964, abs=1e-4)
     assert _deviate(np.zeros(2), np.eye(2)) == pytest.approx(0.0, abs=1e-9)
@@ -272,7 +270,7 @@ def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed: int) -> None:
+def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed):
     draw = np.random.default_rng(seed)
     columns = draw.standard_normal((12, 6)) + 2 * draw.standard_normal((12, 1))
     square, slope, free = columns.T @ columns, columns.T @ draw.standard_normal(12) * 10, np.ones(6, bool)
@@ -290,7 +288,7 @@ def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed: int) -> None:
 
 @pytest.mark.parametrize("damping", [0.0, 0.1, 100.0])
 @pytest.mark.parametrize("bound", [np.inf, 0.02])
-def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping: float, bound: float) -> None:
+def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping, bound):
     n_trials, count, keys = 4, 20, 2
     columns = columns_of(n_trials, count, keys, seed=8)
     for each in columns:
@@ -310,7 +308,7 @@ def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping: fl
     assert predicted == pytest.approx(lowered, rel=1e-6)
 
 
-def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence() -> None:
+def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence():
     columns = columns_of(4, 20, 2, seed=8)
     for each in columns:
         each[:, -1] += each[:, 5]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -56,7 +56,7 @@ def unlike(seed: int) -> Pairs:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("make", "seeds"), [(misread, range(60, 65)), (unlike, range(60, 72))])
-def test_robust_errors_are_correct_where_model_errors_are_too_small(make: Callable[[int], Pairs], seeds: range) -> None:
+def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds):
     """Root mean square error of n and both B in standard errors, by the model of the noise and by what a fit says."""
     by_noise, stated = [], []
     for seed in seeds:
@@ -76,7 +76,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make: Callab
 
 
 @pytest.mark.slow
-def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch):
     """Of bent pictures the trials scatter 1.6 times as widely in one number as the noise says.
 
     What trials err by together, which here is more, is left aside.
@@ -93,7 +93,7 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch: pyt
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trials", [2, 4, 7])
-def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials: int) -> None:
+def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials):
     """Each pulls the mean towards itself by 1/N: what is left of them has the variance (1 − 1/N)σ², degrees N − 1."""
     draw = np.random.default_rng(20690)
     solution = SimpleNamespace(problem=SimpleNamespace(prior_precision=np.zeros(1)))
@@ -117,7 +117,7 @@ def dropped(name: str, seed: int, drag: float, noise_m: float = 2e-3) -> tuple[T
     return trial, as_track(time_s, fallen_m + np.random.default_rng(seed).normal(0, noise_m, time_s.size))
 
 
-def test_the_error_of_two_drops_is_half_their_difference() -> None:
+def test_the_error_of_two_drops_is_half_their_difference():
     """The drag fitted to two drops with 0.574 and 0.459, each known to 0.006; its interval contains both."""
     drops = [dropped("a", 20200, 0.574), dropped("b", 20201, 0.459)]
     both = vt.fit(FALL, drops)["C_D"]
@@ -128,7 +128,7 @@ def test_the_error_of_two_drops_is_half_their_difference() -> None:
     assert both.high > 0.574
 
 
-def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighted_by_their_noise() -> None:
+def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighted_by_their_noise():
     apart = [dropped("a", 20204, 0.574), dropped("b", 20205, 0.459, noise_m=1e-2)]
     assert vt.fit(FALL, apart, profile=False)["C_D"].value == pytest.approx(0.5165, abs=0.02)
     alike = [dropped("a", 20206, 0.5), dropped("b", 20207, 0.5, noise_m=1e-2)]
@@ -138,7 +138,7 @@ def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighte
 
 
 @pytest.mark.slow
-def test_intervals_from_few_drops_contain_the_true_drag() -> None:
+def test_intervals_from_few_drops_contain_the_true_drag():
     held = []
     for campaign in range(40):
         draw = np.random.default_rng([20300, campaign])
@@ -157,14 +157,14 @@ def trials(specimens: int, days: int = 0, count: int = 24) -> list[Trial]:
     return [Trial(name=f"t{i}", vine="v", specimen=one, day=day) for i, (one, day) in enumerate(groups)]
 
 
-def test_the_coarsest_sufficient_groups_are_used() -> None:
+def test_the_coarsest_sufficient_groups_are_used():
     assert len(set(coarsest_groups(trials(8, days=12)))) == 8
     assert len(set(coarsest_groups(trials(3, days=12)))) == 12
     assert len(set(coarsest_groups(trials(0)))) == 24
     assert len(set(coarsest_groups(trials(2, days=3)))) == 24
 
 
-def test_errors_shared_by_a_group_enter_the_covariance() -> None:
+def test_errors_shared_by_a_group_enter_the_covariance():
     generator = np.random.default_rng(7)
     groups = [f"s{i % 12}" for i in range(48)]
     seen = []
@@ -176,7 +176,7 @@ def test_errors_shared_by_a_group_enter_the_covariance() -> None:
     assert abs(np.mean(seen) / 192.5 - 1) < 0.05
 
 
-def test_correlated_errors_of_a_day_enlarge_the_standard_errors() -> None:
+def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     """The same tracks, once with their days told: eight days of two trials, whose bends are those of the day."""
     pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
@@ -194,7 +194,7 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors() -> None:
 
 
 @pytest.mark.parametrize("trials", [5, 7])
-def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_interval(trials: int) -> None:
+def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_interval(trials):
     """Replicates of one condition whose B scatters by far more than any is measured: Student's problem."""
     draw = np.random.default_rng([20640, trials])
     pairs, factors = [], np.exp(0.04 * draw.standard_normal(trials))
@@ -222,7 +222,7 @@ def next_of(pairs: list, model: vt.Model, place: int) -> TrialFit:
 
 
 @pytest.mark.slow
-def test_the_next_of_scattering_drops_is_within_its_band() -> None:
+def test_the_next_of_scattering_drops_is_within_its_band():
     held = []
     for campaign in range(30):
         draw = np.random.default_rng([20600, campaign])
@@ -232,7 +232,7 @@ def test_the_next_of_scattering_drops_is_within_its_band() -> None:
     assert sum(held) >= 26  # of 30 at 95 %, fewer once in 300
 
 
-def test_the_band_of_drops_that_agree_is_their_noise() -> None:
+def test_the_band_of_drops_that_agree_is_their_noise():
     drops = [dropped(f"t{i}", 20650 + i, 0.5) for i in range(6)]
     band_m = next_of(drops, FALL, 5).band_m
     assert band_m is not None

@@ -21,7 +21,7 @@ def fitted(seed: int = 1, replicates: int = 3, **changes: float) -> Fit:
     return vt.fit(vt.base_model(), [(replace(trial, **changes), track) for trial, track in pairs], profile=False)
 
 
-def test_the_lens_adds_to_the_error_what_is_said_to_be_its_part() -> None:
+def test_the_lens_adds_to_the_error_what_is_said_to_be_its_part():
     exact, bent = fitted(position_systematic_m=0.0), fitted(position_systematic_m=2e-4)
     assert "lens" not in exact["n"].shared
     added = bent["n"].sigma ** 2 - exact["n"].sigma ** 2
@@ -29,7 +29,7 @@ def test_the_lens_adds_to_the_error_what_is_said_to_be_its_part() -> None:
     assert 0.5 * added < bent["n"].shared["lens"] ** 2 < added
 
 
-def test_what_trials_share_stays_where_their_number_grows() -> None:
+def test_what_trials_share_stays_where_their_number_grows():
     few, many = fitted(replicates=2), fitted(replicates=8)
     for one, other in zip(few.numbers, many.numbers, strict=True):
         assert other.shared["set pressures"] >= one.shared["set pressures"]
@@ -37,7 +37,7 @@ def test_what_trials_share_stays_where_their_number_grows() -> None:
         assert Number.from_json(one.to_json()).shared == one.shared
 
 
-def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet() -> None:
+def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():
     """The sheet's value is part of the fitted one: the difference has its variance less that of the fit."""
     rng, z = np.random.default_rng(3), []
     for seed in range(12):
@@ -52,7 +52,7 @@ def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet() -> None:
     assert math.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.3)
 
 
-def test_a_fit_that_no_step_improves_far_from_its_optimum_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_that_no_step_improves_far_from_its_optimum_has_not_converged(monkeypatch):
     fit = fitted()
     start = replace(fit.solution.state, theta=fit.solution.state.theta + 0.5)
     monkeypatch.setattr(optimiser, "_accepted_step", lambda *_, **__: (None, 0.0))

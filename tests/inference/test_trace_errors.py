@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import Mock, patch
 
 import numpy as np
@@ -15,7 +14,6 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.inference.fit import predict_prepared
-from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.robust_covariance import recorded_pressures, systematics_of
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
@@ -30,7 +28,7 @@ from vinetrack.inference.solving import (
 
 
 @pytest.fixture(scope="module")
-def laboratory(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
+def laboratory(tmp_path_factory):
     """Twelve trials that empty their chambers, a gauge of 50 Pa noise read some 150 times a second; camera noise, m."""
     shot = campaign("gauge_slow_depletion", 20602, (12, 12), weighed=False)
     folder = tmp_path_factory.mktemp("gauge") / "laboratory"
@@ -39,11 +37,11 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 
 
 @pytest.fixture(scope="module")
-def fit(laboratory: tuple[Path, float]) -> vt.Fit:
+def fit(laboratory):
     return vt.fit(vt.base_model(), laboratory[0], profile=False)
 
 
-def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit: vt.Fit, laboratory: tuple[Path, float]):
+def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, laboratory):
     assert fit.noise_m == pytest.approx(laboratory[1], rel=0.1)
     assert fit.chi2_per_dof < 1.1
     told = np.concatenate([each.trace_error_sizes for each in fit.predictor.data if each.trace_error_sizes is not None])
@@ -52,7 +50,7 @@ def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit: vt.
     assert trace_error_penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
 
 
-def test_an_error_of_a_trace_is_estimated(fit: vt.Fit):
+def test_an_error_of_a_trace_is_estimated(fit):
     """A trace moved by two of its standard deviations, in the way that its motion tells best, is moved back."""
     shapes = recorded_pressures(fit.predictor, fit.solution)
     moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.columns]
@@ -73,19 +71,19 @@ def test_an_error_of_a_trace_is_estimated(fit: vt.Fit):
 
 
 @pytest.mark.slow
-def test_a_poor_model_corrects_no_pressure(laboratory: tuple[Path, float]):
+def test_a_poor_model_corrects_no_pressure(laboratory):
     held = vt.fit(vt.base_model(), laboratory[0], fixed=["n"], start={"eversion_damping.n": 0.9}, profile=False)
     assert held.chi2_per_dof > 3
     assert all(each.trace_error_sizes is None for each in held.predictor.data)
 
 
-def test_trace_errors_suggest_no_exponent_per_vine(fit: vt.Fit):
+def test_trace_errors_suggest_no_exponent_per_vine(fit):
     """A gauge's errors taken for the noise of positions gained 316 in −2 ln L for it in 48 such trials."""
     apart = vt.refit(fit, shared={"eversion_damping.n": "vine"})
     assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
 
 
-def test_estimated_errors_enter_the_likelihood(fit: vt.Fit):
+def test_estimated_errors_enter_the_likelihood(fit):
     data = [replace(each, trace_error_sizes=None) for each in fit.predictor.data]
     predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
     free = assemble(predictor, fit.solution, {}, fit.options, profile=False)
@@ -93,7 +91,7 @@ def test_estimated_errors_enter_the_likelihood(fit: vt.Fit):
     assert trace_error_penalty(fit.predictor.data) > 1.0
 
 
-def test_the_tests_see_the_pressures_that_were_recorded(fit: vt.Fit):
+def test_the_tests_see_the_pressures_that_were_recorded(fit):
     state = fit.solution.state
     recorded = Predictor(fit.predictor.layout, list(map(as_recorded, fit.predictor.data)), fit.predictor.host)
     there = recorded.residuals(state.theta, state.trial_effects)
@@ -105,7 +103,7 @@ def test_the_tests_see_the_pressures_that_were_recorded(fit: vt.Fit):
     assert np.sqrt(np.mean(off**2)) < 0.01 * np.sqrt(np.mean(moved**2))
 
 
-def test_left_out_trials_are_predicted_from_the_recorded_pressure(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
+def test_left_out_trials_are_predicted_from_the_recorded_pressure(fit, monkeypatch):
     """Pressures corrected by a trial's own motion would predict it too well."""
     seen = Mock(wraps=predict_prepared)
     monkeypatch.setattr("vinetrack.diagnosis.ladder.predict_prepared", seen)
@@ -115,7 +113,7 @@ def test_left_out_trials_are_predicted_from_the_recorded_pressure(fit: vt.Fit, m
     assert all(trial_data.trace_error_sizes is None for trial_data in given)
 
 
-def test_another_model_starts_from_the_recorded_pressure(fit: vt.Fit):
+def test_another_model_starts_from_the_recorded_pressure(fit):
     """An effect whose curve the errors had absorbed would not be found otherwise."""
     with patch("vinetrack.inference.fit.make_layout", side_effect=InterruptedError) as begun:
         for model in (fit.model + "air_drag", fit.model):
@@ -126,7 +124,7 @@ def test_another_model_starts_from_the_recorded_pressure(fit: vt.Fit):
     assert same is fit.predictor.data
 
 
-def test_errors_without_influence_on_the_motion_are_zero(fit: vt.Fit):
+def test_errors_without_influence_on_the_motion_are_zero(fit):
     state = fit.solution.state
     deaf = replace(fit.solution, state=replace(state, variance=1e8 * state.variance))
     felt = [each for each in fit.predictor.data if each.trace_errors_Pa is not None]
@@ -142,7 +140,7 @@ GAUGE_NOISE_PA = 100.0
 
 
 @pytest.fixture(scope="module")
-def traced() -> Fit:
+def traced():
     """Sixteen trials; the gauge sees each pressure as it is, not as it was set, give or take 0.1 kPa a sample."""
     pairs, truth = small_campaign(seed=21)
     draw = np.random.default_rng(21)
@@ -154,7 +152,7 @@ def traced() -> Fit:
 
 
 @pytest.mark.slow
-def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_the_gauge(traced: Fit) -> None:
+def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_the_gauge(traced):
     assert traced.chi2_per_dof < 1.15
     assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
     for trial, item in zip(traced.trials, traced.predictor.data, strict=True):
@@ -164,7 +162,7 @@ def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_th
 
 
 @pytest.mark.slow
-def test_an_error_of_a_recorded_pressure_affects_its_own_trial_alone(traced: Fit) -> None:
+def test_an_error_of_a_recorded_pressure_affects_its_own_trial_alone(traced):
     """The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds."""
     predictor = traced.predictor
     trace = predictor.data[3].trace

@@ -11,14 +11,13 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 import vinetrack as vt
 from vinetrack.inference import trial_effects
 from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
 from vinetrack.inference.whitening import products, whiten
 
 
 @pytest.fixture(scope="module")
-def only_in_motion() -> Fit:
+def only_in_motion():
     """Eight trials, grown by scipy and let go 10 ms before the first frame that is kept."""
     pairs, _ = small_campaign(seed=7, replicates=1)
     seen = [track.time_s > 0.03 for _, track in pairs]
@@ -29,7 +28,7 @@ def only_in_motion() -> Fit:
     return fit(vt.base_model(), cut)
 
 
-def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion: Fit) -> None:
+def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion):
     assert only_in_motion.converged
     assert abs(only_in_motion["n"].value - N_TRUE) < 3 * only_in_motion["n"].sigma
     assert only_in_motion["n"].sigma < 0.02
@@ -37,7 +36,7 @@ def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion: Fit) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("early_frames", [5, 20, 45])
-def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion: Fit, early_frames: int) -> None:
+def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion, early_frames):
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     own = solution.state.trial_effects.copy()
     own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
@@ -48,7 +47,7 @@ def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion:
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
-def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho: float) -> None:
+def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho):
     draw = np.random.default_rng(5)
     time_s, grid_s = np.linspace(0.0, 0.3, 41), 0.4 * np.linspace(0, 1, 60) ** 1.5
     curves, position_m, relative = draw.standard_normal((5, 60)), draw.standard_normal(41), draw.uniform(1, 3, 41)
@@ -63,7 +62,7 @@ def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho
         assert np.allclose(product, white.T @ white, rtol=1e-12, atol=1e-12)
 
 
-def test_a_jump_is_remembered_by_later_searches(only_in_motion: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_jump_is_remembered_by_later_searches(only_in_motion, monkeypatch):
     """A search one step later forgot the jump: 3 of 400 trials cycled eight times, in 40 steps of all trials."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     residuals = residuals_in(predictor.linearise(solution.state.theta, solution.state.trial_effects))
@@ -78,7 +77,7 @@ def test_a_jump_is_remembered_by_later_searches(only_in_motion: Fit, monkeypatch
     assert search.returned.all()
 
 
-def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motion: Fit) -> None:
+def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motion):
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     theta = solution.state.theta.copy()
     theta[0] += 0.3
@@ -91,7 +90,7 @@ def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motio
     assert given_up.iterations < led.iterations
 
 
-def test_a_search_converges_if_the_model_is_close_to_the_tracks(only_in_motion: Fit) -> None:
+def test_a_search_converges_if_the_model_is_close_to_the_tracks(only_in_motion):
     """And one whose trajectories overflow costs infinitely much, without a warning."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4, search=True)

@@ -41,7 +41,7 @@ def cuts_prose(node: ast.AST) -> bool:
     return False
 
 
-def test_no_module_outside_the_room_of_prose_parses_it() -> None:
+def test_no_module_outside_the_room_of_prose_parses_it():
     cut = [
         (str(path.relative_to(PACKAGE)), ast.unparse(node)[:90])
         for path in FILES
@@ -51,11 +51,11 @@ def test_no_module_outside_the_room_of_prose_parses_it() -> None:
     assert cut == []
 
 
-def test_every_difference_between_trials_has_a_remedy() -> None:
+def test_every_difference_between_trials_has_a_remedy():
     assert BETWEEN_REMEDIES.keys() == BETWEEN_SUMMARIES.keys()
 
 
-def test_every_code_has_a_sentence_and_every_sentence_a_code() -> None:
+def test_every_code_has_a_sentence_and_every_sentence_a_code():
     makers = ("inference", "diagnosis", "planning", "pipeline")
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name in makers)
     assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= SENTENCES.keys() | REMARKS.keys()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +68,6 @@ def plan() -> str:
 
 
 @pytest.mark.parametrize("make", [verdicts, power, plan])
-def test_the_text_is_the_stored_one(make: Callable[[], str]) -> None:
+def test_the_text_is_the_stored_one(make):
     stored = Path(__file__).with_name(f"{make.__name__}.txt")
     assert make() + "\n" == stored.read_text(encoding="utf-8"), f"if it is meant to be so, store it in {stored.name}"

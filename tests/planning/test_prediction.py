@@ -67,7 +67,7 @@ def certain(one: Trial, B: float, n: float = 0.37, **said: object) -> object:
     return predictive_inputs(one, StatedValues(B=B, n=n, spreads=(0.0, 0.0), **said))  # type: ignore[arg-type]
 
 
-def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it() -> None:
+def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it():
     """42, 47, 52 m/s at 90, 95, 98 % of the length, with the guessed B ≈ 3.3.
 
     At 99 % the film weighs 0.04 g: less than a quarter of the gas, 0.1 g, which is the floor of what moves. With it
@@ -81,7 +81,7 @@ def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it() -> None:
     assert speeds[3] == pytest.approx(53.8, abs=0.1)
 
 
-def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_gives() -> None:
+def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_gives():
     """m ẍ = F with m = λ(L − x/2): ẋ² = −(4F/λ) ln(1 − y/L), level, F = ½(P − P_y)A."""
     one = trial(yield_pressure_kPa=2, growth_angle_deg=90)
     film = 1200 * math.pi * 25e-3 * 100e-6
@@ -92,7 +92,7 @@ def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_
     assert prediction[TENSION].median == pytest.approx(force, rel=1e-6)
 
 
-def test_time_and_speed_are_those_of_another_integrator() -> None:
+def test_time_and_speed_are_those_of_another_integrator():
     one = trial(**VINE, yield_pressure_kPa=3, payload_g=35.6)
     prediction = predict_vine(certain(one, 6.44), samples=2)
     times = np.linspace(0, 0.3, 30_001)
@@ -103,7 +103,7 @@ def test_time_and_speed_are_those_of_another_integrator() -> None:
     assert prediction[EDGE].median == pytest.approx(np.polyfit(times[near], truth[near], 1)[0], rel=1e-3)
 
 
-def test_the_tension_is_what_the_tip_leaves_of_the_drive() -> None:
+def test_the_tension_is_what_the_tip_leaves_of_the_drive():
     """T₁ = ½(P − P_y)A − ½Bẋⁿ all along: 35.6 g pull the tail slack at 14 kPa, in the equation."""
     one = trial(**{**VINE, "pressure_kPa": 14}, yield_pressure_kPa=3, payload_g=35.6)
     prediction = predict_vine(certain(one, 6.44), samples=2)
@@ -116,7 +116,7 @@ def test_the_tension_is_what_the_tip_leaves_of_the_drive() -> None:
     assert prediction[LEAST_TENSION].median == pytest.approx(curve["tension_N"].min(), abs=0.01)
 
 
-def test_bands_are_those_of_the_one_thing_that_is_uncertain() -> None:
+def test_bands_are_those_of_the_one_thing_that_is_uncertain():
     """Speed falls as the yield pressure rises: its quantiles are the speeds at the quantiles of that."""
     inputs = predictive_inputs(planned_trial(FAST).trials[0], StatedValues(B=3.3, n=0.37, spreads=(0.0, 0.0)))
     prediction = predict_vine(inputs, samples=1500)
@@ -129,7 +129,7 @@ def test_bands_are_those_of_the_one_thing_that_is_uncertain() -> None:
     assert (share.low, share.high) == pytest.approx((prediction[EDGE].low, prediction[EDGE].high), rel=0.03)
 
 
-def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> None:
+def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time():
     inputs = predictive_inputs(planned_trial(FAST).trials[0])
     prediction = predict_vine(inputs, samples=300)
     runs = run(inputs, prediction.curve["lead_position_m"].to_numpy(), 300, 1)
@@ -157,19 +157,19 @@ def fitted(n_trials: int = 2, B_is_estimated: bool = True) -> FitNumbers:
     return fit_numbers(FitSummary(vt.base_model().names, numbers=numbers, **rest), "a")
 
 
-def test_what_a_person_says_goes_before_the_fit_and_the_fit_before_the_guess() -> None:
+def test_what_a_person_says_goes_before_the_fit_and_the_fit_before_the_guess():
     numbers = fitted()
     assert predictive_inputs(unsaid(**VINE), StatedValues(B=5.0), numbers).medians[B] == 5.0
     assert predictive_inputs(unsaid(**VINE), None, numbers).medians[B] == pytest.approx(6.0)
     assert predictive_inputs(unsaid()).medians[B] == pytest.approx(3.32, abs=0.005)
 
 
-def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a_factor_three() -> None:
+def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a_factor_three():
     draws = predictive_inputs(unsaid()).draw(40_000, seed=1)[YIELD]
     assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)
 
 
-def test_draws_from_a_fit_have_its_covariance() -> None:
+def test_draws_from_a_fit_have_its_covariance():
     inputs = predictive_inputs(unsaid(**VINE), StatedValues(spreads=(0.0, 0.0)), fitted())
     draws = inputs.draw(40_000, seed=3)
     found = np.cov([np.log(draws[B]), draws[N], draws[YIELD] / 1e5])
@@ -178,7 +178,7 @@ def test_draws_from_a_fit_have_its_covariance() -> None:
     assert found == pytest.approx(np.array(expected), abs=3e-6)
 
 
-def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials() -> None:
+def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials():
     """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
     inputs = predictive_inputs(unsaid(**VINE), None, fitted(13, B_is_estimated=False))
     draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
@@ -186,27 +186,27 @@ def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_
     assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
 
 
-def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess() -> None:
+def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess():
     inputs = predictive_inputs(unsaid(diameter_mm=24, thickness_um=100, length_mm=280), None, fitted())
     assert inputs.medians[B] == pytest.approx(3.0)  # half the wall, half of B
     assert [(note.code, note.facts["vine"]) for note in inputs.notes] == [("B_carried_over", "24mm-200um-280mm")]
     assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
 
 
-def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed() -> None:
+def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed():
     numbers = fitted()
     assert predictive_inputs(unsaid(**VINE, yield_pressure_kPa=3), None, numbers).medians[YIELD] == 3200.0
     assert predictive_inputs(unsaid(**VINE, yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
 
 
-def test_the_same_seed_gives_the_same_draws_and_vines_share_what_they_have_in_common() -> None:
+def test_the_same_seed_gives_the_same_draws_and_vines_share_what_they_have_in_common():
     one, other = predictive_inputs(unsaid()), predictive_inputs(unsaid(length_mm=300))
     assert np.array_equal(one.draw(50, 7)[B], one.draw(50, 7)[B])
     assert np.array_equal(one.draw(50, 7)[N], other.draw(50, 7)[N])
     assert not np.array_equal(one.draw(50, 7, ["guess of B"])[B], other.draw(50, 7, ["guess of B"])[B])
 
 
-def test_a_fit_from_python_is_believed_as_its_file_is() -> None:
+def test_a_fit_from_python_is_believed_as_its_file_is():
     found = vt.fit(vt.base_model(), small_campaign(seed=5)[0])
     inputs = predictive_inputs(unsaid(**VINE), None, found)
     n = found["n"]
@@ -223,7 +223,7 @@ def test_a_fit_from_python_is_believed_as_its_file_is() -> None:
         ("supply_refill=0.1, 1:1.4", {"supply_refill.tau": Size(0.1, 0.1), "supply_refill.gamma": Size(1.0, 1.4)}),
     ],
 )
-def test_sizes_of_effects_are_numbers_or_ranges(text: str, sizes: dict[str, Size]) -> None:
+def test_sizes_of_effects_are_numbers_or_ranges(text, sizes):
     assert read_sizes(text)[1] == sizes
 
 
@@ -231,7 +231,7 @@ def printed(scale: int) -> tuple[float, float]:
     return 1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]
 
 
-def test_the_guess_is_exact_for_the_largest_printed_vine_and_within_a_fifth_for_all() -> None:
+def test_the_guess_is_exact_for_the_largest_printed_vine_and_within_a_fifth_for_all():
     assert guess.damping_prior(*printed(4)) == pytest.approx(6.44)
     for scale, B in published.DAMPING_B.items():
         assert guess.damping_prior(*printed(scale)) == pytest.approx(B, rel=0.18)
@@ -240,7 +240,7 @@ def test_the_guess_is_exact_for_the_largest_printed_vine_and_within_a_fifth_for_
     assert guess.damping_scatter() == pytest.approx(math.sqrt(np.sum(off**2) / 2), rel=1e-3)
 
 
-def test_the_error_of_the_guess_is_that_of_a_regression_read_off_beyond_its_points() -> None:
+def test_the_error_of_the_guess_is_that_of_a_regression_read_off_beyond_its_points():
     z = np.log([guess.damping_prior(*printed(scale)) for scale in published.DAMPING_B])
     design = np.column_stack([np.ones(4), z])
     for size in ((25e-3, 100e-6), (2.5e-3, 50e-6), (100e-3, 400e-6)):
@@ -264,8 +264,8 @@ PSI = 6.894757
     ],
 )
 def test_a_wrong_unit_of_pressure_is_suspected_and_a_right_one_is_not(
-    damping: float, factor: float, yield_factor: float, added_Pa: float, suspected: str
-) -> None:
+    damping, factor, yield_factor, added_Pa, suspected
+):
     """Speeds by F = B·ẋⁿ with the prior's B times `damping`, at three pressures; and a ball, which is passed over."""
     ball = Trial(name="b", diameter_m=0.02, travel_ratio=1, pressure_Pa=0.0, yield_pressure_Pa=0.0)
     pairs = [(ball, 2.0)]
@@ -287,7 +287,7 @@ def prediction(said: StatedValues | None = None, tail_slack: str = "taut", **val
     return predict_vine(predictive_inputs(replace(safe, tail_slack=tail_slack), said), samples=60)
 
 
-def test_a_sound_vine_has_no_hazard() -> None:
+def test_a_sound_vine_has_no_hazard():
     assert design_checks(prediction()) == ()
 
 
@@ -306,11 +306,11 @@ PUSHING = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_
         ({"chamber_l": 1}, "reservoir of 1 L loses 30% (slow) to 41% (fast)"),
     ],
 )
-def test_a_hazard_is_told_once_with_its_number(changes: dict[str, float], told: str) -> None:
+def test_a_hazard_is_told_once_with_its_number(changes, told):
     assert sum(told in str(one) for one in design_checks(prediction(**changes))) == 1
 
 
-def test_a_tail_that_may_go_slack_does() -> None:
+def test_a_tail_that_may_go_slack_does():
     loose = prediction(tail_slack="free", **PUSHING)
     assert loose.final.name == "speed of the leading edge"
     with pytest.raises(KeyError):
@@ -320,7 +320,7 @@ def test_a_tail_that_may_go_slack_does() -> None:
     assert "predicts compression in the tail" not in told
 
 
-def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in() -> None:
+def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in():
     inputs = prediction().inputs
     drag = next(one for one in neglected(inputs, 0.95) if one.effect == "air_drag")
     model = make_model([*inputs.model.names, "air_drag"]).with_values(inputs.model.values)
@@ -330,7 +330,7 @@ def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in() -> None:
     assert drag.change < 0
 
 
-def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_those_left_out() -> None:
+def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_those_left_out():
     said = StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=1")[1])
     names = {one.effect for one in neglected(prediction(said).inputs, 0.95)}
     assert "air_drag" not in names
