@@ -21,11 +21,7 @@ from vinetrack.core.problems import Remark
 from vinetrack.core.records import Trial
 from vinetrack.core.units import with_error
 from vinetrack.diagnosis import likelihood_ratio
-from vinetrack.diagnosis.likelihood_ratio import (
-    LikelihoodRatio,
-    answer_set,
-    film_gain,
-)
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, film_gain
 from vinetrack.diagnosis.misfit_tests import noise_in_motion_p
 from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.score_test import (

@@ -19,7 +19,6 @@ from vinetrack.diagnosis.ladder import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, select_effects, slack_fit
-from vinetrack.dynamics.simulate import simulate
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import YIELD_PRESSURE
 from vinetrack.inference.optimiser import relative_residual
@@ -91,7 +90,7 @@ def interrupted(k: int, pressure_Pa: float) -> tuple[Trial, Track]:
     truth = (vt.base_model() + vt.effects.static_yield).with_values(
         {"eversion_damping.B": 6.0, "eversion_damping.n": 0.4, "static_yield.P_s": P_S_TRUE}
     )
-    y = simulate(truth, trial, time_s, trace=(time_s, trace)).lead_position_m
+    y = vt.simulate(truth, trial, time_s, trace=(time_s, trace)).lead_position_m
     noise_m = 1e-4 * np.random.default_rng(70 + k).standard_normal(time_s.size)
     return trial, plain_track(time_s, y + noise_m, pressure_Pa=trace)
 

@@ -28,7 +28,6 @@ from vinetrack.diagnosis.misfit_tests import (
 )
 from vinetrack.diagnosis.score_test import fit_columns, levers_of
 from vinetrack.diagnosis.selection import confounders_of, size_not_excluded
-from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit
@@ -43,7 +42,7 @@ def careful(payload_g: float, seed: int) -> Pairs:
     return pairs_of(grown(trials, seed, **care))
 
 
-def questioned(pairs: Pairs, model: Model, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND) -> MisfitTests:
+def questioned(pairs: Pairs, model: vt.Model, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND) -> MisfitTests:
     candidates = candidates_of(model, None, None)
     found = fit(model, pairs, host=host_for(model, candidates), profile=False)
     return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], level)

@@ -12,13 +12,14 @@ import pytest
 from lsoda_vine import grown_position, vine_trial
 from vine_truth import make_track
 
+import vinetrack as vt
 import vinetrack.diagnosis.replicates as odd_trials_module
 from vinetrack.core.problems import remark
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.replicates import OddTrial, odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.inference.fit_data import FitError, prepare
+from vinetrack.inference.fit_data import prepare
 
 PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
 
@@ -112,7 +113,7 @@ def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they
 
 def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(adequate):
     unexplained = replace(adequate, rounds=(replace(adequate.rounds[-1], verdict="unexplained"),))
-    without = Mock(side_effect=FitError("there is nothing to fit"))
+    without = Mock(side_effect=vt.FitError("there is nothing to fit"))
     outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], without)
     assert outcome.notes[-1].code == "odd_trials"
 

@@ -12,23 +12,8 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.campaign_power import (
-    CampaignDesign,
-    SimulatedDiagnosis,
-    design_of_fit,
-    planned_tests,
-    rates_of,
-    simulated_diagnosis,
-)
+from vinetrack.diagnosis import campaign_power, linear_power
 from vinetrack.diagnosis.further_trials import _alone_and_distinct, exploratory_trials, further_trials
-from vinetrack.diagnosis.linear_power import (
-    effect_power,
-    fitted_without,
-    noiseless_start,
-    power_of,
-    residual_displacements,
-    score_ratio,
-)
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.experiment.settings import Limits
@@ -44,29 +29,29 @@ def planned(
     pressures: tuple[str, ...] = ("14", "24", "34"),
     candidates: tuple[str, ...] = CANDIDATES,
     **cells: str,
-) -> CampaignDesign:
+) -> campaign_power.CampaignDesign:
     trials: list[Trial] = []
     for pressure in pressures:
         texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "pressure_kPa": pressure}
         trial = vt.planned_trial({**texts, "yield_pressure_kPa": "3", **cells}).trials[0]
         trials += [replace(trial, name=f"P{pressure}_{k}", position_systematic_m=0.0) for k in range(replicates)]
     model = vt.predictive_inputs(trials[0]).model
-    return with_trials(CampaignDesign(model, (), (), spreads, candidates), trials)
+    return with_trials(campaign_power.CampaignDesign(model, (), (), spreads, candidates), trials)
 
 
-def with_trials(design: CampaignDesign, added: Sequence[Trial]) -> CampaignDesign:
+def with_trials(design: campaign_power.CampaignDesign, added: Sequence[Trial]) -> campaign_power.CampaignDesign:
     trials = (*design.trials, *added)
     return replace(design, trials=trials, cameras=(CAMERA,) * len(trials))
 
 
 @pytest.fixture(scope="module")
 def six():
-    return planned_tests(planned(2))[0]
+    return campaign_power.planned_tests(planned(2))[0]
 
 
 @pytest.fixture(scope="module")
 def power(six):
-    return power_of(six)
+    return linear_power.power_of(six)
 
 
 def place_of(questions: MisfitTests, name: str) -> int:
@@ -76,7 +61,7 @@ def place_of(questions: MisfitTests, name: str) -> int:
 def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
     noise_m = 1e-3
     design = replace(planned(2), cameras=(FilmingPlan(500.0, noise_m),) * 6)
-    promised = planned_tests(design)[0].fit
+    promised = campaign_power.planned_tests(design)[0].fit
     pairs = make(design.model, design.trials, design.cameras, design.spreads, np.random.default_rng(1))
     filmed = vt.fit(design.to_fit, pairs, spreads=design.spreads, noise=(noise_m, 0.0), profile=False)
     assert [n.sigma for n in promised.numbers] == pytest.approx([n.sigma for n in filmed.numbers], rel=0.04)
@@ -98,24 +83,26 @@ def test_detectable_sizes_follow_the_normal_distribution(six, power):
 @pytest.mark.slow
 def test_four_times_the_trials_halve_the_detectable_size(power):
     # Where scatter of trials alone is in the way, and positions are known as good as exactly.
-    few = power_of(planned_tests(planned(4))[0])["leak"].size_at(0.5)
-    many = power_of(planned_tests(planned(16))[0])["leak"].size_at(0.5)
+    few = linear_power.power_of(campaign_power.planned_tests(planned(4))[0])["leak"].size_at(0.5)
+    many = linear_power.power_of(campaign_power.planned_tests(planned(16))[0])["leak"].size_at(0.5)
     assert few / many == pytest.approx(2.0, rel=0.25)
     assert power["leak"].size_at(0.5) > few
 
 
 def test_two_equivalent_effects_are_confused_with_each_other():
     # A diameter and a pressure that are off by a part act alike but for the film's mass.
-    power = power_of(planned_tests(replace(planned(2), candidates=("area_scale", "pressure_gain")))[0])
+    power = linear_power.power_of(
+        campaign_power.planned_tests(replace(planned(2), candidates=("area_scale", "pressure_gain")))[0]
+    )
     assert "pressure_gain" in power["area_scale"].taken_for
     assert "area_scale" in power["pressure_gain"].taken_for
 
 
 def test_a_small_effect_has_the_score_of_linear_theory_and_leaves_what_a_refit_without_it_leaves(six, power):
-    k, start, size = place_of(six, "leak"), noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
-    assert score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
-    moved_m = size * residual_displacements(six.fit, six.products)[k]
-    after = fitted_without(six.fit, six.sensitivities.shapes[k], size, start)
+    k, start, size = place_of(six, "leak"), linear_power.noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
+    assert linear_power.score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
+    moved_m = size * linear_power.residual_displacements(six.fit, six.products)[k]
+    after = linear_power.fitted_without(six.fit, six.sensitivities.shapes[k], size, start)
     left = [block[:, -1] for block in after.solution.columns]
     assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
 
@@ -136,13 +123,13 @@ def test_probabilities_invert_sizes():
 
 def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate():
     answers = [
-        SimulatedDiagnosis("leak", "missing", ("leak",)),
-        SimulatedDiagnosis("leak", "ambiguous", ("supply_refill", "leak")),
-        SimulatedDiagnosis("leak", "missing", ("supply_refill",)),
-        SimulatedDiagnosis("leak", "adequate"),
-        SimulatedDiagnosis("leak", failed="FitError: none"),
+        campaign_power.SimulatedDiagnosis("leak", "missing", ("leak",)),
+        campaign_power.SimulatedDiagnosis("leak", "ambiguous", ("supply_refill", "leak")),
+        campaign_power.SimulatedDiagnosis("leak", "missing", ("supply_refill",)),
+        campaign_power.SimulatedDiagnosis("leak", "adequate"),
+        campaign_power.SimulatedDiagnosis("leak", failed="FitError: none"),
     ]
-    rates = rates_of(answers, 0.5, 0.9)
+    rates = campaign_power.rates_of(answers, 0.5, 0.9)
     assert (rates.detections, rates.alarms, rates.failed) == (Rate(2, 4), Rate(3, 4), 1)
     # Clopper and Pearson's for nine of ten, from the quantiles of the beta distribution.
     assert Rate(9, 10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
@@ -151,14 +138,14 @@ def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate()
 
 @pytest.mark.slow
 def test_a_simulated_campaign_is_diagnosed_with_its_effect():
-    found = simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", (0.02,), 3)
+    found = campaign_power.simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", (0.02,), 3)
     assert found.failed == ""
     assert found.is_found
 
 
 def test_the_design_of_a_fit_records_as_long_as_its_trials():
-    questions, _ = planned_tests(planned(1))
-    design = design_of_fit(questions.fit)
+    questions, _ = campaign_power.planned_tests(planned(1))
+    design = campaign_power.design_of_fit(questions.fit)
     for camera, trial in zip(design.cameras, questions.fit.trials, strict=True):
         assert camera.stops_s == pytest.approx(trial.time_s[-1] - trial.release_s)
         assert camera.capture_fps == pytest.approx(500.0)
@@ -177,7 +164,7 @@ def few():
 
 @pytest.fixture(scope="module")
 def few_power(few):
-    return power_of(planned_tests(few)[0], nonlinear=True)
+    return linear_power.power_of(campaign_power.planned_tests(few)[0], nonlinear=True)
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +175,7 @@ def further(few, few_power):
 def test_the_power_of_a_plan_is_that_of_a_sheet_with_its_trials(few, further):
     assert further.before < 0.9 <= further.after
     made = with_trials(few, [added.trial for added in further.trials])
-    again = effect_power(planned_tests(made)[0], "leak")
+    again = linear_power.effect_power(campaign_power.planned_tests(made)[0], "leak")
     assert again is not None
     assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
 
@@ -218,11 +205,13 @@ CONNECTOR_LIMITS = Limits(
 NAMES = ("inlet_loss", "linear_damping", "leak")
 
 
-def sizes_with(design: CampaignDesign, settings: list[tuple[float, float]]) -> np.ndarray:
+def sizes_with(design: campaign_power.CampaignDesign, settings: list[tuple[float, float]]) -> np.ndarray:
     """Sizes of all effects found nine times in ten with trials at these pressures, kPa, and connectors, mm, as well."""
     like = design.trials[0]
     added = [replace(like, name=f"a{k}", pressure_Pa=1e3 * P, inlet_m=mm / 1e3) for k, (P, mm) in enumerate(settings)]
-    powers = [effect_power(planned_tests(with_trials(design, added))[0], name) for name in NAMES]
+    powers = [
+        linear_power.effect_power(campaign_power.planned_tests(with_trials(design, added))[0], name) for name in NAMES
+    ]
     return np.array([power.size_at(0.9) for power in powers if power is not None])
 
 
@@ -230,7 +219,9 @@ def sizes_with(design: CampaignDesign, settings: list[tuple[float, float]]) -> n
 def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promised():
     """After three trials of one vine at each of two pressures, through a connector that is always the same."""
     design = planned(3, (0.005, 0.02), ("14", "24"), NAMES, chamber_l="3.7", inlet_mm="8")
-    found = exploratory_trials(design, power_of(planned_tests(design)[0], nonlinear=True), CONNECTOR_LIMITS)
+    found = exploratory_trials(
+        design, linear_power.power_of(campaign_power.planned_tests(design)[0], nonlinear=True), CONNECTOR_LIMITS
+    )
     assert found is not None
     settings = [(t["pressure_kPa"], t["inlet_mm"]) for t in found.trials for _ in range(t["replicates"])]
     assert len(settings) == 4

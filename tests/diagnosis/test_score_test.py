@@ -22,55 +22,40 @@ from vinetrack.diagnosis.likelihood_ratio import (
     prior_penalty,
     weights_of,
 )
-from vinetrack.diagnosis.misfit_tests import (
-    FALSE_ALARM_LEVEL_FIRST_ROUND,
-    FALSE_ALARM_LEVEL_LATER_ROUNDS,
-    SINGLE_PROBE_LEVEL,
-    MisfitTests,
-    Structure,
-    structure_from_scores,
-)
-from vinetrack.diagnosis.score_test import (
-    CandidateShape,
-    EffectSensitivities,
-    Scores,
-    _marginalisation,
-    _marginalised,
-    family_test,
-    is_plausible,
-)
 from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.marginal_likelihood import FitState
 
-QUIET = Structure(0.0, 0, 1.0, 0.0)
+QUIET = misfit_tests.Structure(0.0, 0, 1.0, 0.0)
 
 
-def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float = 1.0, sizes: Any = 0.0) -> Scores:
+def scores(
+    draw: np.random.Generator, trials: int, shapes: int, scatter: float = 1.0, sizes: Any = 0.0
+) -> score_test.Scores:
     """What a linear campaign says of shapes of true `sizes`."""
     root = draw.standard_normal((trials, 3 * shapes, shapes)) / math.sqrt(3 * shapes)
     informations = np.einsum("nkj,nkl->njl", root, root)
     noise = scatter * np.einsum("nkj,nk->nj", root, draw.standard_normal((trials, 3 * shapes)))
     single = noise + informations @ np.broadcast_to(sizes, (shapes,))
-    return Scores(
+    return score_test.Scores(
         single.sum(axis=0), informations.sum(axis=0), single, informations, 1, [str(i) for i in range(trials)]
     )
 
 
 def questioned(
-    of: Scores,
+    of: score_test.Scores,
     signs: Any = 0,
-    structure: Structure = QUIET,
-    level: float = FALSE_ALARM_LEVEL_FIRST_ROUND,
+    structure: misfit_tests.Structure = QUIET,
+    level: float = misfit_tests.FALSE_ALARM_LEVEL_FIRST_ROUND,
     effects: tuple[str, ...] | None = None,
-) -> MisfitTests:
+) -> misfit_tests.MisfitTests:
     """The tests of candidates with these scores, each shape another effect where these are not named."""
     signs = np.broadcast_to(signs, of.score.shape).tolist()
     shapes = [SimpleNamespace(effect=SimpleNamespace(parameters=(1,)), size=SimpleNamespace(sign=s)) for s in signs]
     named = effects or tuple(f"effect_{k}" for k in range(len(shapes)))
     answers: Any = SimpleNamespace(shapes=shapes, effects=named)
     fit: Any = None
-    return MisfitTests(fit, (), answers, fit, of, structure, level)
+    return misfit_tests.MisfitTests(fit, (), answers, fit, of, structure, level)
 
 
 @pytest.mark.parametrize("scatter", [1.0, 3.0])
@@ -107,7 +92,7 @@ def test_a_candidate_of_many_shapes_is_no_more_often_a_false_alarm_than_all_shou
 @pytest.mark.parametrize(("trials", "probes", "scatter"), [(24, 8, 1.0), (24, 8, 3.0), (6, 12, 1.0)])
 def test_probes_of_nothing_find_structure_as_often_as_they_say(trials, probes, scatter):
     draw = np.random.default_rng(20604)
-    found = [structure_from_scores(scores(draw, trials, probes, scatter)) for _ in range(400)]
+    found = [misfit_tests.structure_from_scores(scores(draw, trials, probes, scatter)) for _ in range(400)]
     assert np.mean([one.p < 0.05 for one in found]) < 0.09
     assert np.mean([one.smallest_probe_p < 0.05 for one in found]) < 0.08
     if (trials, scatter) == (24, 1.0):
@@ -115,8 +100,10 @@ def test_probes_of_nothing_find_structure_as_often_as_they_say(trials, probes, s
 
 
 def test_six_trials_hear_a_force_of_thirty_standard_errors_that_one_probe_feels():
-    draw, level = np.random.default_rng(9), 0.1 * FALSE_ALARM_LEVEL_LATER_ROUNDS
-    loud = [structure_from_scores(scores(draw, 6, 12, sizes=[30 / math.sqrt(6), *[0] * 11])) for _ in range(40)]
+    draw, level = np.random.default_rng(9), 0.1 * misfit_tests.FALSE_ALARM_LEVEL_LATER_ROUNDS
+    loud = [
+        misfit_tests.structure_from_scores(scores(draw, 6, 12, sizes=[30 / math.sqrt(6), *[0] * 11])) for _ in range(40)
+    ]
     assert all(one.p < level and one.smallest_probe_p < level for one in loud)
 
 
@@ -126,9 +113,9 @@ def test_the_sum_over_probes_and_the_loudest_each_hear_what_the_other_misses(alo
     draw, heard = np.random.default_rng(20606 if alone else 20605), []
     sizes = [6.0, *[0] * 23] if alone else 3.0 * np.resize([1, -1], 24)
     for _ in range(60):
-        structure = structure_from_scores(scores(draw, 60, 24, sizes=np.array(sizes) / math.sqrt(60)))
-        by_sum, by_one = structure.p < 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND, structure.smallest_probe_p
-        if not by_sum if alone else by_one > SINGLE_PROBE_LEVEL:
+        structure = misfit_tests.structure_from_scores(scores(draw, 60, 24, sizes=np.array(sizes) / math.sqrt(60)))
+        by_sum, by_one = structure.p < 0.1 * misfit_tests.FALSE_ALARM_LEVEL_FIRST_ROUND, structure.smallest_probe_p
+        if not by_sum if alone else by_one > misfit_tests.SINGLE_PROBE_LEVEL:
             heard.append(questioned(scores(draw, 12, 2), structure=structure).probes_reject)
     assert len(heard) >= 15
     assert np.mean(heard) > 0.6
@@ -139,13 +126,13 @@ def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselve
     chance = {"between_conditions_p": 1.0, "noise_in_motion_p": 1.0}
     for name in chance:
         monkeypatch.setattr(misfit_tests, name, lambda _, name=name: chance[name])
-    shaped = Structure(80.0, 8, 1e-9, 6.0)
+    shaped = misfit_tests.Structure(80.0, 8, 1e-9, 6.0)
     assert not questioned(of).omnibus_rejects
     assert questioned(of, structure=shaped).omnibus_rejects
     for name in chance:
         chance[name] = 1e-5
         assert questioned(of).omnibus_rejects
-        assert not questioned(of, level=0.1 * FALSE_ALARM_LEVEL_LATER_ROUNDS).omnibus_rejects
+        assert not questioned(of, level=0.1 * misfit_tests.FALSE_ALARM_LEVEL_LATER_ROUNDS).omnibus_rejects
         chance[name] = 1.0
 
 
@@ -176,11 +163,13 @@ def test_scores_that_a_specimen_shares_count_once():
     draw = np.random.default_rng(8)
     groups = [f"tube {k // 4}" for k in range(40)]
     shared = np.repeat(draw.standard_normal((10, 300)), 4, axis=0)
-    of = Scores(shared.sum(axis=0), 40 * np.eye(300), shared, np.tile(np.eye(300), (40, 1, 1)), 1, groups)
+    of = score_test.Scores(shared.sum(axis=0), 40 * np.eye(300), shared, np.tile(np.eye(300), (40, 1, 1)), 1, groups)
     assert of.degrees == 9
     # The sum of ten independent fours has the standard deviation 4 √10.
     assert np.mean(of.robust_sigma * 40) == pytest.approx(4 * math.sqrt(10), rel=0.1)
-    alone = Scores(of.score, of.information, of.trial_scores, of.trial_informations, 1, [str(k) for k in range(40)])
+    alone = score_test.Scores(
+        of.score, of.information, of.trial_scores, of.trial_informations, 1, [str(k) for k in range(40)]
+    )
     assert np.mean(alone.robust_sigma * 40) < 0.6 * np.mean(of.robust_sigma * 40)
 
 
@@ -189,15 +178,17 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
     friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, cast(Any, None)
-    answers = EffectSensitivities((CandidateShape(friction, (), 1e-3),), [], ())
+    answers = score_test.EffectSensitivities((score_test.CandidateShape(friction, (), 1e-3),), [], ())
     held = []
     for _ in range(2000):
         one = scores(draw, trials, 1, sizes=true * unit)
         more = scatter * np.sqrt(one.trial_informations[:, :, 0]) * draw.standard_normal((trials, 1))
         of_trials = ((one.trial_scores + more) * unit, one.trial_informations * unit**2)
         score, groups = (one.score + more.sum(axis=0)) * unit, [str(i) for i in range(trials)]
-        of = Scores(score, one.information * unit**2, *of_trials, 1, groups)
-        asked = MisfitTests(fit, (friction,), answers, fit, of, QUIET, FALSE_ALARM_LEVEL_FIRST_ROUND)
+        of = score_test.Scores(score, one.information * unit**2, *of_trials, 1, groups)
+        asked = misfit_tests.MisfitTests(
+            fit, (friction,), answers, fit, of, QUIET, misfit_tests.FALSE_ALARM_LEVEL_FIRST_ROUND
+        )
         limits, testable = asked.upper_limits(friction)
         assert testable
         held.append(limits["tail_friction.mu_w"] > true)
@@ -207,8 +198,8 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
 def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
     together = scores(np.random.default_rng(20609), 12, 5)
-    turn = _marginalisation(together.information, 3)
-    score, information = _marginalised(together.score, together.information, turn)
+    turn = score_test._marginalisation(together.information, 3)
+    score, information = score_test._marginalised(together.score, together.information, turn)
     A, B, C = together.information[:3, :3], together.information[:3, 3:], together.information[3:, 3:]
     inner = np.linalg.inv(C + np.eye(2))
     assert information == pytest.approx(A - B @ inner @ B.T)
@@ -287,7 +278,7 @@ def alike_within() -> np.ndarray:
     ids=["of either sign", "of one sign", "Šidák's share", "the same curve counts once", "the silent take no share"],
 )
 def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, share):
-    family = family_test(cosines, [sign] * len(names), list(names), level)
+    family = score_test.family_test(cosines, [sign] * len(names), list(names), level)
     assert family.threshold("a") == pytest.approx(norm.isf(share), abs=0.01)
 
 
@@ -295,7 +286,7 @@ def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, sha
 def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share():
     """Against two million draws from another generator."""
     cosines, level = alike_within(), 3e-3
-    family = family_test(cosines, SIGNS, NAMES, level)
+    family = score_test.family_test(cosines, SIGNS, NAMES, level)
     limits, signs = np.array([family.threshold(name) for name in NAMES]), np.array(SIGNS)
     draw, root = np.random.default_rng(20621), np.linalg.cholesky(cosines + 1e-9 * np.eye(len(NAMES)))
     alarms, total, by_many = 0, 0, 0
@@ -386,5 +377,5 @@ def test_a_number_of_which_the_data_say_nothing_costs_nothing_and_weights_follow
 def test_any_phase_of_a_swing_is_plausible():
     """A phase of −3.67 rad is one of 2.61."""
     of = {parameter.name: parameter for parameter in catalogue()["supply_pulsation"].parameters}
-    assert all(is_plausible(of["phi"], phase_rad, 0.0) for phase_rad in (-3.67, 6.9, 3.0))
-    assert not is_plausible(of["f"], 480.0, 0.0)
+    assert all(score_test.is_plausible(of["phi"], phase_rad, 0.0) for phase_rad in (-3.67, 6.9, 3.0))
+    assert not score_test.is_plausible(of["f"], 480.0, 0.0)

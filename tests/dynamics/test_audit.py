@@ -9,13 +9,12 @@ import pandas as pd
 import pytest
 from by_hand import LOADED
 
+import vinetrack as vt
 from vinetrack.core.records import Bend, Kinematics, Trial
 from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, measured_motion
-from vinetrack.dynamics.model import base_model
-from vinetrack.dynamics.simulate import simulate
 
 A = math.pi * 24e-3**2 / 4
-BASE = base_model().with_values({"eversion_damping.B": 6.44})
+BASE = vt.base_model().with_values({"eversion_damping.B": 6.44})
 
 
 def trial(**others: object) -> Trial:
@@ -98,8 +97,8 @@ def test_each_rule_is_violated_beyond_its_limit(rule, kept, broken):
 def test_compression_in_the_tail_is_found(P, onset_s, within_s):
     of = trial(pressure_Pa=P)
     spread = np.linspace(0.0, 1.0, 200) ** 2
-    times = simulate(BASE, of, 30.0 * spread).end_time_s * spread[:-1]
-    grown = simulate(BASE, of, times)
+    times = vt.simulate(BASE, of, 30.0 * spread).end_time_s * spread[:-1]
+    grown = vt.simulate(BASE, of, times)
     found = audit(BASE, [AuditedMotion(of, times, grown.lead_position_m, grown.lead_velocity_m_s)])
     tension = row(found, "tail_tension")
     assert abs(tension["slack_from_s"] - onset_s) < within_s

@@ -11,32 +11,37 @@ import pytest
 from by_hand import BARE, LOADED, N
 from own_effect import NAME, write_effect
 
+import vinetrack as vt
 from vinetrack import effects
 from vinetrack.dynamics import kernel as batch
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import Model, base_model, effects_on, host_for, make_model, shared_host
+from vinetrack.dynamics.model import effects_on, host_for, shared_host
 from vinetrack.dynamics.simulate import prepare, simulate_many
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue, load_effect, own_effects
 
 
 def test_removing_by_effect_or_by_name_removes_its_values():
-    larger = (base_model() + effects.reservoir_depletion).with_values(
+    larger = (vt.base_model() + effects.reservoir_depletion).with_values(
         {"reservoir_depletion.gamma": 1.2, "eversion_damping.B": 2.0}
     )
     for smaller in (larger - effects.reservoir_depletion, larger - "reservoir_depletion"):
         assert smaller.names == BASE_EFFECTS
         assert dict(smaller.values) == {"eversion_damping.B": 2.0}
-    assert base_model() + effects.leak - effects.leak == base_model() != base_model().with_values({"gravity.g": 2.0})
-    for twice in (lambda: base_model() + effects.gravity, lambda: make_model(["gravity", "gravity"])):
+    assert (
+        vt.base_model() + effects.leak - effects.leak
+        == vt.base_model()
+        != vt.base_model().with_values({"gravity.g": 2.0})
+    )
+    for twice in (lambda: vt.base_model() + effects.gravity, lambda: vt.make_model(["gravity", "gravity"])):
         with pytest.raises(EffectError):
             twice()
 
 
 def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine():
-    assert base_model().parameter_names == ("gravity.g", "eversion_damping.B", "eversion_damping.n")
-    assert base_model().parameters_for("any").tolist() == [9.81, 3.0, 0.37]
-    model = base_model().with_values({"eversion_damping.n": 0.5})
+    assert vt.base_model().parameter_names == ("gravity.g", "eversion_damping.B", "eversion_damping.n")
+    assert vt.base_model().parameters_for("any").tolist() == [9.81, 3.0, 0.37]
+    model = vt.base_model().with_values({"eversion_damping.n": 0.5})
     model = model.with_values({"eversion_damping.B": {"thin": 1.0, "thick": 4.0}})
     assert model.parameters_for("thick").tolist() == [9.81, 4.0, 0.5]
     with pytest.raises(EffectError):
@@ -44,7 +49,7 @@ def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine():
 
 
 def test_effects_of_size_zero_and_replaced_ones_do_not_act():
-    model = base_model() + effects.reservoir_depletion + effects.supply_refill + effects.air_drag
+    model = vt.base_model() + effects.reservoir_depletion + effects.supply_refill + effects.air_drag
     rows = np.array([model.parameters_for(""), model.with_values({"air_drag.C_D": 0.0}).parameters_for("")])
     acting = dict(zip(model.names, effects_on(model, rows).T.tolist(), strict=True))
     always = {name: [True, True] for name in (*BASE_EFFECTS, "supply_refill")}
@@ -53,7 +58,7 @@ def test_effects_of_size_zero_and_replaced_ones_do_not_act():
 
 def test_terms_along_a_motion_by_hand():
     """At y = 0.1 m and ẏ = 2 m/s, with B 6.44 and n 0.37, everything worked out on paper."""
-    model = base_model().with_values({"eversion_damping.B": 6.44})
+    model = vt.base_model().with_values({"eversion_damping.B": 6.44})
     terms = evaluate(model, LOADED.trial(), np.array([0.05]), np.array([0.1]), np.array([2.0]))
     mass = 1200 * math.pi * 0.024 * 200e-6 * (0.28 - 0.1) + 0.0356
     area = math.pi * 0.012**2
@@ -68,8 +73,8 @@ def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp
     own = own_effects([write_effect(tmp_path)])
     named_as_another = load_effect(write_effect(tmp_path).rename(tmp_path / "air_drag.py"))
     assert named_as_another.name in catalogue()
-    models = (base_model(), make_model(["gravity"]), base_model() + "air_drag" + own[NAME])
-    for several in (*(model.effects for model in models), (*base_model().effects, named_as_another)):
+    models = (vt.base_model(), vt.make_model(["gravity"]), vt.base_model() + "air_drag" + own[NAME])
+    for several in (*(model.effects for model in models), (*vt.base_model().effects, named_as_another)):
         assert shared_host(several) is None
 
 
@@ -78,10 +83,10 @@ def test_a_tail_that_may_go_slack_is_not_compiled_with_the_whole_catalogue(monke
 
     def noted(effects: tuple[Effect, ...], tail_free: bool) -> ModuleType:
         asked.append((len(effects), tail_free))
-        return kernel(base_model().effects)
+        return kernel(vt.base_model().effects)
 
     monkeypatch.setattr(batch, "kernel", noted)
-    model = base_model().with_values({"eversion_damping.B": BARE.B}) + "air_drag"
+    model = vt.base_model().with_values({"eversion_damping.B": BARE.B}) + "air_drag"
     for slack in ("taut", "free"):
         prepare(model, [replace(BARE.trial(), tail_slack=slack)], [np.linspace(0.0, 0.1, 5)])
     assert asked == [(len(catalogue()) + 1, False), (len(model.effects), True)]
@@ -89,7 +94,7 @@ def test_a_tail_that_may_go_slack_is_not_compiled_with_the_whole_catalogue(monke
 
 def test_by_the_host_it_is_the_same_to_the_last_bit(monkeypatch):
     sizes = {"eversion_damping.B": 6.44, "eversion_damping.n": N, "reservoir_depletion.gamma": 1.3, "air_drag.C_D": 1.1}
-    model: Model = (base_model() + "reservoir_depletion" + "air_drag").with_values(sizes)
+    model: vt.Model = (vt.base_model() + "reservoir_depletion" + "air_drag").with_values(sizes)
     trials = [LOADED.trial(chamber_m3=3.7e-3), BARE.trial(chamber_m3=3.7e-3, growth_angle_rad=1.0)]
     times = [np.linspace(0.0, 0.3, 200)] * 2
     by_host = simulate_many(model, trials, times)

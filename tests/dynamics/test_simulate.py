@@ -12,21 +12,21 @@ from by_hand import ATM, RT_AIR, G, N, followed
 from by_hand import LOADED as HANGING
 from scipy.integrate import solve_ivp
 
+import vinetrack as vt
 from vinetrack import effects
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.model import base_model, make_model
-from vinetrack.dynamics.simulate import SimulationError, simulate, simulate_many
+from vinetrack.dynamics.simulate import SimulationError, simulate_many
 from vinetrack.effects import catalogue
 
 LOADED = HANGING.trial(pressure_Pa=14e3)
 VINE = replace(LOADED, payload_kg=0.0)
-MODEL = base_model().with_values({"eversion_damping.B": HANGING.B, "eversion_damping.n": N})
+MODEL = vt.base_model().with_values({"eversion_damping.B": HANGING.B, "eversion_damping.n": N})
 
 
 def test_a_dropped_ball_falls_half_g_t_squared():
     ball = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
     times_s = np.linspace(0, 2, 41)
-    found = simulate(make_model(["gravity"]), ball, times_s)
+    found = vt.simulate(vt.make_model(["gravity"]), ball, times_s)
     np.testing.assert_allclose(found.lead_position_m, 0.5 * G * times_s**2, rtol=1e-10, atol=1e-14)
     np.testing.assert_allclose(found.lead_velocity_m_s, G * times_s, rtol=1e-8, atol=1e-12)
     assert found.status == "running"
@@ -56,8 +56,8 @@ def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial, B, n, rel
     truth = followed(acceleration, 2 * trial.length_m, until=1e6)
     end = truth.end  # type: ignore[attr-defined]
     times = np.linspace(0.01, 1, 60) * end * (1 - 1e-6)
-    model = base_model().with_values({"eversion_damping.B": B, "eversion_damping.n": n})
-    found = simulate(model, trial, np.append(times, 2 * end))
+    model = vt.base_model().with_values({"eversion_damping.B": B, "eversion_damping.n": n})
+    found = vt.simulate(model, trial, np.append(times, 2 * end))
     assert found.status == "ended"
     assert found.n_steps < 500
     assert found.end_time_s == pytest.approx(end, rel=rel)
@@ -67,8 +67,8 @@ def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial, B, n, rel
 
 
 def test_the_result_does_not_depend_on_the_requested_times():
-    many = simulate(MODEL, VINE, np.linspace(0, 0.5, 501))
-    few = simulate(MODEL, VINE, np.array([0.1, 0.25, 0.5]))
+    many = vt.simulate(MODEL, VINE, np.linspace(0, 0.5, 501))
+    few = vt.simulate(MODEL, VINE, np.array([0.1, 0.25, 0.5]))
     np.testing.assert_allclose(few.lead_position_m, many.lead_position_m[[100, 250, 500]], rtol=0, atol=1e-9)
 
 
@@ -78,7 +78,7 @@ def test_many_at_once_agree_with_each_alone():
     traces = [None, (np.array([0.0, 1.0]), np.array([14e3, 10e3])), None]
     together = simulate_many(MODEL, trials, times, traces=traces)
     for trial, times_s, trace, found in zip(trials, times, traces, together, strict=True):
-        alone = simulate(MODEL, trial, times_s, trace=trace)
+        alone = vt.simulate(MODEL, trial, times_s, trace=trace)
         np.testing.assert_array_equal(found.lead_position_m, alone.lead_position_m)
 
 
@@ -104,10 +104,10 @@ def breakpoints(rig):
 def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path):
     """A ball that falls by g, and beyond 0.1 m is drawn on by k (y − 0.1 m): m z̈ = m g + k z."""
     (tmp_path / "band.py").write_text(BAND)
-    model = make_model(["gravity"]) + effects.load_effect(tmp_path / "band.py")
+    model = vt.make_model(["gravity"]) + effects.load_effect(tmp_path / "band.py")
     ball = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
     times_s = np.linspace(0, 0.2, 41)
-    found = simulate(model, ball, times_s)
+    found = vt.simulate(model, ball, times_s)
     root = math.sqrt(500.0 / 0.1)
     beyond = root * np.maximum(times_s - math.sqrt(0.2 / G), 0.0)
     drawn = 0.1 + math.sqrt(0.2 * G) / root * np.sinh(beyond) + G / root**2 * (np.cosh(beyond) - 1)
@@ -181,7 +181,7 @@ def test_the_tip_follows_its_own_law_while_the_payload_falls(case):
     model = (MODEL + catalogue()["payload_friction"] + catalogue()["supply_refill"]).with_values(sizes)
     trial = HANGING.trial(pressure_Pa=P, tail_slack="free", growth_angle_rad=math.acos(down))
     # A coasting tail carries an error of its speed on for a tenth of a second: a tighter tolerance than usual.
-    got = simulate(model, trial, times, trace=trace, **({"relative_tolerance": 1e-6} if case == "rubs" else {}))
+    got = vt.simulate(model, trial, times, trace=trace, **({"relative_tolerance": 1e-6} if case == "rubs" else {}))
     assert len(switches) == expected
     assert got.slack_from_s == pytest.approx(switches[0], abs=1e-5 if trace else 2e-6)
     np.testing.assert_allclose(got.lead_position_m, np.minimum(truth, L), rtol=0, atol=1e-5 * min(truth[-1], L))
@@ -189,16 +189,16 @@ def test_the_tip_follows_its_own_law_while_the_payload_falls(case):
 
 def test_below_the_yield_pressure_the_payload_falls_and_the_tip_stays():
     trial = HANGING.trial(pressure_Pa=2e3, tail_slack="free")
-    got = simulate(MODEL, trial, np.linspace(0, 0.2, 20))
+    got = vt.simulate(MODEL, trial, np.linspace(0, 0.2, 20))
     assert got.slack_from_s == 0.0
     assert np.all(got.lead_position_m == 0)
     # Eq. (2) as written lets the weight of the payload pull the tip along.
     taut = replace(trial, tail_slack="taut")
-    assert simulate(MODEL, taut, np.linspace(0, 0.2, 20)).lead_position_m[-1] > 1e-5
+    assert vt.simulate(MODEL, taut, np.linspace(0, 0.2, 20)).lead_position_m[-1] > 1e-5
 
 
 def test_a_slack_phase_that_fails_states_the_time():
     """No step meets a tolerance of nothing: the tail goes slack at release and gets no further."""
     trial = HANGING.trial(pressure_Pa=7e3, tail_slack="free")
     with pytest.raises(SimulationError):
-        simulate(MODEL, trial, np.linspace(0, 0.2, 20), relative_tolerance=0.0)
+        vt.simulate(MODEL, trial, np.linspace(0, 0.2, 20), relative_tolerance=0.0)

@@ -9,9 +9,9 @@ import pytest
 from by_hand import ATM, LEVEL, LOADED, RT_AIR, G, N, Vine, assert_same_motion, followed, simulated
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
+import vinetrack as vt
 from vinetrack.core.records import Bend
 from vinetrack.dynamics.audit import evaluate
-from vinetrack.dynamics.model import make_model
 
 
 def test_capstan_friction_as_printed_is_a_constant():
@@ -59,8 +59,8 @@ def test_the_order_in_which_a_model_is_put_together_does_not_matter():
     names = ["inlet_loss", "leak", "wall_stretch", "reservoir_depletion", "pressure_gauge", "pressure_gain"]
     base = ["pressure_drive", "gravity", "eversion_damping", "yield_pressure"]
     motion = (np.linspace(0, 0.1, 30), np.linspace(0, 0.25, 30), np.linspace(0, 3, 30))
-    forwards = evaluate(make_model([*base, *names]), LOADED.trial(), *motion)
-    backwards = evaluate(make_model([*names[::-1], *base]), LOADED.trial(), *motion)
+    forwards = evaluate(vt.make_model([*base, *names]), LOADED.trial(), *motion)
+    backwards = evaluate(vt.make_model([*names[::-1], *base]), LOADED.trial(), *motion)
     np.testing.assert_array_equal(forwards.pressure_Pa, backwards.pressure_Pa)
     np.testing.assert_array_equal(forwards.area_m2, backwards.area_m2)
 

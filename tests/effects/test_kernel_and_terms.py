@@ -17,12 +17,13 @@ from numba import njit
 from own_effect import NAME, write_effect
 
 import vinetrack
+import vinetrack as vt
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.equations import TrialArrays
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import Model, effects_on
-from vinetrack.dynamics.simulate import simulate, trial_inputs
+from vinetrack.dynamics.model import effects_on
+from vinetrack.dynamics.simulate import trial_inputs
 from vinetrack.effects import Effect, catalogue
 
 PACKAGE = Path(vinetrack.__file__).parent
@@ -38,7 +39,7 @@ def callable_parts(effects: tuple[Effect, ...]) -> tuple:
 
 
 def accelerations(
-    model: Model, trial: Trial, time: np.ndarray, y: np.ndarray, v: np.ndarray, chamber: np.ndarray | None = None
+    model: vt.Model, trial: Trial, time: np.ndarray, y: np.ndarray, v: np.ndarray, chamber: np.ndarray | None = None
 ) -> list[float]:
     """Of the tail, by the compiled rates, at these pressures of the chamber (none: as at release)."""
     chamber_at_release, acceleration = callable_parts(model.effects)
@@ -104,7 +105,7 @@ def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau):
     sizes = {"supply_refill.tau": tau, "supply_refill.gamma": 1.4, "eversion_damping.B": LOADED.B}
     model = whole_catalogue(sizes)
     times = np.linspace(0, 0.15, 1501)
-    got = simulate(model, LOADED.trial(), times)
+    got = vt.simulate(model, LOADED.trial(), times)
     terms = evaluate(model, LOADED.trial(), times, got.lead_position_m, got.lead_velocity_m_s)
     # Ṗ by hand, at points of the motion: what the table of pressures says changes as its equation asks.
     P, y, ydot, A = terms.pressure_Pa, got.lead_position_m, got.lead_velocity_m_s, LOADED.A
@@ -147,8 +148,8 @@ def test_the_usual_tolerance_gives_what_a_thousandth_of_it_gives():
     for seed in range(60):
         vine, sizes = mixture(seed)
         model = whole_catalogue(sizes)
-        usual = simulate(model, vine.trial(), TIMES).lead_position_m
-        exact = simulate(model, vine.trial(), TIMES, relative_tolerance=1e-7).lead_position_m
+        usual = vt.simulate(model, vine.trial(), TIMES).lead_position_m
+        exact = vt.simulate(model, vine.trial(), TIMES, relative_tolerance=1e-7).lead_position_m
         # Of the distance; where it hardly moves, and sets off by a hair (a latch as strong as the drive), of L/10.
         assert np.max(np.abs(usual - exact)) <= 1e-5 * max(exact[-1], 0.1 * vine.L), seed
 
@@ -156,6 +157,6 @@ def test_the_usual_tolerance_gives_what_a_thousandth_of_it_gives():
 def test_a_vine_that_stops_and_creeps_on_is_nowhere_else_meanwhile():
     # Seed 1025: friction brings it to rest between two frames while the drive exceeds what holds it by a hair.
     vine, sizes = mixture(1025)
-    found = simulate(whole_catalogue(sizes), vine.trial(), TIMES).lead_position_m
+    found = vt.simulate(whole_catalogue(sizes), vine.trial(), TIMES).lead_position_m
     assert np.all(np.diff(found) >= -1e-9)
     assert found.max() < vine.L

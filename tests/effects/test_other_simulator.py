@@ -16,7 +16,7 @@ from hidden.questions import outsider_values, true_effects
 from hidden.verify import FRAME_S, SIZES, ours, trials
 
 import vinetrack as vt
-from vinetrack.dynamics.model import Model, host_for
+from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
 from vinetrack.inference.fit_data import pairs_of
@@ -34,7 +34,7 @@ def test_every_candidate_that_a_release_can_show_is_hidden_in_some_campaign():
     assert set(SIZES) == {"", *EFFECTS}
 
 
-def with_only(effect: str) -> Model:
+def with_only(effect: str) -> vt.Model:
     """The base model with one effect at its size."""
     model = vt.base_model() + effect if effect else vt.base_model()
     size = {f"{effect}.{name}": value for name, value in SIZES[effect][1].items()}
@@ -80,7 +80,7 @@ def test_a_force_of_no_catalogue_is_the_one_that_scoring_knows(name):
     values = {"eversion_damping.B": B, "eversion_damping.n": N, **outsider_values(truth)}
     model = (vt.base_model() + true_effects((), name)[0]).with_values(values)
     # In one compiled model for all of them.
-    host = Model((*vt.base_model(), *(true_effects((), outsider)[0] for outsider in OUTSIDERS)))
+    host = vt.Model((*vt.base_model(), *(true_effects((), outsider)[0] for outsider in OUTSIDERS)))
     theirs = simulate_many(model, [trial], [TIMES], host=host, relative_tolerance=1e-7)[0].lead_position_m
     seen = other[:, 1] < 0.95 * trial.length_m
     plain, _ = follow(TIMES, tube, Physics(B=B, n=N), np.empty((0, 3)))

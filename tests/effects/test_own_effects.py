@@ -14,10 +14,9 @@ from by_hand import LOADED, followed
 from click.testing import Result
 from typer.testing import CliRunner
 
+import vinetrack as vt
 from vinetrack.cli.main import app
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import base_model, make_model
-from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import Effect, EffectError, air_drag, catalogue, load_effect
 from vinetrack.effects._catalogue import _is_independent_of_path, behaviour_faults, own_effects
 
@@ -51,10 +50,10 @@ def written(folder: Path, text: str = BRUSH, name: str = "brush.py") -> Path:
 
 def test_it_is_simulated_like_any_other(tmp_path):
     brush = own_effects([written(tmp_path)])
-    model = make_model([*base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
+    model = vt.make_model([*vt.base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
     travel = followed(lambda _t, x, v: (LOADED.base(x, v) - 0.8 * max(x, 0.0) ** 0.5) / LOADED.m(x), 1.8 * LOADED.L)
     times = np.linspace(0, travel.end, 41)  # type: ignore[attr-defined]
-    got = simulate(model, LOADED.trial(), times).lead_position_m
+    got = vt.simulate(model, LOADED.trial(), times).lead_position_m
     np.testing.assert_allclose(got, travel(times) / 2, rtol=0, atol=1e-5 * LOADED.L)
 
 
@@ -67,7 +66,7 @@ def copies(folder: Path, text: str) -> list[Effect]:
 
 def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(tmp_path):
     one, other = copies(tmp_path, BRUSH)
-    assert kernel((base_model() + one).effects) is kernel((base_model() + other).effects)
+    assert kernel((vt.base_model() + one).effects) is kernel((vt.base_model() + other).effects)
     for effect, name in ((one, "a"), (other, "b")):
         assert effect.path == tmp_path / name / "brush.py"
         assert effect.functions["tail_force"].__code__.co_filename == str(effect.path)
@@ -82,7 +81,7 @@ def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path, line):
     assert not _is_independent_of_path(f"{BRUSH}\n{line}\n".encode())
     if "brushes" not in line:
         one, other = copies(tmp_path, f"{BRUSH}\n{line}\n")
-        assert kernel((base_model() + one).effects) is not kernel((base_model() + other).effects)
+        assert kernel((vt.base_model() + one).effects) is not kernel((vt.base_model() + other).effects)
 
 
 def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path, monkeypatch):

@@ -13,12 +13,10 @@ from lsoda_vine import B_TRUE, FPS, N_TRUE, NOISE_M, ar1, as_track, filmed, grow
 import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.replicates import first_that_counts
-from vinetrack.dynamics.simulate import SimulationError, simulate
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference import solving
 from vinetrack.inference.fit import fit_subset, predict_prepared
-from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.fit_summary import film_influence
 from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.inference.sensitivity import Predictor
 
@@ -273,7 +271,7 @@ def slow_campaign() -> list[tuple[Trial, Track]]:
     truth = vt.base_model().with_values({"eversion_damping.B": 6.0, "eversion_damping.n": N_SLOW})
     for k, (height_Pa, rise_s) in enumerate(((12e3, 0.3), (16e3, 0.3), (20e3, 0.5))):
         pressure_Pa = height_Pa * -np.expm1(-time_s / rise_s)
-        y = simulate(truth, SLOW, time_s, trace=(time_s, pressure_Pa)).lead_position_m
+        y = vt.simulate(truth, SLOW, time_s, trace=(time_s, pressure_Pa)).lead_position_m
         noise_m = 1e-4 * np.random.default_rng(40 + k).standard_normal(time_s.size)
         stated = replace(SLOW, name=f"slow{k}", yield_pressure_Pa=P_Y_TRUE - 2.5e3)
         pairs.append((stated, as_track(time_s, y + noise_m, pressure_Pa)))
@@ -318,15 +316,15 @@ def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypa
 )
 def test_gravity_moves_no_such_ball(change):
     trial, track = ball(20400)
-    with pytest.raises(FitError):
+    with pytest.raises(vt.FitError):
         vt.fit(vt.make_model(["gravity"]), [(replace(trial, **change), track)])
 
 
 def test_pressures_below_those_of_the_yield_and_unknown_parameters_are_refused():
     pairs, _ = small_campaign(seed=8, replicates=1)
-    with pytest.raises(FitError):
+    with pytest.raises(vt.FitError):
         vt.fit(vt.base_model(), [(replace(t, yield_pressure_Pa=1.5 * t.pressure_Pa), track) for t, track in pairs])
-    with pytest.raises(FitError):
+    with pytest.raises(vt.FitError):
         vt.fit(vt.base_model(), pairs, fixed=("b",))
 
 
@@ -350,10 +348,10 @@ def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(campaign):
     stays = pairs[0][0].vine
     alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
     assert {number.vine for number in alone.numbers} == {"", stays}
-    with pytest.raises(FitError):
+    with pytest.raises(vt.FitError):
         vt.predict(alone, [next(pair for pair in pairs if pair[0].vine != stays)])
     for keep in (["elsewhere"], [False] * len(whole.trials), [True, False]):
-        with pytest.raises(FitError):
+        with pytest.raises(vt.FitError):
             fit_subset(whole, keep)
 
 
@@ -391,9 +389,9 @@ def test_film_influence_agrees_with_refits_with_heavier_film():
         other = vt.fit(vt.base_model(), heavier, profile=False)
         squares += np.square([b.value - a.value for a, b in zip(fit.numbers, other.numbers, strict=True)])
     keys = [number.key for number in fit.numbers]
-    moved, by_refit = film_influence(fit), np.sqrt(squares)
+    moved, by_refit = vt.film_influence(fit), np.sqrt(squares)
     of_law = [k for k, key in enumerate(keys) if key.startswith("eversion_damping")]
     assert moved[of_law] == pytest.approx(by_refit[of_law], rel=0.2)
     n = keys.index("eversion_damping.n")
     assert moved[n] > fit.numbers[n].sigma
-    assert not film_influence(vt.refit(fit, fit.model + "film_mass")).any()
+    assert not vt.film_influence(vt.refit(fit, fit.model + "film_mass")).any()

@@ -12,20 +12,8 @@ from scipy.linalg import toeplitz
 from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
+from vinetrack.inference import marginal_likelihood as marginal
 from vinetrack.inference.fit_result import _deviate
-from vinetrack.inference.marginal_likelihood import (
-    FitState,
-    MixedProblem,
-    at_prior_means,
-    bounded_solve,
-    deviance,
-    estimate_between_trial_sd,
-    estimate_noise,
-    levenberg_marquardt_step,
-    marginal,
-    trial_deviation_sd,
-    without_deviations,
-)
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
 from vinetrack.inference.position_errors import degrees_of_freedom, precision
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
@@ -37,8 +25,8 @@ def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
     return np.asarray(sigma**2 * toeplitz(rho ** np.arange(count)))
 
 
-def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> MixedProblem:
-    return MixedProblem(
+def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> marginal.MixedProblem:
+    return marginal.MixedProblem(
         index=np.tile(np.arange(keys), (n_trials, 1)),
         has_deviation=np.tile([False, True], (n_trials, 1)),
         gauge_error=np.zeros(n_trials),
@@ -55,9 +43,9 @@ def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> Mixe
     )
 
 
-def state_of(n_trials: int, keys: int, spread: float, rho: float = RHO, sigma: float = SIGMA) -> FitState:
+def state_of(n_trials: int, keys: int, spread: float, rho: float = RHO, sigma: float = SIGMA) -> marginal.FitState:
     variance = np.full(n_trials, sigma**2 * (1 - rho**2))
-    return FitState(np.zeros(keys), np.zeros((n_trials, 4)), (1e-5, spread), rho, variance)
+    return marginal.FitState(np.zeros(keys), np.zeros((n_trials, 4)), (1e-5, spread), rho, variance)
 
 
 def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarray]:
@@ -95,8 +83,8 @@ def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd, moved):
     effects = np.tile([moved, -moved, 0.0, 0.0], (n_trials, 1))
     frame = frame_of(n_trials, count, keys, flat_sd)
     state = replace(state_of(n_trials, keys, spread), trial_effects=effects)
-    part = marginal(crossed(columns), frame, state)
-    found = deviance(part, frame, state, state.spread, restricted=False)
+    part = marginal.marginal(crossed(columns), frame, state)
+    found = marginal.deviance(part, frame, state, state.spread, restricted=False)
     # The same by brute force: shared numbers by least squares, then the density of what is left.
     noise = covariance(count, RHO, SIGMA)
     for c in columns:
@@ -120,7 +108,9 @@ def test_residuals_at_zero_deviations_are_restored():
         column[:, -1] += column[:, 2:4] @ effects[2:]
     white = at_correlation(crossed(columns), RHO)
     frame = replace(frame_of(3, 15, 2), release_origin_precision=np.zeros((3, 2)))
-    assert at_prior_means(white, frame, state, -1) == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
+    assert marginal.at_prior_means(white, frame, state, -1) == pytest.approx(
+        at_correlation(crossed(whole), RHO), rel=1e-9
+    )
 
 
 def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions():
@@ -146,7 +136,7 @@ def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions():
         for j in range(i + 1, 4):
             part = whole[j][i] / pivot[i]
             whole[j] = [a - part * b for a, b in zip(whole[j], pivot, strict=True)]
-    left, log_det = without_deviations(np.array(block, dtype=float)[None], np.array([roots], dtype=float))
+    left, log_det = marginal.without_deviations(np.array(block, dtype=float)[None], np.array([roots], dtype=float))
     exact = np.array([[float(value) for value in row[2:]] for row in whole[2:]])
     assert np.triu(left[0]) == pytest.approx(np.triu(exact), rel=1e-3)
     assert log_det == pytest.approx(math.log(determinant), rel=1e-9)
@@ -156,7 +146,7 @@ def test_collinear_parameters_are_left_to_least_squares():
     draw = np.random.default_rng(10)
     rows, seen = draw.standard_normal((30, 4)), draw.standard_normal(30)
     twice = np.column_stack([rows, rows[:, 1]])
-    step, _ = bounded_solve(twice.T @ twice, twice.T @ seen, frame_of(1, 5, 5), np.zeros(5))
+    step, _ = marginal.bounded_solve(twice.T @ twice, twice.T @ seen, frame_of(1, 5, 5), np.zeros(5))
     assert twice @ step == pytest.approx(rows @ np.linalg.lstsq(rows, seen, rcond=None)[0], abs=1e-9)
     assert step[1] == pytest.approx(step[4])
 
@@ -164,8 +154,10 @@ def test_collinear_parameters_are_left_to_least_squares():
 def test_the_restricted_likelihood_adds_the_information():
     columns = columns_of(4, 20, 2, seed=3)
     frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
-    part = marginal(crossed(columns), frame, state)
-    more = deviance(part, frame, state, state.spread) - deviance(part, frame, state, state.spread, restricted=False)
+    part = marginal.marginal(crossed(columns), frame, state)
+    more = marginal.deviance(part, frame, state, state.spread) - marginal.deviance(
+        part, frame, state, state.spread, restricted=False
+    )
     covariance_of_numbers = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
     assert more == pytest.approx(-np.linalg.slogdet(covariance_of_numbers.covariance)[1], rel=1e-8)
 
@@ -179,7 +171,9 @@ def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance():
     means = np.array([c[:, -1].mean() for c in columns])
     cross_products = crossed(columns)
     frame, state = frame_of(n_trials, count, 1), state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
-    found = estimate_between_trial_sd(marginal(cross_products, frame, state), frame, state, (False, True))
+    found = marginal.estimate_between_trial_sd(
+        marginal.marginal(cross_products, frame, state), frame, state, (False, True)
+    )
     solution = Solution(replace(state, spread=found), frame, cross_products, (), (False, True), True, 1)
     assert found[1] == pytest.approx(math.sqrt(means.var(ddof=1) - 0.01**2 / 25), rel=2e-3)
     assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
@@ -198,8 +192,8 @@ def test_two_between_trial_standard_deviations_are_found_from_any_start(start):
         columns.append(np.column_stack([own, slope, seen]))
     frame = replace(frame_of(n_trials, count, 1), has_deviation=np.ones((n_trials, 2), dtype=bool))
     state = replace(state_of(n_trials, 1, 0.0, rho=0.0, sigma=1e-4), spread=start)
-    part = marginal(crossed(columns), frame, state)
-    pressure, damping = estimate_between_trial_sd(part, frame, state, (True, True))
+    part = marginal.marginal(crossed(columns), frame, state)
+    pressure, damping = marginal.estimate_between_trial_sd(part, frame, state, (True, True))
     assert pressure == pytest.approx(0.004, rel=0.4)
     assert damping == pytest.approx(0.02, rel=0.4)
 
@@ -216,7 +210,7 @@ def test_noise_is_estimated_without_the_bias_of_fitted_parameters():
         columns.append(np.column_stack([flat, np.zeros((count, 2)), noise]))
     cross_products = crossed(columns)
     frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
-    found, variance = estimate_noise(cross_products, frame, state)
+    found, variance = marginal.estimate_noise(cross_products, frame, state)
     # 9000 points: ρ to 0.01, σ² to 2 %. Without counting the line ρ would come out 0.06 too small.
     assert found == pytest.approx(rho, abs=0.03)
     assert variance.mean() == pytest.approx(1 - rho**2, rel=0.05)
@@ -231,7 +225,7 @@ def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_diffe
     columns = [np.column_stack([np.zeros((count, 4)), s * draw.standard_normal(count)]) for s in sd]
     cross_products = crossed(columns)
     frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
-    _, variance = estimate_noise(cross_products, frame, state, rho=0.0)
+    _, variance = marginal.estimate_noise(cross_products, frame, state, rho=0.0)
     alone = np.array([np.mean(block[:, -1] ** 2) for block in columns])
     assert lowest < np.std(np.log(variance)) / np.std(np.log(alone)) < highest
     assert np.mean(variance) == pytest.approx(np.mean(alone), rel=0.1)
@@ -239,7 +233,7 @@ def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_diffe
 
 def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge():
     frame = replace(frame_of(3, 25, 1), gauge_error=np.array([0.0, 4e-3, 0.0]))
-    assert trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(
+    assert marginal.trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(
         np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]])
     )
 
@@ -278,7 +272,7 @@ def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed):
     # At their bounds from the start, near them, and free of them.
     theta = np.clip(draw.uniform(-2, 3, 6), -1, 2)
     problem = replace(frame_of(1, 5, 6), lower=np.full(6, -1.0), upper=np.full(6, 2.0), free=free)
-    step, _ = bounded_solve(square, slope, problem, theta)
+    step, _ = marginal.bounded_solve(square, slope, problem, theta)
     target = np.linalg.lstsq(columns.T, slope, rcond=None)[0]
     exact = lsq_linear(columns[:, free], target, (-1 - theta[free], 2 - theta[free]), tol=1e-14, method="bvls").x
     best = exact @ (2 * slope[free] - square[np.ix_(free, free)] @ exact)
@@ -296,7 +290,9 @@ def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping, bo
     frame = replace(frame_of(n_trials, count, keys), lower=np.full(keys, -bound), upper=np.full(keys, bound))
     state = state_of(n_trials, keys, 0.5)
     starts = np.arange(count) == 0
-    step, own, predicted = levenberg_marquardt_step(all_products(columns, [starts] * n_trials), frame, state, damping)
+    step, own, predicted = marginal.levenberg_marquardt_step(
+        all_products(columns, [starts] * n_trials), frame, state, damping
+    )
 
     def cost(theta: np.ndarray, effects: np.ndarray) -> float:
         left = [c[:, -1] - c[:, 4:6] @ theta - c[:, :4] @ u for c, u in zip(columns, effects, strict=True)]
@@ -314,8 +310,8 @@ def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence():
         each[:, -1] += each[:, 5]
     frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
     cross_products = crossed(columns)
-    assert levenberg_marquardt_step(cross_products, frame, state, 1e6)[2] < CONVERGED_DECREASE
+    assert marginal.levenberg_marquardt_step(cross_products, frame, state, 1e6)[2] < CONVERGED_DECREASE
     (step, _, decrease), damping = _next_step(cross_products, frame, state, 1e6, CONVERGED_DECREASE)
     assert decrease > CONVERGED_DECREASE
     assert damping == 0
-    assert step == pytest.approx(levenberg_marquardt_step(cross_products, frame, state, 0.0)[0])
+    assert step == pytest.approx(marginal.levenberg_marquardt_step(cross_products, frame, state, 0.0)[0])

@@ -13,18 +13,11 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
+from vinetrack.inference import solving
 from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.robust_covariance import recorded_pressures, systematics_of
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
-from vinetrack.inference.solving import (
-    as_recorded,
-    assemble,
-    solve_onward,
-    trace_error_penalty,
-    trace_error_step,
-    with_fitted_trace_errors,
-)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +40,7 @@ def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, lab
     told = np.concatenate([each.trace_error_sizes for each in fit.predictor.data if each.trace_error_sizes is not None])
     assert told.size > 12
     assert 0.4 < np.sqrt(np.mean(told**2)) < 1.6
-    assert trace_error_penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
+    assert solving.trace_error_penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
 
 
 def test_an_error_of_a_trace_is_estimated(fit):
@@ -62,8 +55,8 @@ def test_an_error_of_a_trace_is_estimated(fit):
     assert told is not None
     data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * errors_Pa[:, 0]), trace_error_sizes=told)
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
-    solution = solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
-    back, _ = with_fitted_trace_errors(moved, solution, FixedTerms())
+    solution = solving.solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
+    back, _ = solving.with_fitted_trace_errors(moved, solution, FixedTerms())
     after = back.data[which]
     assert after.trace_error_sizes is not None
     assert after.trace_error_sizes[0] - told[0] == pytest.approx(-2.0, abs=0.5)
@@ -86,14 +79,16 @@ def test_trace_errors_suggest_no_exponent_per_vine(fit):
 def test_estimated_errors_enter_the_likelihood(fit):
     data = [replace(each, trace_error_sizes=None) for each in fit.predictor.data]
     predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
-    free = assemble(predictor, fit.solution, {}, fit.options, profile=False)
-    assert free.log_likelihood - fit.log_likelihood == pytest.approx(0.5 * trace_error_penalty(fit.predictor.data))
-    assert trace_error_penalty(fit.predictor.data) > 1.0
+    free = solving.assemble(predictor, fit.solution, {}, fit.options, profile=False)
+    assert free.log_likelihood - fit.log_likelihood == pytest.approx(
+        0.5 * solving.trace_error_penalty(fit.predictor.data)
+    )
+    assert solving.trace_error_penalty(fit.predictor.data) > 1.0
 
 
 def test_the_tests_see_the_pressures_that_were_recorded(fit):
     state = fit.solution.state
-    recorded = Predictor(fit.predictor.layout, list(map(as_recorded, fit.predictor.data)), fit.predictor.host)
+    recorded = Predictor(fit.predictor.layout, list(map(solving.as_recorded, fit.predictor.data)), fit.predictor.host)
     there = recorded.residuals(state.theta, state.trial_effects)
     errors = systematics_of(fit.predictor, fit.solution, fit.trials)
     seen = errors.at_zero_errors(fit.solution.columns)
@@ -129,7 +124,7 @@ def test_errors_without_influence_on_the_motion_are_zero(fit):
     deaf = replace(fit.solution, state=replace(state, variance=1e8 * state.variance))
     felt = [each for each in fit.predictor.data if each.trace_errors_Pa is not None]
     far = [replace(each, trace_error_sizes=np.full(each.trace_errors_Pa.shape[1], 3.0)) for each in felt]
-    moved = trace_error_step(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf)
+    moved = solving.trace_error_step(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf)
     for back, each in zip(moved, far, strict=True):
         np.testing.assert_allclose(back[: each.trace_error_sizes.size], -3.0, atol=0.05)
 

@@ -9,58 +9,45 @@ from typing import Any
 import numpy as np
 import pytest
 
+import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.model import make_model
-from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.experiment.sheet import planned_trial
+from vinetrack.planning import prediction
 from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
-from vinetrack.planning.prediction import (
-    GAMMAS,
-    Room,
-    chamber_for,
-    fastest,
-    final_speeds,
-    final_with,
-    gauge_loss,
-    predict_vine,
-    supplied_chamber,
-    supplied_loss,
-    swept_m3,
-)
-from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
-EXACT = StatedValues(n=0.37, spreads=(0.0, 0.0))
+EXACT = vt.StatedValues(n=0.37, spreads=(0.0, 0.0))
 SIZES = {"diameter_mm": 24, "thickness_um": 200, "length_mm": 280, "pressure_kPa": 28, "yield_pressure_kPa": 3}
 
 
 def trial(**values: object) -> Trial:
-    return planned_trial({name: str(value) for name, value in {**SIZES, "chamber_l": 3.7, **values}.items()}).trials[0]
+    return vt.planned_trial({name: str(value) for name, value in {**SIZES, "chamber_l": 3.7, **values}.items()}).trials[
+        0
+    ]
 
 
-def room(pressure_kPa: float = 62, **values: object) -> Room:
+def room(pressure_kPa: float = 62, **values: object) -> prediction.Room:
     options = {name: str(values.pop(name)) for name in ("payload_g", "growth_angle_deg") if name in values}
-    rig = planned_trial({"yield_pressure_kPa": "3", **options}, needed=()).trials[0]
+    rig = vt.planned_trial({"yield_pressure_kPa": "3", **options}, needed=()).trials[0]
     known: dict[str, object] = {"films_m": (100e-6,), "diameter_m": (5e-3, 25e-3), "length_m": (0.1, 0.4)}
-    return Room(pressure_Pa=1e3 * pressure_kPa, rig=rig, **{**known, "burst_share": 1.0, **values})  # type: ignore[arg-type]
+    return prediction.Room(pressure_Pa=1e3 * pressure_kPa, rig=rig, **{**known, "burst_share": 1.0, **values})  # type: ignore[arg-type]
 
 
 def test_the_papers_fast_vine_is_the_fastest_of_its_setup():
     """25 mm and 40 cm were the largest the setup held; 62 kPa is just under burst for 100 µm."""
-    best = fastest(room(), EXACT, samples=50)[0].prediction.inputs.trial
+    best = prediction.fastest(room(), EXACT, samples=50)[0].prediction.inputs.trial
     assert (best.diameter_m, best.length_m, best.pressure_Pa) == pytest.approx((0.025, 0.4, 62e3), rel=1e-3)
 
 
 def test_no_vine_of_a_fine_grid_is_faster():
     limits = room(pressure_kPa=60, diameter_m=(10e-3, 60e-3), length_m=(0.1, 0.3), payload_g=20)
-    (choice,) = fastest(limits, EXACT, samples=50)
+    (choice,) = prediction.fastest(limits, EXACT, samples=50)
     grid = [
-        predictive_inputs(limits.trial(D, 100e-6, L), EXACT)
+        vt.predictive_inputs(limits.trial(D, 100e-6, L), EXACT)
         for D in np.linspace(10e-3, 60e-3, 41)
         for L in np.linspace(0.1, 0.3, 9)
     ]
-    speeds = [final_speeds(inputs.model, [inputs.trial], 0.95)[0] for inputs in grid]
+    speeds = [prediction.final_speeds(inputs.model, [inputs.trial], 0.95)[0] for inputs in grid]
     assert choice.prediction.final.median > 0.995 * max(speeds)
     assert (choice.prediction.final.name, choice.prediction.final.y_over_L) == ("ejection speed of the payload", 1.0)
 
@@ -70,8 +57,8 @@ def test_at_the_burst_stress_acceleration_is_the_same_for_every_film():
     limits = room(1000, films_m=(50e-6, 200e-6), burst_share=0.5, growth_angle_deg=90)
     limits = replace(limits, rig=replace(limits.rig, yield_pressure_Pa=0.0))
     sights = [
-        predict_vine(
-            predictive_inputs(limits.trial(D, film, 0.4), StatedValues(B=1e-9, n=0.37, spreads=(0.0, 0.0))),
+        prediction.predict_vine(
+            vt.predictive_inputs(limits.trial(D, film, 0.4), vt.StatedValues(B=1e-9, n=0.37, spreads=(0.0, 0.0))),
             samples=2,
             at_fraction=0.8,
         )
@@ -83,32 +70,32 @@ def test_at_the_burst_stress_acceleration_is_the_same_for_every_film():
     assert speeds[1] == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("gamma", GAMMAS.values())
+@pytest.mark.parametrize("gamma", prediction.GAMMAS.values())
 @pytest.mark.parametrize("loss", [0.01, 0.05, 0.5])
 def test_a_chamber_that_is_sized_loses_just_what_it_may(gamma, loss):
-    assert gauge_loss(trial(), chamber_for(trial(), loss, gamma), gamma) == pytest.approx(loss)
+    assert prediction.gauge_loss(trial(), prediction.chamber_for(trial(), loss, gamma), gamma) == pytest.approx(loss)
     # The paper's injector: 1.7 per cent of the volume are 5.3 of gauge.
     small = trial(diameter_mm=2.5, thickness_um=50, length_mm=12.5, pressure_kPa=48, chamber_l=math.pi * 1.125e-3)
-    assert swept_m3(small) / small.chamber_m3 == pytest.approx(0.017, abs=5e-4)
-    assert gauge_loss(small, small.chamber_m3, 1.0) == pytest.approx(0.053, abs=5e-4)
+    assert prediction.swept_m3(small) / small.chamber_m3 == pytest.approx(0.017, abs=5e-4)
+    assert prediction.gauge_loss(small, small.chamber_m3, 1.0) == pytest.approx(0.053, abs=5e-4)
 
 
 def test_speeds_with_a_chamber_are_those_of_the_effect():
-    inputs = predictive_inputs(trial(payload_g=35.6), StatedValues(B=6.44, n=0.37))
-    model = make_model([*inputs.model.names, "reservoir_depletion"]).with_values(
+    inputs = vt.predictive_inputs(trial(payload_g=35.6), vt.StatedValues(B=6.44, n=0.37))
+    model = vt.make_model([*inputs.model.names, "reservoir_depletion"]).with_values(
         {**inputs.model.values, "reservoir_depletion.gamma": 1.0}
     )
     times = np.linspace(0.0, 1.0, 20_001)
-    found = simulate(model, inputs.trial, times)
-    assert final_with(inputs, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
+    found = vt.simulate(model, inputs.trial, times)
+    assert prediction.final_with(inputs, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
 
 
 def test_a_quick_supply_saves_a_chamber():
-    inputs = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
-    closed = chamber_for(inputs.trial, 0.05, 1.4)
-    volumes = [supplied_chamber(inputs, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
+    inputs = vt.predictive_inputs(trial(), vt.StatedValues(B=6.44, n=0.37))
+    closed = prediction.chamber_for(inputs.trial, 0.05, 1.4)
+    volumes = [prediction.supplied_chamber(inputs, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
     assert volumes[0] < volumes[1] < closed
-    assert supplied_loss(inputs, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
+    assert prediction.supplied_loss(inputs, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
 
 
 def made(pressure_kPa: float, **more: object) -> Trial:

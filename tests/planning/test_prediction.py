@@ -13,9 +13,6 @@ from lsoda_vine import grown_position, small_campaign
 import vinetrack as vt
 from vinetrack.core import published
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.model import make_model
-from vinetrack.dynamics.simulate import simulate
-from vinetrack.experiment.sheet import planned_trial
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.planning import predictive_inputs as guess
@@ -28,7 +25,6 @@ from vinetrack.planning.prediction import (
     VinePrediction,
     design_checks,
     neglected,
-    predict_vine,
     run,
 )
 from vinetrack.planning.predictive_inputs import (
@@ -37,10 +33,8 @@ from vinetrack.planning.predictive_inputs import (
     YIELD,
     FitNumbers,
     Size,
-    StatedValues,
     damping_prior,
     fit_numbers,
-    predictive_inputs,
     pressure_problems,
     read_sizes,
 )
@@ -55,16 +49,16 @@ VINE = dict(zip(SIZES, (24, 200, 280, 28), strict=True))
 
 def trial(**values: object) -> Trial:
     said = {**FAST, "yield_pressure_sigma_kPa": "0", **{name: str(value) for name, value in values.items()}}
-    return planned_trial(said).trials[0]
+    return vt.planned_trial(said).trials[0]
 
 
 def unsaid(**values: object) -> Trial:
     said = {**dict(zip(SIZES, (25, 100, 400, 62), strict=True)), **values}
-    return planned_trial({name: str(value) for name, value in said.items()}).trials[0]
+    return vt.planned_trial({name: str(value) for name, value in said.items()}).trials[0]
 
 
 def certain(one: Trial, B: float, n: float = 0.37, **said: object) -> object:
-    return predictive_inputs(one, StatedValues(B=B, n=n, spreads=(0.0, 0.0), **said))  # type: ignore[arg-type]
+    return vt.predictive_inputs(one, vt.StatedValues(B=B, n=n, spreads=(0.0, 0.0), **said))  # type: ignore[arg-type]
 
 
 def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it():
@@ -86,7 +80,7 @@ def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_
     one = trial(yield_pressure_kPa=2, growth_angle_deg=90)
     film = 1200 * math.pi * 25e-3 * 100e-6
     force = 0.5 * 60e3 * math.pi * 25e-3**2 / 4
-    prediction = predict_vine(certain(one, 1e-9), samples=2, at_fraction=0.8)
+    prediction = vt.predict_vine(certain(one, 1e-9), samples=2, at_fraction=0.8)
     assert prediction[TAIL].median == pytest.approx(math.sqrt(4 * force / film * math.log(5)), rel=2e-3)
     assert prediction[EDGE].median == pytest.approx(prediction[TAIL].median / 2)
     assert prediction[TENSION].median == pytest.approx(force, rel=1e-6)
@@ -94,7 +88,7 @@ def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_
 
 def test_time_and_speed_are_those_of_another_integrator():
     one = trial(**VINE, yield_pressure_kPa=3, payload_g=35.6)
-    prediction = predict_vine(certain(one, 6.44), samples=2)
+    prediction = vt.predict_vine(certain(one, 6.44), samples=2)
     times = np.linspace(0, 0.3, 30_001)
     truth = grown_position(one, times, 6.44, 0.37)
     there = np.interp(0.95 * 0.28, truth[np.isfinite(truth)], times[np.isfinite(truth)])
@@ -106,7 +100,7 @@ def test_time_and_speed_are_those_of_another_integrator():
 def test_the_tension_is_what_the_tip_leaves_of_the_drive():
     """T₁ = ½(P − P_y)A − ½Bẋⁿ all along: 35.6 g pull the tail slack at 14 kPa, in the equation."""
     one = trial(**{**VINE, "pressure_kPa": 14}, yield_pressure_kPa=3, payload_g=35.6)
-    prediction = predict_vine(certain(one, 6.44), samples=2)
+    prediction = vt.predict_vine(certain(one, 6.44), samples=2)
     curve = prediction.curve
     force = 0.5 * 11e3 * math.pi * 24e-3**2 / 4
     expected = force - 0.5 * 6.44 * curve["tail_velocity_m_s"] ** 0.37
@@ -118,11 +112,12 @@ def test_the_tension_is_what_the_tip_leaves_of_the_drive():
 
 def test_bands_are_those_of_the_one_thing_that_is_uncertain():
     """Speed falls as the yield pressure rises: its quantiles are the speeds at the quantiles of that."""
-    inputs = predictive_inputs(planned_trial(FAST).trials[0], StatedValues(B=3.3, n=0.37, spreads=(0.0, 0.0)))
-    prediction = predict_vine(inputs, samples=1500)
+    inputs = vt.predictive_inputs(vt.planned_trial(FAST).trials[0], vt.StatedValues(B=3.3, n=0.37, spreads=(0.0, 0.0)))
+    prediction = vt.predict_vine(inputs, samples=1500)
     drawn = np.quantile(inputs.draw(1500, 1)[YIELD], BAND, method="inverted_cdf")
     speeds = [
-        predict_vine(certain(trial(yield_pressure_kPa=P_y / 1e3), 3.3), samples=1).quantities[0].median for P_y in drawn
+        vt.predict_vine(certain(trial(yield_pressure_kPa=P_y / 1e3), 3.3), samples=1).quantities[0].median
+        for P_y in drawn
     ]
     assert [prediction[EDGE].high, prediction[EDGE].median, prediction[EDGE].low] == pytest.approx(speeds, rel=2e-3)
     (share,) = prediction.shares
@@ -130,8 +125,8 @@ def test_bands_are_those_of_the_one_thing_that_is_uncertain():
 
 
 def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time():
-    inputs = predictive_inputs(planned_trial(FAST).trials[0])
-    prediction = predict_vine(inputs, samples=300)
+    inputs = vt.predictive_inputs(vt.planned_trial(FAST).trials[0])
+    prediction = vt.predict_vine(inputs, samples=300)
     runs = run(inputs, prediction.curve["lead_position_m"].to_numpy(), 300, 1)
     when = float(prediction.curve["time_high_90_s"].iloc[60])
     positions = [float(np.interp(when, times, runs.places_m)) for times in runs.time_s]
@@ -159,18 +154,18 @@ def fitted(n_trials: int = 2, B_is_estimated: bool = True) -> FitNumbers:
 
 def test_what_a_person_says_goes_before_the_fit_and_the_fit_before_the_guess():
     numbers = fitted()
-    assert predictive_inputs(unsaid(**VINE), StatedValues(B=5.0), numbers).medians[B] == 5.0
-    assert predictive_inputs(unsaid(**VINE), None, numbers).medians[B] == pytest.approx(6.0)
-    assert predictive_inputs(unsaid()).medians[B] == pytest.approx(3.32, abs=0.005)
+    assert vt.predictive_inputs(unsaid(**VINE), vt.StatedValues(B=5.0), numbers).medians[B] == 5.0
+    assert vt.predictive_inputs(unsaid(**VINE), None, numbers).medians[B] == pytest.approx(6.0)
+    assert vt.predictive_inputs(unsaid()).medians[B] == pytest.approx(3.32, abs=0.005)
 
 
 def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a_factor_three():
-    draws = predictive_inputs(unsaid()).draw(40_000, seed=1)[YIELD]
+    draws = vt.predictive_inputs(unsaid()).draw(40_000, seed=1)[YIELD]
     assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)
 
 
 def test_draws_from_a_fit_have_its_covariance():
-    inputs = predictive_inputs(unsaid(**VINE), StatedValues(spreads=(0.0, 0.0)), fitted())
+    inputs = vt.predictive_inputs(unsaid(**VINE), vt.StatedValues(spreads=(0.0, 0.0)), fitted())
     draws = inputs.draw(40_000, seed=3)
     found = np.cov([np.log(draws[B]), draws[N], draws[YIELD] / 1e5])
     # ln B has 0.06/6 = 1 %, and n the correlation −0.00048/(0.06 × 0.01) = −0.8 with it.
@@ -180,14 +175,14 @@ def test_draws_from_a_fit_have_its_covariance():
 
 def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials():
     """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
-    inputs = predictive_inputs(unsaid(**VINE), None, fitted(13, B_is_estimated=False))
+    inputs = vt.predictive_inputs(unsaid(**VINE), None, fitted(13, B_is_estimated=False))
     draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
     assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
     assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
 
 
 def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess():
-    inputs = predictive_inputs(unsaid(diameter_mm=24, thickness_um=100, length_mm=280), None, fitted())
+    inputs = vt.predictive_inputs(unsaid(diameter_mm=24, thickness_um=100, length_mm=280), None, fitted())
     assert inputs.medians[B] == pytest.approx(3.0)  # half the wall, half of B
     assert [(note.code, note.facts["vine"]) for note in inputs.notes] == [("B_carried_over", "24mm-200um-280mm")]
     assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
@@ -195,12 +190,12 @@ def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess()
 
 def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed():
     numbers = fitted()
-    assert predictive_inputs(unsaid(**VINE, yield_pressure_kPa=3), None, numbers).medians[YIELD] == 3200.0
-    assert predictive_inputs(unsaid(**VINE, yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
+    assert vt.predictive_inputs(unsaid(**VINE, yield_pressure_kPa=3), None, numbers).medians[YIELD] == 3200.0
+    assert vt.predictive_inputs(unsaid(**VINE, yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
 
 
 def test_the_same_seed_gives_the_same_draws_and_vines_share_what_they_have_in_common():
-    one, other = predictive_inputs(unsaid()), predictive_inputs(unsaid(length_mm=300))
+    one, other = vt.predictive_inputs(unsaid()), vt.predictive_inputs(unsaid(length_mm=300))
     assert np.array_equal(one.draw(50, 7)[B], one.draw(50, 7)[B])
     assert np.array_equal(one.draw(50, 7)[N], other.draw(50, 7)[N])
     assert not np.array_equal(one.draw(50, 7, ["guess of B"])[B], other.draw(50, 7, ["guess of B"])[B])
@@ -208,7 +203,7 @@ def test_the_same_seed_gives_the_same_draws_and_vines_share_what_they_have_in_co
 
 def test_a_fit_from_python_is_believed_as_its_file_is():
     found = vt.fit(vt.base_model(), small_campaign(seed=5)[0])
-    inputs = predictive_inputs(unsaid(**VINE), None, found)
+    inputs = vt.predictive_inputs(unsaid(**VINE), None, found)
     n = found["n"]
     draws = inputs.draw(20_000, 1)
     assert (np.mean(draws[N]), np.std(draws[N])) == pytest.approx((n.value, (n.high - n.low) / 3.92), rel=0.05)
@@ -282,9 +277,9 @@ def test_a_wrong_unit_of_pressure_is_suspected_and_a_right_one_is_not(
 SAFE = dict(zip(SIZES, (18, 150, 250, 24), strict=True)) | {"growth_angle_deg": 180, "chamber_l": 50}
 
 
-def prediction(said: StatedValues | None = None, tail_slack: str = "taut", **values: object) -> VinePrediction:
+def prediction(said: vt.StatedValues | None = None, tail_slack: str = "taut", **values: object) -> VinePrediction:
     safe = unsaid(**{**SAFE, "yield_pressure_kPa": 3, **values})
-    return predict_vine(predictive_inputs(replace(safe, tail_slack=tail_slack), said), samples=60)
+    return vt.predict_vine(vt.predictive_inputs(replace(safe, tail_slack=tail_slack), said), samples=60)
 
 
 def test_a_sound_vine_has_no_hazard():
@@ -323,15 +318,15 @@ def test_a_tail_that_may_go_slack_does():
 def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in():
     inputs = prediction().inputs
     drag = next(one for one in neglected(inputs, 0.95) if one.effect == "air_drag")
-    model = make_model([*inputs.model.names, "air_drag"]).with_values(inputs.model.values)
-    found = simulate(model, inputs.trial, np.linspace(0, 2.0, 20_001))
+    model = vt.make_model([*inputs.model.names, "air_drag"]).with_values(inputs.model.values)
+    found = vt.simulate(model, inputs.trial, np.linspace(0, 2.0, 20_001))
     speed = np.interp(0.95 * 0.25, found.lead_position_m, found.lead_velocity_m_s)
     assert drag.final_m_s == pytest.approx(speed, rel=1e-3)
     assert drag.change < 0
 
 
 def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_those_left_out():
-    said = StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=1")[1])
+    said = vt.StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=1")[1])
     names = {one.effect for one in neglected(prediction(said).inputs, 0.95)}
     assert "air_drag" not in names
     assert "inlet_loss" not in names  # no inlet in the sheet
