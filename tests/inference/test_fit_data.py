@@ -25,10 +25,7 @@ STEP_M = 2e-3
 
 def rounded(seed: int, step_m: float = STEP_M):
     pairs, truth = small_campaign(seed)
-    return [
-        (trial, replace(track, lead_position_m=np.round(track.lead_position_m / step_m) * step_m))
-        for trial, track in pairs
-    ], truth
+    return [(t, replace(x, lead_position_m=np.round(x.lead_position_m / step_m) * step_m)) for t, x in pairs], truth
 
 
 def test_a_rest_counts_as_one_point_where_rounding_hides_its_noise():
@@ -59,45 +56,33 @@ def test_origins_of_rounded_tracks_have_the_stated_errors():
         fit = vt.fit(vt.base_model(), pairs, profile=False)
         known = {trial.name: each for (trial, _), each in zip(pairs, truth, strict=True)}
         errors += [(t.origin_m - known[t.name]["origin_m"]) / t.origin_sigma_m for t in fit.trials]
-        (n,) = [number for number in fit.numbers if number.symbol == "n"]
-        assert abs(n.value - N_TRUE) < 3 * n.sigma
+        assert abs(fit["n"].value - N_TRUE) < 3 * fit["n"].sigma
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
-
-
-# Points of unequal noise in a fit: the same estimates as from data divided by their noise.
 
 
 def test_weighted_products_are_those_of_columns_divided_by_their_noise():
     draw = np.random.default_rng(20000)
     first = np.isin(np.arange(60), [0, 25])
     columns, relative_sd = draw.standard_normal((60, 3)), np.exp(draw.uniform(-1, 1, 60))
-    np.testing.assert_array_equal(
-        products(columns, first, relative_sd), products(columns / relative_sd[:, None], first)
-    )
-    white = whiten(columns, first, 0.4, relative_sd)
-    np.testing.assert_allclose(
-        at_correlation(products(columns, first, relative_sd)[None], 0.4)[0], white.T @ white, rtol=1e-12
-    )
+    weighted, white = products(columns, first, relative_sd), whiten(columns, first, 0.4, relative_sd)
+    np.testing.assert_array_equal(weighted, products(columns / relative_sd[:, None], first))
+    np.testing.assert_allclose(at_correlation(weighted[None], 0.4)[0], white.T @ white, rtol=1e-12)
 
 
 def test_trials_are_weighted_where_noise_grows_with_speed():
     """Sixteen fast vines filmed with 0.06 mm of noise and a blur of as many µs."""
-    pairs, true_sd = [], []
+    pairs, true_sd, vine = [], [], Vine(2, 10.0)
+    known = {"diameter_m": vine.diameter_m, "thickness_m": 1e-4, "pressure_Pa": 3e4, "yield_pressure_Pa": 1e3}
     for i in range(16):
         draw = np.random.default_rng(20100 + i)
-        vine = Vine(2, 10.0)
         made = record(vine, draw, noise_m=6e-5)
         blurred = 6e-5 * made.lead_velocity_m_s
         positions = made.track.lead_position_m + blurred * draw.standard_normal(blurred.size)
-        trial = Trial(
-            name=f"t{i}", diameter_m=vine.diameter_m, thickness_m=1e-4, pressure_Pa=3e4, yield_pressure_Pa=1e3
-        )
-        pairs.append((trial, replace(made.track, lead_position_m=positions)))
+        pairs.append((Trial(name=f"t{i}", **known), replace(made.track, lead_position_m=positions)))
         true_sd.append(np.hypot(6e-5, blurred))
     data, left_out = prepare(pairs)
     assert not left_out
     for item, true in zip(data, true_sd, strict=True):
-        assert item.relative_sd is not None
         assert np.mean(np.log(item.relative_sd)) == pytest.approx(0.0, abs=1e-12)
         # Thirty moving frames a trial, differences as good as 185 points in all: 5 % is its standard error.
         assert item.blur_s == pytest.approx(6e-5, rel=0.15)
@@ -111,16 +96,10 @@ def test_trials_are_weighted_where_noise_grows_with_speed():
 def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials():
     # A payload that rubs and a pressure that is lower move one trial in exactly the same way. The jump at the end of
     # growth, different for the two as their steps have different signs, once passed for knowledge of μ_p to 1e-4.
-    bare = [trial for trial in sheet() if trial.vine == sheet()[0].vine]
-    trials = [
-        replace(trial, name=f"{trial.name}_{load:g}", payload_kg=load, growth_angle_rad=math.pi / 2)
-        for trial in bare
-        for load in (0.0, 0.03)
-    ]
-    virtual = grown(
-        trials, 20_411, ["payload_friction"], {"payload_friction.mu_p": 0.3},
-        damping_scatter=2e-3, pressure_scatter=5e-3, noise_m=2e-5, frames_after_end=4,
-    )  # fmt: skip
+    bare = [replace(trial, growth_angle_rad=math.pi / 2) for trial in sheet() if trial.vine == sheet()[0].vine]
+    trials = [replace(t, name=f"{t.name}_{load:g}", payload_kg=load) for t in bare for load in (0.0, 0.03)]
+    care = {"damping_scatter": 2e-3, "pressure_scatter": 5e-3, "noise_m": 2e-5, "frames_after_end": 4}
+    virtual = grown(trials, 20_411, ["payload_friction"], {"payload_friction.mu_p": 0.3}, **care)
     fit = vt.fit(vt.base_model(), pairs_of(virtual), profile=False)
     candidates = candidates_of(fit.model, ["payload_friction"], None)
     questions = misfit_tests(fit, hypotheses.testable(candidates, fit.predictor.data)[0], FALSE_ALARM_LEVEL_FIRST_ROUND)
