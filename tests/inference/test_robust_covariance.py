@@ -29,6 +29,7 @@ from vinetrack.inference.robust_covariance import (
 
 Pairs = list[tuple[Trial, Track]]
 FALL = vt.make_model(["gravity", "air_drag"])
+MOSTLY = 0.9  # part of a trial's positions within its 95 % band, of a trial that counts as held
 
 
 def misread(seed: int) -> Pairs:
@@ -95,10 +96,9 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch):
 @pytest.mark.parametrize("trials", [2, 4, 7])
 def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials):
     """Each pulls the mean towards itself by 1/N: what is left of them has the variance (1 − 1/N)σ², degrees N − 1."""
-    draw = np.random.default_rng(20690)
+    found, draw = [], np.random.default_rng(20690)
     solution = SimpleNamespace(problem=SimpleNamespace(prior_precision=np.zeros(1)))
     information, plain = np.full((trials, 1, 1), 25.0), np.array([[1 / (25.0 * trials)]])
-    found = []
     for _ in range(3000):
         values = 0.2 * draw.standard_normal(trials)
         scores = 25.0 * (values - values.mean())[:, None]
@@ -117,15 +117,19 @@ def dropped(name: str, seed: int, drag: float, noise_m: float = 2e-3) -> tuple[T
     return trial, as_track(time_s, fallen_m + np.random.default_rng(seed).normal(0, noise_m, time_s.size))
 
 
+def scattering(seed: int, campaign: int, count: int) -> Pairs:
+    """Drops whose drag scatters by a tenth."""
+    draw = np.random.default_rng([seed, campaign])
+    return [dropped(f"t{i}", seed + 10 * campaign + i, 0.5 + 0.05 * draw.standard_normal()) for i in range(count)]
+
+
 def test_the_error_of_two_drops_is_half_their_difference():
     """The drag fitted to two drops with 0.574 and 0.459, each known to 0.006; its interval contains both."""
-    drops = [dropped("a", 20200, 0.574), dropped("b", 20201, 0.459)]
-    both = vt.fit(FALL, drops)["C_D"]
+    both = vt.fit(FALL, [dropped("a", 20200, 0.574), dropped("b", 20201, 0.459)])["C_D"]
     assert both.value == pytest.approx(0.5165, abs=0.02)
     assert both.sigma == pytest.approx(0.0575, rel=0.2)
     assert both.dof == pytest.approx(1.0, abs=0.1)
-    assert both.low < 0.459
-    assert both.high > 0.574
+    assert both.low < 0.459 < 0.574 < both.high
 
 
 def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighted_by_their_noise():
@@ -141,36 +145,22 @@ def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighte
 def test_intervals_from_few_drops_contain_the_true_drag():
     held = []
     for campaign in range(40):
-        draw = np.random.default_rng([20300, campaign])
-        count = 3 + campaign % 4
-        drops = [dropped(f"t{i}", 20300 + 10 * campaign + i, 0.5 + 0.05 * draw.standard_normal()) for i in range(count)]
-        drag = vt.fit(FALL, drops, profile=False)["C_D"]
+        drag = vt.fit(FALL, scattering(20300, campaign, 3 + campaign % 4), profile=False)["C_D"]
         held.append(drag.low < 0.5 < drag.high)
     assert sum(held) >= 34  # of 40 at 95 %, fewer once in 600
 
 
-# Errors clustered by specimen or day where the sheet states enough of them.
-
-
-def trials(specimens: int, days: int = 0, count: int = 24) -> list[Trial]:
-    groups = [(f"s{i % specimens}" if specimens else "", f"{i % days}" if days else "") for i in range(count)]
-    return [Trial(name=f"t{i}", vine="v", specimen=one, day=day) for i, (one, day) in enumerate(groups)]
-
-
-def test_the_coarsest_sufficient_groups_are_used():
-    assert len(set(coarsest_groups(trials(8, days=12)))) == 8
-    assert len(set(coarsest_groups(trials(3, days=12)))) == 12
-    assert len(set(coarsest_groups(trials(0)))) == 24
-    assert len(set(coarsest_groups(trials(2, days=3)))) == 24
+@pytest.mark.parametrize(("specimens", "days", "groups"), [(8, 12, 8), (3, 12, 12), (0, 0, 24), (2, 3, 24)])
+def test_the_coarsest_sufficient_groups_are_used(specimens, days, groups):
+    told = [(f"s{i % specimens}" if specimens else "", f"{i % days}" if days else "") for i in range(24)]
+    trials = [Trial(name=f"t{i}", vine="v", specimen=one, day=day) for i, (one, day) in enumerate(told)]
+    assert len(set(coarsest_groups(trials))) == groups
 
 
 def test_errors_shared_by_a_group_enter_the_covariance():
-    generator = np.random.default_rng(7)
-    groups = [f"s{i % 12}" for i in range(48)]
-    seen = []
+    draw, groups, seen = np.random.default_rng(7), [f"s{i % 12:02}" for i in range(48)], []
     for _ in range(400):
-        shared = dict(zip(sorted(set(groups)), generator.standard_normal(12), strict=True))
-        single = np.array([[shared[group]] for group in groups]) + 0.1 * generator.standard_normal((48, 1))
+        single = np.tile(draw.standard_normal((12, 1)), (4, 1)) + 0.1 * draw.standard_normal((48, 1))
         seen.append(group_scatter(single - single.mean(axis=0), groups, 1)[0, 0])
     # 12 groups of 4 with a shared error of variance 1 and single ones of 0.01: 12 · 16 + 48 · 0.01.
     assert abs(np.mean(seen) / 192.5 - 1) < 0.05
@@ -190,17 +180,13 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     assert np.max(by_day / alone) > 1.2
 
 
-# Errors and intervals of a fit where statistics prescribe them. Seeds from 20640, which were not used for tuning.
-
-
 @pytest.mark.parametrize("trials", [5, 7])
 def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_interval(trials):
     """Replicates of one condition whose B scatters by far more than any is measured: Student's problem."""
     draw = np.random.default_rng([20640, trials])
-    pairs, factors = [], np.exp(0.04 * draw.standard_normal(trials))
-    for k, factor in enumerate(factors):
-        trial = replace(vine_trial(f"t{k}", 20), vine="v", condition="c")
-        pairs.append((trial, filmed(trial, draw, damping=float(factor))[0]))
+    factors = np.exp(0.04 * draw.standard_normal(trials))
+    vines = [replace(vine_trial(f"t{k}", 20), vine="v", condition="c") for k in range(trials)]
+    pairs = [(trial, filmed(trial, draw, damping=f)[0]) for trial, f in zip(vines, factors.tolist(), strict=True)]
     model = vt.base_model().with_values({"eversion_damping.n": 0.4})
     found = vt.fit(model, pairs, fixed=["n", "P_y"], profile=False)
     B = found["B"]
@@ -211,29 +197,17 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     assert half_width / (B.sigma / B.value) == pytest.approx(student.ppf(0.975, B.dof), rel=1e-3)
 
 
-# The next trial lies within its 95 % band, given between-trial scatter and model misfit.
-
-MOSTLY = 0.9  # part of a trial's positions within its band, of a trial that counts as held
-
-
-def next_of(pairs: list, model: vt.Model, place: int) -> TrialFit:
-    """One trial predicted from all others."""
-    return vt.predict(vt.fit(model, [*pairs[:place], *pairs[place + 1 :]], profile=False), [pairs[place]])[0]
+def last_of(drops: Pairs) -> TrialFit:
+    """The last drop predicted from all others."""
+    return vt.predict(vt.fit(FALL, drops[:-1], profile=False), drops[-1:])[0]
 
 
 @pytest.mark.slow
 def test_the_next_of_scattering_drops_is_within_its_band():
-    held = []
-    for campaign in range(30):
-        draw = np.random.default_rng([20600, campaign])
-        count = 4 + campaign % 3
-        drops = [dropped(f"t{i}", 20600 + 10 * campaign + i, 0.5 + 0.05 * draw.standard_normal()) for i in range(count)]
-        held.append(next_of(drops, FALL, count - 1).within_band >= MOSTLY)
+    held = [last_of(scattering(20600, c, 4 + c % 3)).within_band >= MOSTLY for c in range(30)]
     assert sum(held) >= 26  # of 30 at 95 %, fewer once in 300
 
 
 def test_the_band_of_drops_that_agree_is_their_noise():
-    drops = [dropped(f"t{i}", 20650 + i, 0.5) for i in range(6)]
-    band_m = next_of(drops, FALL, 5).band_m
-    assert band_m is not None
-    assert np.median(band_m) == pytest.approx(1.96 * 2e-3, rel=0.2)
+    last = last_of([dropped(f"t{i}", 20650 + i, 0.5) for i in range(6)])
+    assert np.median(last.band_m) == pytest.approx(1.96 * 2e-3, rel=0.2)

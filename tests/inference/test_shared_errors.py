@@ -42,11 +42,9 @@ def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():
     rng, z = np.random.default_rng(3), []
     for seed in range(12):
         pairs, _ = small_campaign(seed, damping=5e-3, pressure=2e-3, replicates=3)
-        off_Pa = {vine: 300.0 * rng.standard_normal() for vine in {trial.vine for trial, _ in pairs}}
-        misread = [
-            (replace(t, yield_pressure_Pa=t.yield_pressure_Pa + off_Pa[t.vine], yield_pressure_sigma_Pa=300.0), track)
-            for t, track in pairs
-        ]
+        stated = {vine: 3e3 + 300.0 * rng.standard_normal() for vine in dict.fromkeys(trial.vine for trial, _ in pairs)}
+        told = {vine: {"yield_pressure_Pa": P_y, "yield_pressure_sigma_Pa": 300.0} for vine, P_y in stated.items()}
+        misread = [(replace(trial, **told[trial.vine]), track) for trial, track in pairs]
         fit = vt.fit(vt.base_model(), misread, profile=False)
         z += [test.row["z"] for test in against_the_sheet(fit)]
     assert math.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.3)

@@ -51,14 +51,11 @@ def test_an_error_of_a_trace_is_estimated(fit):
     data = list(fit.predictor.data)
     clock_s, pressure_Pa = data[which].trace
     errors_Pa, told = data[which].trace_errors_Pa, data[which].trace_error_sizes
-    assert errors_Pa is not None
-    assert told is not None
     data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * errors_Pa[:, 0]), trace_error_sizes=told)
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
     solution = solving.solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
     back, _ = solving.with_fitted_trace_errors(moved, solution, FixedTerms())
     after = back.data[which]
-    assert after.trace_error_sizes is not None
     assert after.trace_error_sizes[0] - told[0] == pytest.approx(-2.0, abs=0.5)
     assert np.max(np.abs(after.trace[1] - pressure_Pa)) < 0.3 * np.max(np.abs(2.0 * errors_Pa[:, 0]))
 
@@ -129,8 +126,6 @@ def test_errors_without_influence_on_the_motion_are_zero(fit):
         np.testing.assert_allclose(back[: each.trace_error_sizes.size], -3.0, atol=0.05)
 
 
-# Trials with a pressure recorded by a noisy gauge: the remaining error is not taken for missing physics.
-
 GAUGE_NOISE_PA = 100.0
 
 
@@ -138,8 +133,7 @@ GAUGE_NOISE_PA = 100.0
 def traced():
     """Sixteen trials; the gauge sees each pressure as it is, not as it was set, give or take 0.1 kPa a sample."""
     pairs, truth = small_campaign(seed=21)
-    draw = np.random.default_rng(21)
-    seen = []
+    seen, draw = [], np.random.default_rng(21)
     for (trial, track), true in zip(pairs, truth, strict=True):
         gauge_Pa = trial.pressure_Pa * true["pressure"] + GAUGE_NOISE_PA * draw.standard_normal(track.time_s.size)
         seen.append((trial, as_track(track.time_s, track.lead_position_m, gauge_Pa)))
@@ -161,7 +155,6 @@ def test_an_error_of_a_recorded_pressure_affects_its_own_trial_alone(traced):
     """The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds."""
     predictor = traced.predictor
     trace = predictor.data[3].trace
-    assert trace is not None
     ramp = np.linspace(-100.0, 100.0, trace[0].size)
     data = [replace(trial_data, trace_errors_Pa=None, trace_error_sizes=None) for trial_data in predictor.data]
     data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])

@@ -10,7 +10,6 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference import trial_effects
-from vinetrack.inference.fit import fit
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
 from vinetrack.inference.whitening import products, whiten
@@ -19,13 +18,8 @@ from vinetrack.inference.whitening import products, whiten
 @pytest.fixture(scope="module")
 def only_in_motion():
     """Eight trials, grown by scipy and let go 10 ms before the first frame that is kept."""
-    pairs, _ = small_campaign(seed=7, replicates=1)
-    seen = [track.time_s > 0.03 for _, track in pairs]
-    cut = [
-        (trial, as_track(track.time_s[keep], track.lead_position_m[keep]))
-        for (trial, track), keep in zip(pairs, seen, strict=True)
-    ]
-    return fit(vt.base_model(), cut)
+    pairs = [(trial, track, track.time_s > 0.03) for trial, track in small_campaign(seed=7, replicates=1)[0]]
+    return vt.fit(vt.base_model(), [(t, as_track(x.time_s[seen], x.lead_position_m[seen])) for t, x, seen in pairs])
 
 
 def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion):
@@ -51,9 +45,7 @@ def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho
     draw = np.random.default_rng(5)
     time_s, grid_s = np.linspace(0.0, 0.3, 41), 0.4 * np.linspace(0, 1, 60) ** 1.5
     curves, position_m, relative = draw.standard_normal((5, 60)), draw.standard_normal(41), draw.uniform(1, 3, 41)
-    first = np.zeros(41, dtype=bool)
-    first[[0, 17]] = True
-    releases_s = np.array([-0.2, 0.0, 0.013, 0.25])
+    first, releases_s = np.isin(np.arange(41), [0, 17]), np.array([-0.2, 0.0, 0.013, 0.25])
     products = products_at_releases(time_s, position_m, first, relative, releases_s, grid_s, curves, rho)
     for release_s, product in zip(releases_s, products, strict=True):
         columns = np.array([np.interp(np.maximum(time_s - release_s, 0.0), grid_s, curve) for curve in curves]).T
@@ -79,9 +71,7 @@ def test_a_jump_is_remembered_by_later_searches(only_in_motion, monkeypatch):
 
 def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motion):
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
-    theta = solution.state.theta.copy()
-    theta[0] += 0.3
-    start = replace(solution.state, theta=theta)
+    start = replace(solution.state, theta=solution.state.theta + 0.3 * (np.arange(solution.state.theta.size) == 0))
     led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, goal=solution.log_likelihood() - 1)
     assert led.converged
     assert led.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
