@@ -57,8 +57,7 @@ def test_gauge_then_chamber_then_leak_then_inlet_then_stretch():
 
 def test_the_order_in_which_a_model_is_put_together_does_not_matter():
     names = ["inlet_loss", "leak", "wall_stretch", "reservoir_depletion", "pressure_gauge", "pressure_gain"]
-    base = ["pressure_drive", "gravity", "eversion_damping", "yield_pressure"]
-    motion = (np.linspace(0, 0.1, 30), np.linspace(0, 0.25, 30), np.linspace(0, 3, 30))
+    base, motion = vt.base_model().names, [np.linspace(0, end, 30) for end in (0.1, 0.25, 3)]
     forwards = evaluate(vt.make_model([*base, *names]), LOADED.trial(), *motion)
     backwards = evaluate(vt.make_model([*names[::-1], *base]), LOADED.trial(), *motion)
     np.testing.assert_array_equal(forwards.pressure_Pa, backwards.pressure_Pa)
@@ -67,19 +66,16 @@ def test_the_order_in_which_a_model_is_put_together_does_not_matter():
 
 @pytest.mark.parametrize("name", ["reservoir_depletion.gamma", "leak.rate", "supply_refill.tau"])
 def test_a_measured_pressure_already_holds_what_happens_in_the_chamber(name):
-    times = np.linspace(0, 0.15, 50)
     trace = (np.array([0.0, 0.1, 0.2]), np.array([28e3, 24e3, 25e3]))
-    plain = simulated(LOADED, {}, times, trace).lead_position_m
-    np.testing.assert_array_equal(simulated(LOADED, {name: 1.2}, times, trace).lead_position_m, plain)
-    assert np.max(np.abs(simulated(LOADED, {name: 1.2}, times).lead_position_m - plain)) > 1e-4
+    plain = simulated(LOADED, {}, TIMES, trace).lead_position_m
+    np.testing.assert_array_equal(simulated(LOADED, {name: 1.2}, TIMES, trace).lead_position_m, plain)
+    assert np.max(np.abs(simulated(LOADED, {name: 1.2}, TIMES).lead_position_m - plain)) > 1e-4
 
 
+FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
+TIMES = np.linspace(0, 0.15, 50)
 P_S = 8e3
 UP_AND_DOWN = (np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), np.array([2e3, 12e3, 1e3, 1e3, 11e3, 11e3]))
-
-
-def pressure(t: float) -> float:
-    return float(np.interp(t, *UP_AND_DOWN))
 
 
 def by_hand(times: np.ndarray) -> tuple[np.ndarray, list[tuple[float, float]]]:
@@ -89,14 +85,13 @@ def by_hand(times: np.ndarray) -> tuple[np.ndarray, list[tuple[float, float]]]:
     for start, until in ((0.12, 0.74), (0.74, 1.0)):
 
         def slope(t: float, s: np.ndarray) -> list[float]:
-            force = 0.5 * (pressure(t) - vine.P_y) * vine.A - 0.5 * vine.B * max(s[1], 0.0) ** N
+            force = 0.5 * (np.interp(t, *UP_AND_DOWN) - vine.P_y) * vine.A - 0.5 * vine.B * max(s[1], 0.0) ** N
             return [max(s[1], 0.0), force / vine.m(s[0])]
 
         def stops(t: float, s: np.ndarray, start: float = start) -> float:
             return s[1] if t > start + 1e-3 else 1.0
 
-        stops.terminal = True  # type: ignore[attr-defined]
-        stops.direction = -1  # type: ignore[attr-defined]
+        stops.terminal, stops.direction = True, -1
         how = {"rtol": 1e-10, "atol": 1e-13, "dense_output": True, "max_step": 2e-3}
         done = solve_ivp(slope, (start, until), [x, 0.0], "LSODA", events=stops, **how)
         end = float(done.t[-1])
@@ -119,9 +114,6 @@ def test_stick_and_slip_under_a_pressure_that_rises_and_falls():
     assert np.all(got.lead_velocity_m_s[resting] == 0)
 
 
-TIMES = np.linspace(0, 0.15, 50)
-
-
 def test_below_p_s_it_never_starts_and_released_above_it_leaves_no_trace():
     got = simulated(LEVEL, {"static_yield.P_s": 30e3}, TIMES)
     assert got.status == "stalled"
@@ -129,9 +121,6 @@ def test_below_p_s_it_never_starts_and_released_above_it_leaves_no_trace():
     free = simulated(LEVEL, {}, TIMES).lead_position_m
     for P_s in (3e3, 20e3):
         np.testing.assert_array_equal(simulated(LEVEL, {"static_yield.P_s": P_s}, TIMES).lead_position_m, free)
-
-
-FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
 
 
 @pytest.mark.parametrize("first", [{"perspective.k": 0.2}, {"tail_stretch.compliance": 5e-8}], ids=["lens", "stretch"])
@@ -209,7 +198,7 @@ def test_a_supply_that_rises_starts_the_vine_once_it_overcomes_the_yield_pressur
         return held / vine.m(x) if v > 0 or held > 0 else 0.0
 
     travel = followed(acceleration, 1.8 * vine.L, max_step=1e-4)
-    times = np.linspace(0.0, travel.end, 61)  # type: ignore[attr-defined]
+    times = np.linspace(0.0, travel.end, 61)
     got = simulated(vine, {"supply_rise.tau": tau}, times).lead_position_m
     np.testing.assert_allclose(got, travel(times) / 2, rtol=0, atol=1e-5 * vine.L)
     assert simulated(vine, {}, times).lead_position_m[20] > got[20] + 5e-3

@@ -16,7 +16,6 @@ from by_hand import BARE, LOADED, N, Vine, whole_catalogue
 from numba import njit
 from own_effect import NAME, write_effect
 
-import vinetrack
 import vinetrack as vt
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics.audit import evaluate
@@ -26,7 +25,7 @@ from vinetrack.dynamics.model import effects_on
 from vinetrack.dynamics.simulate import trial_inputs
 from vinetrack.effects import Effect, catalogue
 
-PACKAGE = Path(vinetrack.__file__).parent
+PACKAGE = Path(vt.__file__).parent
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
 
 
@@ -60,10 +59,8 @@ def test_each_effect_and_all_together(name, vine):
     # A payload that weighs far less than stated: nothing is taken from the film.
     less = {"payload_mass.delta": -20e-3} if name == "payload_mass" else {}
     sizes = {f"{one}.{p.name}": p.default for one in names for p in catalogue()[one].parameters}
-    model = whole_catalogue(sizes | less)
-    trial = vine.trial(bends=BENDS)
-    time, y = np.linspace(0.01, 0.1, 25), np.linspace(0.01, 0.95 * vine.L, 25)
-    v = np.linspace(0.2, 12.0, 25)
+    model, trial = whole_catalogue(sizes | less), vine.trial(bends=BENDS)
+    time, y, v = (np.linspace(*ends, 25) for ends in ((0.01, 0.1), (0.01, 0.95 * vine.L), (0.2, 12.0)))
     terms = evaluate(model, trial, time, y, v)
     chamber = terms.pressure_Pa if name == "supply_refill" else None
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
@@ -90,10 +87,7 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
         folder.mkdir()
         write_effect(folder)
         environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache), "NUMBA_CACHE_DIR": ""}
-        run = subprocess.run(
-            [sys.executable, "-c", FALL], env=environment, cwd=folder, capture_output=True, text=True, check=True
-        )
-        said.append(run.stdout)
+        said.append(subprocess.check_output([sys.executable, "-c", FALL], env=environment, cwd=folder))
         compiled.append(sorted((path.name, path.stat().st_mtime_ns) for path in cache.rglob("kernel_*")))
     assert said[0] == said[1]
     assert compiled[0] == compiled[1]
@@ -102,8 +96,7 @@ def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_p
 
 @pytest.mark.parametrize("tau", [1e-4, 0.02, 1.0])
 def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau):
-    sizes = {"supply_refill.tau": tau, "supply_refill.gamma": 1.4, "eversion_damping.B": LOADED.B}
-    model = whole_catalogue(sizes)
+    model = whole_catalogue({"supply_refill.tau": tau, "supply_refill.gamma": 1.4, "eversion_damping.B": LOADED.B})
     times = np.linspace(0, 0.15, 1501)
     got = vt.simulate(model, LOADED.trial(), times)
     terms = evaluate(model, LOADED.trial(), times, got.lead_position_m, got.lead_velocity_m_s)
@@ -116,13 +109,11 @@ def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau):
 
 def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice():
     # At the end a bare vine's moving mass is its fold, λπt, and a quarter of the gas ρ_gas A L; nothing on top of it.
-    vine, rest = BARE, np.zeros(1)
-    model = whole_catalogue({"gas_inertia.factor": 1.0})
-    terms = evaluate(model, vine.trial(), rest, np.array([vine.L]), rest)
-    gas = (vine.P + 101_325) / (287 * 293) * vine.A * vine.L / 4
-    fold = vine.lam * math.pi * vine.t
+    vine, model = BARE, whole_catalogue({"gas_inertia.factor": 1.0})
+    at_end = model, vine.trial(), np.zeros(1), np.array([vine.L]), np.zeros(1)
+    terms, compiled = evaluate(*at_end), accelerations(*at_end)
+    gas, fold = (vine.P + 101_325) / (287 * 293) * vine.A * vine.L / 4, vine.lam * math.pi * vine.t
     assert terms.inertia_kg[0] == pytest.approx(fold + gas, rel=1e-9)
-    compiled = accelerations(model, vine.trial(), rest, np.array([vine.L]), rest)
     np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)
 
 
@@ -140,7 +131,7 @@ def mixture(seed: int) -> tuple[Vine, dict[str, float]]:
     sizes = {"eversion_damping.B": vine.B, "eversion_damping.n": N}
     for effect in sorted(catalogue().values(), key=lambda effect: effect.name in DRAWN_LAST):
         if effect.kind != "base" and rng.random() < 0.4:
-            sizes |= {f"{effect.name}.{p.name}": rng.uniform(*p.plausible) for p in effect.parameters}  # type: ignore[misc]
+            sizes |= {f"{effect.name}.{p.name}": rng.uniform(*p.plausible) for p in effect.parameters}
     return vine, sizes
 
 

@@ -22,6 +22,7 @@ from vinetrack.effects import catalogue
 from vinetrack.inference.fit_data import pairs_of
 
 B, N = 6.44, 0.37
+DAMPING = {"eversion_damping.B": B, "eversion_damping.n": N}
 WRITTEN_OUT = ("growth_angle", "lens", "moving_average", "rolling_shutter", "supply_rise", "trace_clock")
 """Effects that are held against a vine written out by hand instead (`test_by_hand`)."""
 
@@ -34,20 +35,13 @@ def test_every_candidate_that_a_release_can_show_is_hidden_in_some_campaign():
     assert set(SIZES) == {"", *EFFECTS}
 
 
-def with_only(effect: str) -> vt.Model:
-    """The base model with one effect at its size."""
-    model = vt.base_model() + effect if effect else vt.base_model()
-    size = {f"{effect}.{name}": value for name, value in SIZES[effect][1].items()}
-    return model.with_values({"eversion_damping.B": B, "eversion_damping.n": N, **size})
-
-
 @pytest.mark.parametrize("effect", SIZES, ids=lambda effect: effect or "base")
 def test_two_simulators_agree(effect):
+    size = {f"{effect}.{name}": value for name, value in SIZES[effect][1].items()}
+    model = (vt.base_model() + effect if effect else vt.base_model()).with_values(DAMPING | size)
+    host = host_for(model)  # the compiled model of the diagnoses, all its other effects at rest
     for rig in ("payload, down", "horizontal, slow", "bent", "reel"):
         trial = trials()[rig]
-        model = with_only(effect)
-        # In the compiled model of the diagnoses, all its other effects at rest.
-        host = host_for(model)
         theirs = simulate_many(model, [trial], [TIMES], host=host, relative_tolerance=1e-7)[0].observed_position_m
         other = ours(effect, trial, TIMES, B, N)
         seen = np.isfinite(other)
@@ -72,13 +66,11 @@ OUTSIDE = {
 def test_a_force_of_no_catalogue_is_the_one_that_scoring_knows(name):
     trial = trials()["bare, down"]
     physics = Physics(B=B, n=N, **OUTSIDE[name])
-    tube = Tube(
-        trial.pressure_Pa, trial.yield_pressure_Pa, trial.diameter_m, trial.thickness_m, trial.length_m, 0.0, 1.0
-    )
+    rig = ("pressure_Pa", "yield_pressure_Pa", "diameter_m", "thickness_m", "length_m")
+    tube = Tube(*(getattr(trial, name) for name in rig), 0.0, 1.0)
     other, _ = follow(TIMES, tube, physics, np.empty((0, 3)))
     truth = replace(make("null:few_trials", 900).truth, outsider=name, physics=physics)
-    values = {"eversion_damping.B": B, "eversion_damping.n": N, **outsider_values(truth)}
-    model = (vt.base_model() + true_effects((), name)[0]).with_values(values)
+    model = (vt.base_model() + true_effects((), name)[0]).with_values(DAMPING | outsider_values(truth))
     # In one compiled model for all of them.
     host = vt.Model((*vt.base_model(), *(true_effects((), outsider)[0] for outsider in OUTSIDERS)))
     theirs = simulate_many(model, [trial], [TIMES], host=host, relative_tolerance=1e-7)[0].lead_position_m

@@ -11,11 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from by_hand import LOADED, followed
-from click.testing import Result
-from typer.testing import CliRunner
+from commanded import run
 
 import vinetrack as vt
-from vinetrack.cli.main import app
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.effects import Effect, EffectError, air_drag, catalogue, load_effect
 from vinetrack.effects._catalogue import _is_independent_of_path, behaviour_faults, own_effects
@@ -150,21 +148,18 @@ def test_the_catalogue_passes_what_is_asked_of_a_users_own(name):
 
 
 def test_the_command_lists_it_and_draws_the_effects_of_the_catalogue(tmp_path):
-    def run(*arguments: object) -> Result:
-        return CliRunner().invoke(app, ["effects", *map(str, arguments)], catch_exceptions=False)
-
     (tmp_path / "in").mkdir()
     written(tmp_path)
     for folder, path in ((tmp_path, "brush.py"), (tmp_path / "in", "../brush.py")):
         (folder / "experiment.yaml").write_text(f"effects: [{path}]\n", encoding="utf-8")
-    done = run("--experiment", tmp_path)
+    done = run("effects", "--experiment", tmp_path)
     named = {line.split()[0] for line in done.stdout.splitlines()[1:] if not line.startswith("    ")}
     assert (done.exit_code, named) == (0, {*catalogue(), "brush"})
-    assert run("--experiment", tmp_path / "in").exit_code == 1  # it lies outside the experiment
-    assert run("air_drag", "--figure", tmp_path / "drag.png").exit_code == 0
+    assert run("effects", "--experiment", tmp_path / "in").exit_code == 1  # it lies outside the experiment
+    assert run("effects", "air_drag", "--figure", tmp_path / "drag.png").exit_code == 0
     assert (tmp_path / "drag.png").read_bytes().startswith(b"\x89PNG")
-    assert run("air_drag", "--figure", tmp_path / "drag.doc").exit_code == 1
-    assert run("--figure", tmp_path / "all.png").exit_code == 1
+    assert run("effects", "air_drag", "--figure", tmp_path / "drag.doc").exit_code == 1
+    assert run("effects", "--figure", tmp_path / "all.png").exit_code == 1
     assert not {"drag.doc", "all.png"} & {path.name for path in tmp_path.iterdir()}
 
 
