@@ -20,13 +20,13 @@ from vinetrack.effects import catalogue
 
 LOADED = HANGING.trial(pressure_Pa=14e3)
 VINE = replace(LOADED, payload_kg=0.0)
+BALL = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
 MODEL = vt.base_model().with_values({"eversion_damping.B": HANGING.B, "eversion_damping.n": N})
 
 
 def test_a_dropped_ball_falls_half_g_t_squared():
-    ball = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
     times_s = np.linspace(0, 2, 41)
-    found = vt.simulate(vt.make_model(["gravity"]), ball, times_s)
+    found = vt.simulate(vt.make_model(["gravity"]), BALL, times_s)
     np.testing.assert_allclose(found.lead_position_m, 0.5 * G * times_s**2, rtol=1e-10, atol=1e-14)
     np.testing.assert_allclose(found.lead_velocity_m_s, G * times_s, rtol=1e-8, atol=1e-12)
     assert found.status == "running"
@@ -54,7 +54,7 @@ def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial, B, n, rel
         return pull / mass + G * math.cos(trial.growth_angle_rad)
 
     truth = followed(acceleration, 2 * trial.length_m, until=1e6)
-    end = truth.end  # type: ignore[attr-defined]
+    end = truth.end
     times = np.linspace(0.01, 1, 60) * end * (1 - 1e-6)
     model = vt.base_model().with_values({"eversion_damping.B": B, "eversion_damping.n": n})
     found = vt.simulate(model, trial, np.append(times, 2 * end))
@@ -63,7 +63,7 @@ def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial, B, n, rel
     assert found.end_time_s == pytest.approx(end, rel=rel)
     np.testing.assert_allclose(found.lead_position_m[:-1], truth(times) / 2, rtol=0, atol=rel * trial.length_m)
     assert (found.lead_position_m[-1], found.lead_velocity_m_s[-1]) == (trial.length_m, 0.0)
-    assert found.end_lead_velocity_m_s == pytest.approx(truth.state(end)[1] / 2, rel=1e-3)  # type: ignore[attr-defined]
+    assert found.end_lead_velocity_m_s == pytest.approx(truth.state(end)[1] / 2, rel=1e-3)
 
 
 def test_the_result_does_not_depend_on_the_requested_times():
@@ -86,16 +86,10 @@ BAND = '''"""Band: a force that grows from a place along the way.
 
     tail force k (y − 0.1 m) from 0.1 m on
 """
-
 from vinetrack.effects import Parameter
-
 PARAMETERS = (Parameter("k", "k", "N/m", 500.0, bounds=(0.0, 1e4)),)
-
-
 def tail_force(s, rig, k):
     return k * max(s.lead_position - 0.1, 0.0)
-
-
 def breakpoints(rig):
     return (0.1,)
 '''
@@ -105,9 +99,8 @@ def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path
     """A ball that falls by g, and beyond 0.1 m is drawn on by k (y − 0.1 m): m z̈ = m g + k z."""
     (tmp_path / "band.py").write_text(BAND)
     model = vt.make_model(["gravity"]) + effects.load_effect(tmp_path / "band.py")
-    ball = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
     times_s = np.linspace(0, 0.2, 41)
-    found = vt.simulate(model, ball, times_s)
+    found = vt.simulate(model, BALL, times_s)
     root = math.sqrt(500.0 / 0.1)
     beyond = root * np.maximum(times_s - math.sqrt(0.2 / G), 0.0)
     drawn = 0.1 + math.sqrt(0.2 * G) / root * np.sinh(beyond) + G / root**2 * (np.cosh(beyond) - 1)
@@ -144,8 +137,8 @@ def by_hand(
     def taken_up(_t: float, s: np.ndarray) -> float:
         return s[0] - 2 * s[2]
 
-    tension.terminal = taken_up.terminal = True  # type: ignore[attr-defined]
-    tension.direction = taken_up.direction = -1  # type: ignore[attr-defined]
+    for event in (tension, taken_up):
+        event.terminal, event.direction = True, -1
     y, switches = np.zeros_like(times), []
     start, state, is_taut = 0.0, np.array([0.0, 0.0, 0.0, first_Pa]), True
     how = {"rtol": 1e-10, "atol": [1e-13, 1e-13, 1e-13, 1e-8], "dense_output": True, "max_step": 1e-3}
