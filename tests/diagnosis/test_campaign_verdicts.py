@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from grown import Pairs, grown, pairs_of
+from grown import Pairs, grown
+from grown import pairs_of as grown_pairs
 from hidden import make, shots
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
@@ -23,7 +24,7 @@ from vinetrack.core.units import with_error
 from vinetrack.diagnosis import likelihood_ratio
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, film_gain
 from vinetrack.diagnosis.misfit_tests import noise_in_motion_p
-from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
+from vinetrack.diagnosis.result import NOT_TESTABLE, Candidate, Diagnosis
 from vinetrack.diagnosis.score_test import (
     RANGE_SHARE_BESIDE_SLIP,
     effect_sensitivities,
@@ -35,7 +36,8 @@ from vinetrack.effects import catalogue
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import values_for_trial
-from vinetrack.inference.fit_result import Number, group_names, groups_of, make_layout
+from vinetrack.inference.fit_data import pairs_of
+from vinetrack.inference.fit_result import group_names, groups_of, make_layout
 from vinetrack.inference.optimiser import variance_floor
 from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.laboratory.tracks import Vine
@@ -53,9 +55,9 @@ def laboratory(folder: Path, row: str, seed: int, size: tuple[int, int], **more:
     return known.truth["truths"], vt.read_experiment(folder / "e")
 
 
-def numbers_of(said: Diagnosis, effect: str) -> tuple[Number, ...]:
+def row_of(said: Diagnosis, effect: str) -> Candidate:
     (row,) = (row for row in said.rounds[0].ranking if row.effect == effect)
-    return row.numbers
+    return row
 
 
 @pytest.mark.slow
@@ -79,12 +81,10 @@ def test_what_is_missing_is_in_the_answer_with_its_size_and_nothing_where_nothin
         return
     assert kind in said.answer_set
     assert len(said.answer_set) <= 2
-    numbers = {number.key: number for number in numbers_of(said, kind)}
+    numbers = {number.key: number for number in row_of(said, kind).numbers}
     for key, size in hidden.truth.values.items():
         assert abs(numbers[key].value - size) < 4 * numbers[key].sigma
 
-
-# Film that weighs other than thickness and density say: a size for each vine, asked of all and of each alone.
 
 FILM, DRAG = catalogue()["film_mass"], catalogue()["air_drag"]
 TRIALS = [Trial(name="t1", vine="a"), Trial(name="t2", vine="b")]
@@ -101,8 +101,8 @@ def answered(tmp_path_factory):
 def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
     truths, said = answered
     assert (said.verdict, said.answer_set) == ("artefact", ("film_mass",))
-    (named,) = [candidate for candidate in said.rounds[0].ranking if candidate.effect == "film_mass"]
-    (n,) = [number for number in named.along if number.key == "eversion_damping.n"]
+    named = row_of(said, "film_mass")
+    (n,) = (number for number in named.along if number.key == "eversion_damping.n")
     assert abs(n.value - truths["eversion_damping.n"]) < 2 * n.sigma
     assert f"Fitted together with film_mass, n = {with_error(n.value, n.sigma)} instead of" in said.explanation
     for k, number in enumerate(named.numbers):
@@ -114,8 +114,10 @@ def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_h
     assert [(s.group, s.other_groups) for s in shapes_of(FILM, TRIALS)] == [("", ()), ("a", ("b",)), ("b", ("a",))]
     assert not any(shape.group for shape in shapes_of(DRAG, TRIALS))
     known = [replace(trial, day=str(1 + k % 2)) for k, trial in enumerate(TRIALS)]
-    for of, days in ((known, ["", "day 1", "day 2"]), ([known[0], replace(known[1], day="")], [""]), (known[:1], [""])):
-        assert [shape.group for shape in shapes_of(catalogue()["time_base"], of)] == days
+    for of, days in ((known, ["day 1", "day 2"]), ([known[0], replace(known[1], day="")], []), (known[:1], [])):
+        assert [shape.group for shape in shapes_of(catalogue()["time_base"], of)] == ["", *days]
+        assert groups_of(of, "day") == (days or [""] * len(of))
+    assert group_names([replace(known[0], day=day) for day in ("10", "2", "2")], "day") == ["day 2", "day 10"]
 
 
 @pytest.mark.slow
@@ -143,42 +145,30 @@ def test_film_gains_what_a_fit_with_free_film_gains_less_its_prior(answered):
     assert film_gain(film_free) == 0
 
 
-def _ratio(effect, log_likelihood, gain=0.0):
-    fit = SimpleNamespace(log_likelihood=log_likelihood)
-    return LikelihoodRatio((effect,), fit, 0.0, 0.0, plausible=True, reason=Remark(), film_gain=gain)
-
-
-def _labels(*ratios):
-    return {ratio.label for ratio in answer_set(ratios)[0]}
-
-
-@pytest.fixture
-def unlike(monkeypatch):
-    """Hypotheses none of which predicts the curve of another."""
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ({"length_scale": (100, 0, 1), "air_drag": (86, 0, 1)}, {"length_scale"}),
+        ({"length_scale": (100, 0, 1), "air_drag": (86, 27, 1)}, {"length_scale", "air_drag"}),
+        # With film off the drag is the likeliest, and the leak as far behind it as without.
+        ({"length_scale": (100, 0, 1), "air_drag": (86, 50, 1), "leak": (80, 50, 1)}, {"length_scale", "air_drag"}),
+        ({"film_mass": (100, 0, 1), "air_drag": (86, 30, 1)}, {"film_mass"}),
+        ({"film_mass": (96, 0, 1), "air_drag": (86, 30, 1)}, {"film_mass", "air_drag"}),
+        # A form that contains the other gains 20 in −2 ln L: more than 9, less than 9 of noise three times as large.
+        ({"supply_refill": (110, 0, 1), "reservoir_depletion": (100, 0, 1)}, {"supply_refill"}),
+        ({"supply_refill": (110, 0, 3), "reservoir_depletion": (100, 0, 3)}, {"reservoir_depletion"}),
+    ],
+)
+def test_what_is_as_likely_with_film_a_little_off_is_not_excluded_unless_film_explains_all_alone(
+    monkeypatch, given, kept
+):
+    """By ln L, gain by film and inflation; none predicts the curve of another. A larger form must gain as much."""
     monkeypatch.setattr(likelihood_ratio, "_distance", lambda *_: 1e3)
-
-
-@pytest.mark.usefixtures("unlike")
-def test_what_is_as_likely_with_film_a_little_off_is_not_excluded_unless_film_explains_all_alone():
-    scale, drag, leak = (catalogue()[name] for name in ("length_scale", "air_drag", "leak"))
-    best = _ratio(scale, 100.0)
-    assert _labels(best, _ratio(drag, 86.0)) == {"length_scale"}
-    assert _labels(best, _ratio(drag, 86.0, 27.0)) == {"length_scale", "air_drag"}
-    # With film off the drag is the likeliest, and the leak as far behind it as without.
-    assert _labels(best, _ratio(drag, 86.0, 50.0), _ratio(leak, 80.0, 50.0)) == {"length_scale", "air_drag"}
-    assert _labels(_ratio(FILM, 100.0), _ratio(DRAG, 86.0, 30.0)) == {"film_mass"}
-    assert _labels(_ratio(FILM, 96.0), _ratio(DRAG, 86.0, 30.0)) == {"film_mass", "air_drag"}
-
-
-@pytest.mark.usefixtures("unlike")
-@pytest.mark.parametrize(("inflation", "kept"), [(1.0, {"supply_refill"}), (3.0, {"reservoir_depletion"})])
-def test_a_larger_form_must_gain_what_excludes_a_hypothesis(inflation, kept):
-    """A form that contains the other and gains 20 in −2 ln L: more than 9 of noise, less than 9 of noise three times
-    as large.
-    """
-    larger, contained = catalogue()["supply_refill"], catalogue()["reservoir_depletion"]
-    both = [replace(_ratio(larger, 110.0), inflation=inflation), replace(_ratio(contained, 100.0), inflation=inflation)]
-    assert _labels(*both) == kept
+    ratios = []
+    for name, (log_likelihood, gain, inflation) in given.items():
+        known = SimpleNamespace(log_likelihood=log_likelihood), 0.0, 0.0, True, Remark()
+        ratios.append(LikelihoodRatio((catalogue()[name],), *known, film_gain=gain, inflation=inflation))
+    assert {ratio.label for ratio in answer_set(ratios)[0]} == kept
 
 
 def test_two_predictions_are_as_far_apart_as_the_noise_of_the_fit_makes_them():
@@ -188,16 +178,12 @@ def test_two_predictions_are_as_far_apart_as_the_noise_of_the_fit_makes_them():
     expected = difference @ np.linalg.solve(variance / (1 - rho**2) * rho**lags, difference)
 
     def fit(position_m):
-        state = SimpleNamespace(rho=rho, variance=np.array([variance]))
-        data = [SimpleNamespace(relative_sd=None)]
+        solution = SimpleNamespace(state=SimpleNamespace(rho=rho, variance=np.array([variance])))
+        parts = {"predictor": SimpleNamespace(data=[SimpleNamespace(relative_sd=None)]), "solution": solution}
         trials = [SimpleNamespace(predicted_position_m=position_m)]
-        parts = {"predictor": SimpleNamespace(data=data), "solution": SimpleNamespace(state=state)}
         return SimpleNamespace(trials=trials, noise_correlation=0.1, **parts)
 
     assert likelihood_ratio._distance(fit(difference), fit(0 * difference)) == pytest.approx(expected)
-
-
-# A camera that was set otherwise on one day: a number for each day, and models that hold such numbers.
 
 
 @pytest.fixture(scope="module")
@@ -211,18 +197,11 @@ def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day(of_two_days)
     said = diagnosed(of_two_days)
     assert said.verdict == "artefact"
     assert "time_base" in said.answer_set
-    first, second = numbers_of(said, "time_base")
+    first, second = row_of(said, "time_base").numbers
     assert (first.vine, second.vine) == ("day 1", "day 2")
     assert abs(first.value) < 3 * first.sigma < 0.02
     assert 0.03 < abs(second.value) < 0.09
     assert second.sigma < 0.01
-
-
-def test_days_count_where_the_sheet_states_several_and_one_for_every_trial():
-    two = [Trial(name="a", vine="v", day="1"), Trial(name="b", vine="v", day="2")]
-    assert groups_of(two, "day") == ["day 1", "day 2"]
-    assert groups_of([two[0], replace(two[1], day="")], "day") == groups_of([two[0], two[0]], "day") == ["", ""]
-    assert group_names([replace(two[0], day=day) for day in ("10", "2", "2")], "day") == ["day 2", "day 10"]
 
 
 @pytest.mark.slow
@@ -240,23 +219,16 @@ def test_a_fit_with_a_number_for_each_day_predicts_the_trials_of_each(of_two_day
     assert fitted_by_day.numbers[place].name == "time_base.eps[day 2]"
 
 
-# A chamber that is larger than stated is a depletion with a γ that no gas has, and nothing else.
-
-CHAMBER_RIVALS = ("reservoir_depletion", "supply_refill", "area_scale", "film_mass", "tail_friction", "leak")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("row", "seed"), [("chamber_larger", 914), ("chamber_smaller", 902)])
 def test_a_chamber_that_was_misread_is_a_depletion(tmp_path, row, seed):
-    _, experiment = laboratory(tmp_path, row, seed, (10, 14), weighed=False)
-    said = diagnosed(experiment, CHAMBER_RIVALS)
+    """With a γ that no gas has, and nothing else."""
+    rivals = ("reservoir_depletion", "supply_refill", "area_scale", "film_mass", "tail_friction", "leak")
+    said = diagnosed(laboratory(tmp_path, row, seed, (10, 14), weighed=False)[1], rivals)
     assert said.effects == ("reservoir_depletion",)
     assert said.final_verdict == "adequate"
     (gamma,) = [number for number in said.parameters if number.key == "reservoir_depletion.gamma"]
     assert gamma.value < 1.0 if row == "chamber_larger" else gamma.value > 1.4
-
-
-# Payloads that weigh other than stated: one for each vine, of which one may be mistyped.
 
 
 @pytest.mark.slow
@@ -264,24 +236,15 @@ def test_one_mistyped_payload_of_several_is_named_with_its_vine(tmp_path):
     """The payload of one of two vines weighs 15 % more than stated."""
     said = diagnosed(laboratory(tmp_path, "payload_mistyped", 912, (24, 40))[1])
     assert (said.verdict, said.answer_set) == ("artefact", ("payload_mass",))
-    off = [number for number in numbers_of(said, "payload_mass") if abs(number.value) > 4 * number.sigma]
+    off = [number for number in row_of(said, "payload_mass").numbers if abs(number.value) > 4 * number.sigma]
     assert len(off) == 1
     loaded_kg = {trial.trial.payload_kg for trial in said.fits[0].trials if trial.trial.vine == off[0].vine} - {0.0}
     assert off[0].value == pytest.approx(0.15 * max(loaded_kg), abs=3 * off[0].sigma)
 
 
-# A slip in the whole sheet is named as what it is, however large the error that it leaves.
-
 FLAT = 2 / math.pi - 1
 FAULTS = ("area_scale", "film_mass", "length_scale", "pressure_gain", "time_base", "inlet_loss", "air_drag")
 DIAMETER = catalogue()["area_scale"].parameters[0]
-
-
-@pytest.fixture(scope="module")
-def clean_pairs(tmp_path_factory):
-    """A campaign with nothing missing."""
-    _, experiment = laboratory(tmp_path_factory.mktemp("slips"), "clean", 909, (10, 14))
-    return list(vt.fit(vt.base_model(), experiment, profile=False).pairs)
 
 
 @pytest.mark.slow
@@ -294,42 +257,35 @@ def clean_pairs(tmp_path_factory):
     ],
     ids=["flat", "radius", "folded"],
 )
-def test_a_slip_in_a_column_is_named(clean_pairs, column, factor, named, size):
-    slipped = [(replace(t, **{column: factor * getattr(t, column)}), track) for t, track in clean_pairs]
+def test_a_slip_in_a_column_is_named(tmp_path, column, factor, named, size):
+    pairs, _ = pairs_of(laboratory(tmp_path, "clean", 909, (10, 14))[1])
+    slipped = [(replace(t, **{column: factor * getattr(t, column)}), track) for t, track in pairs]
     said = diagnosed(slipped, FAULTS)
     assert said.verdict in ("artefact", "ambiguous")
     assert named in said.answer_set
-    (row,) = [row for row in said.rounds[0].ranking if row.effect == named]
+    row = row_of(said, named)
     assert all(abs(number.value - size) < 3 * number.sigma + 0.02 for number in row.numbers)
     assert row.plausible
 
 
-def test_what_is_left_beside_a_slip_must_be_an_ordinary_error():
-    _, high = DIAMETER.plausible
-    inside, outside = (
-        (1 + part * high) * (1 + FLAT) - 1 for part in (0.9 * RANGE_SHARE_BESIDE_SLIP, 1.2 * RANGE_SHARE_BESIDE_SLIP)
-    )
+def test_what_is_left_beside_a_slip_must_be_an_ordinary_error_and_that_is_no_slip():
+    most = RANGE_SHARE_BESIDE_SLIP * DIAMETER.plausible[1]
+    inside, outside = ((1 + part * most) * (1 + FLAT) - 1 for part in (0.9, 1.2))
     assert slip_of(DIAMETER, inside, 0.0) == DIAMETER.slips[0]
     assert is_plausible(DIAMETER, inside, 0.0)
     assert slip_of(DIAMETER, outside, 0.0) is None
     assert not is_plausible(DIAMETER, outside, 0.0)
     assert slip_of(DIAMETER, outside, 0.01) is not None
-
-
-def test_an_ordinary_error_is_no_slip():
-    """But film a fifth too light is polyethylene sooner than too thin: film is sold to within a tenth."""
+    # But film a fifth too light is polyethylene sooner than too thin: film is sold to within a tenth.
     for name, part in (("area_scale", 1.0), ("length_scale", 1.0), ("time_base", 1.0), ("film_mass", 0.5)):
         parameter = catalogue()[name].parameters[0]
         assert parameter.slips
         assert all(slip_of(parameter, part * error, 0.01) is None for error in (*parameter.plausible, 0.0))
 
 
-# Positions without noise, as a simulation gives them: they are no more exact than the model's own integrator.
-
-
 @pytest.mark.slow
 def test_nothing_is_missing_from_a_simulation_of_the_model_itself(tmp_path, monkeypatch):
-    """What the integrator errs by, 1 µm in a metre, had passed for motion that is noisier than rest."""
+    """Without noise. What the integrator errs by, 1 µm in a metre, had passed for motion that is noisier than rest."""
     camera = shots.Camera
     monkeypatch.setattr(shots, "Camera", lambda _noise_m, **how: camera(0.0, **how))
     truths, experiment = laboratory(tmp_path, "clean", 20600, (12, 12), weighed=False)
@@ -342,18 +298,14 @@ def test_nothing_is_missing_from_a_simulation_of_the_model_itself(tmp_path, monk
     assert fit["n"].value == pytest.approx(truths["eversion_damping.n"], abs=3 * fit["n"].sigma)
 
 
-# A growth angle counted from the level is a fault of the measurement, or not testable where nothing weighs enough.
-
 ANGLE_RIVALS = ("growth_angle", "payload_friction", "pressure_gauge", "leak")
 
 
 def filmed(vine: Vine, pressures_kPa: tuple[float, ...], payload_g: float, stated_deg: float, true_deg: float) -> Pairs:
     """Three trials a pressure of a vine that grew in one direction and is stated in another."""
-    trials = [
-        replace(trial, growth_angle_rad=math.radians(true_deg))
-        for trial in laboratory_campaign(vine, pressures_kPa, 3, payload_g)
-    ]
-    pairs = pairs_of(grown(with_names(trials), 61))
+    made = laboratory_campaign(vine, pressures_kPa, 3, payload_g)
+    trials = with_names([replace(trial, growth_angle_rad=math.radians(true_deg)) for trial in made])
+    pairs = grown_pairs(grown(trials, 61))
     return [(replace(trial, growth_angle_rad=math.radians(stated_deg)), track) for trial, track in pairs]
 
 
@@ -362,7 +314,7 @@ def filmed(vine: Vine, pressures_kPa: tuple[float, ...], payload_g: float, state
 def test_a_loaded_vine_tells_that_its_angle_is_wrong(stated_deg, true_deg):
     told = diagnosed(filmed(Vine(24, 200, 280), (14, 28, 41), 35.6, stated_deg, true_deg), ANGLE_RIVALS)
     assert (told.verdict, told.answer_set, told.effects) == ("artefact", ("growth_angle",), ())
-    (slip,) = (number for row in told.ranking if row.effect == "growth_angle" for number in row.numbers)
+    (slip,) = row_of(told, "growth_angle").numbers
     assert abs(slip.value - 1) < 4 * slip.sigma < 0.4
 
 
@@ -371,5 +323,4 @@ def test_a_bare_vine_of_light_film_cannot_tell():
     bare = filmed(Vine(12, 100, 140), (24, 30, 38, 48), 0, 90, 0)
     told = diagnosed([(replace(t, position_systematic_m=1e-4), track) for t, track in bare], ANGLE_RIVALS)
     assert told.verdict == "adequate"
-    (row,) = (row for row in told.ranking if row.effect == "growth_angle")
-    assert row.status == NOT_TESTABLE
+    assert row_of(told, "growth_angle").status == NOT_TESTABLE

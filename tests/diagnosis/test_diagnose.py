@@ -31,15 +31,9 @@ from vinetrack.diagnosis.replicates import LostFrames, with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.selection import contradictions
 from vinetrack.effects import own_effects
-from vinetrack.inference.fit import fit
 from vinetrack.tracks.importers import flag_end_of_motion
 
 FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
-
-
-@pytest.fixture(scope="module")
-def nothing_missing():
-    return vt.diagnose(grown(seed=7000))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +46,8 @@ def depleted(depleted_pairs):
     return vt.diagnose(depleted_pairs, candidates=FEW)
 
 
-def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_said(nothing_missing):
+def test_nothing_missing_is_adequate_and_how_large_an_effect_could_still_be_is_said():
+    nothing_missing = vt.diagnose(grown(seed=7000))
     assert nothing_missing.verdict == nothing_missing.final_verdict == "adequate"
     assert nothing_missing.effects == nothing_missing.answer_set == ()
     ranking = {one.effect: one for one in nothing_missing.rounds[0].ranking}
@@ -89,9 +84,8 @@ def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
     before, after = (fit["n"] for fit in depleted.fits)
     assert abs(after.value - 0.37) < 4 * after.sigma
     assert abs(after.value - 0.37) < 0.5 * abs(before.value - 0.37)
-    assert depleted.ladder is not None
     assert list(depleted.ladder["added"]) == ["", "reservoir_depletion"]
-    first, last = depleted.ladder.iloc[0], depleted.ladder.iloc[1]
+    first, last = (depleted.ladder.iloc[k] for k in range(2))
     assert last["rms_left_out_m"] < 0.5 * first["rms_left_out_m"]
     assert last["rms_in_sample_m"] < 2 * last["floor_m"]
 
@@ -112,7 +106,6 @@ def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do():
     assert found.verdict == "artefact"
     assert "length_scale" in found.answer_set
     assert found.effects == ()
-    assert found.next_experiment is not None
     assert found.next_experiment["calibration"]
 
 
@@ -154,21 +147,15 @@ def test_a_users_own_effect_is_found_like_any_other(tmp_path):
 
 @pytest.mark.slow
 def test_a_measured_pressure_already_holds_what_happens_in_the_chamber():
-    pairs = [
-        (trial, replace(track, pressure_Pa=np.full(track.time_s.size, trial.pressure_Pa)))
-        for trial, track in grown(seed=7005)
-    ]
-    found = vt.diagnose(pairs, ladder=False, advice=False)
+    steady = [(t, replace(x, pressure_Pa=np.full(x.time_s.size, t.pressure_Pa))) for t, x in grown(seed=7005)]
+    found = vt.diagnose(steady, ladder=False, advice=False)
     blind = {one.effect: one.reason for one in found.rounds[0].ranking if one.status == NOT_TESTABLE}
     assert blind["reservoir_depletion"].code == "in_measured_pressure"
 
 
-# What the ladder of errors and drifting parameters say against a verdict reaches the reader.
-
-
 @pytest.fixture(scope="module")
 def plain():
-    return fit(vt.base_model(), grown(seed=51), profile=False)
+    return vt.fit(vt.base_model(), grown(seed=51), profile=False)
 
 
 def test_an_effect_that_predicts_no_condition_better_is_said_to(plain):
@@ -192,9 +179,8 @@ def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain):
     np.testing.assert_array_equal(plain.solution.state.theta, theta)
 
 
-# Bodies that move as a whole: what is missing from gravity is named, and nothing that only a tube can have.
-
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")
+needs_recordings = pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
 DRAG = 0.5
 TUBES_ALONE = {"capstan_friction", "gas_inertia", "tail_friction", "latch_release", "fold_inertia", "wall_stretch"}
 
@@ -210,20 +196,16 @@ def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:
     return Trial(name=name, diameter_m=diameter_m, payload_kg=mass_kg, **still)
 
 
-@pytest.fixture(scope="module")
-def balls():
-    made, time_s = [], np.arange(100) / 120
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [["gravity"], ["gravity", "payload_friction"]])
+def test_the_drag_of_falling_balls_is_named(model):
+    """And nothing that only a tube can have."""
+    balls, time_s = [], np.arange(100) / 120
     for kind, size in enumerate(((0.04, 2.7e-3), (0.1, 20e-3), (0.038, 60e-3))):
         for repeat in range(3):
             trial = of_ball(f"d{kind}_{repeat}", *size)
             noise_m = np.random.default_rng(20100 + 10 * kind + repeat).normal(0, 2e-3, time_s.size)
-            made.append((trial, as_track(time_s, fallen_m(time_s - 0.0513, trial) + 0.004 + noise_m)))
-    return made
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", [["gravity"], ["gravity", "payload_friction"]])
-def test_the_drag_of_falling_balls_is_named(balls, model):
+            balls.append((trial, as_track(time_s, fallen_m(time_s - 0.0513, trial) + 0.004 + noise_m)))
     found = vt.diagnose(balls, model=vt.make_model(model), ladder=False, advice=False)
     assert (found.verdict, found.effects) == ("missing", ("air_drag",))
     drag = found.fits[-1]["C_D"]
@@ -263,7 +245,7 @@ def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_
 
 
 @pytest.mark.real
-@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
+@needs_recordings
 def test_the_drag_of_eight_real_paper_cups_is_named():
     found = vt.diagnose(Path(REAL) / "falling_cups", ladder=False, advice=False)
     assert (found.verdict, found.effects) == ("missing", ("air_drag",))
@@ -271,7 +253,7 @@ def test_the_drag_of_eight_real_paper_cups_is_named():
 
 
 @pytest.mark.real
-@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
+@needs_recordings
 def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_mends_most_of_it(tmp_path):
     """Its authors fit a pressure to start above one to stop, and drag that rises with the length."""
     sticking = [one for one in read_recordings(Path(REAL) / "everting_tube") if one.name == "tube2_hi_2"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,27 +26,22 @@ NAMES = ("air_drag", "leak", "tail_friction")
 TRIPLE = -1000.0
 
 
-def of(
-    names: tuple[str, ...], log_likelihood: float, inflation: float = 1.0, numbers: tuple[Any, ...] = ()
-) -> LikelihoodRatio:
+def of(names: Iterable[str], log_likelihood: float, inflation: float = 1.0, numbers: Any = ()) -> LikelihoodRatio:
     fit: Any = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers)
-    effects = tuple(find_effect(name) for name in names)
-    return LikelihoodRatio(effects, fit, 0.0, 0.0, plausible=True, reason=Remark(), inflation=inflation)
+    return LikelihoodRatio(tuple(map(find_effect, names)), fit, 0.0, 0.0, True, Remark(), inflation=inflation)
 
 
 def sets_of(known: list[LikelihoodRatio], thresholds: Mapping[str, float] | None = None) -> EffectSets:
     family = FamilyTest(3e-3, 1e-4, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
-    search: Any = SimpleNamespace(
-        tests=SimpleNamespace(fit=SimpleNamespace(model=()), effects=()),
-        tests_after=lambda _fit: SimpleNamespace(family=family),
-    )
+    tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
+    search: Any = SimpleNamespace(tests=tests, tests_after=lambda _fit: after)
     return EffectSets(search, known, lambda _line: None)
 
 
 def pairs(worth: float) -> list[LikelihoodRatio]:
     """The three pairs of a triple, one of which is worse than it by so many standard deviations, the others by 30."""
-    falls = {NAMES[0]: 30.0, NAMES[1]: 30.0, NAMES[2]: worth}
-    return [of(tuple(n for n in NAMES if n != out), TRIPLE - falls[out] ** 2 / 2) for out in NAMES]
+    falls = zip(NAMES, (30.0, 30.0, worth), strict=True)
+    return [of([name for name in NAMES if name != out], TRIPLE - fall**2 / 2) for out, fall in falls]
 
 
 @pytest.fixture(autouse=True)
@@ -60,9 +55,9 @@ def no_refit_succeeds(monkeypatch):
 def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others(worth, enough):
     triple, sets = of(NAMES, TRIPLE), sets_of(pairs(worth))
     assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
-    assert bool(sets.superfluous(triple)) != enough
+    told = sets.superfluous(triple)
+    assert bool(told) != enough
     if not enough:
-        told = sets.superfluous(triple)
         assert (told.code, told.facts["effect"]) == ("too_weak_in_set", "tail_friction")
         assert (told.facts["sigmas"], told.facts["required"]) == (pytest.approx(worth), 6.0)
 
@@ -157,8 +152,6 @@ def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(mon
     assert bool(sets_of(pairs(30.0)).superfluous(of(NAMES, TRIPLE))) != needed
 
 
-# Several effects together, and steps that mend a part of what nothing mends in full.
-
 CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak")
 TRUTH = {
     "reservoir_depletion.gamma": 1.3,
@@ -173,25 +166,19 @@ def asked(*names: str, **how: bool) -> Diagnosis:
     return vt.diagnose(grown(TRUTH, seed=7200, trials=sheet()[::2]), candidates=names, **how)
 
 
-@pytest.fixture(scope="module")
-def three_missing():
-    return asked(*CANDIDATES, ladder=False, advice=False)
-
-
-@pytest.fixture(scope="module")
-def one_not_asked():
-    return asked(*(name for name in CANDIDATES if name != "latch_release"))
+def stored(said: Diagnosis) -> Diagnosis:
+    return Diagnosis.from_json(json.loads(json.dumps(said.to_json(), default=str)))
 
 
 @pytest.mark.slow
-def test_three_effects_are_found_one_after_the_other(three_missing):
+def test_three_effects_are_found_one_after_the_other():
+    three_missing = asked(*CANDIDATES, ladder=False, advice=False)
     assert three_missing.verdict == "missing"
     assert set(three_missing.effects) == {"reservoir_depletion", "tail_friction", "latch_release"}
     assert three_missing.final_verdict == "adequate"
     assert [len(step.model) for step in three_missing.rounds] == [4, 5, 6, 7]
     assert set(three_missing.rounds[0].sets[0]) == set(three_missing.effects)
-    stored = Diagnosis.from_json(json.loads(json.dumps(three_missing.to_json(), default=str)))
-    assert [step.sets for step in stored.rounds] == [step.sets for step in three_missing.rounds]
+    assert [step.sets for step in stored(three_missing).rounds] == [step.sets for step in three_missing.rounds]
     numbers = {number.key: number for number in three_missing.parameters}
     for key in ("reservoir_depletion.gamma", "tail_friction.mu_w"):
         assert abs(numbers[key].value - TRUTH[key]) < 4 * numbers[key].sigma
@@ -215,19 +202,15 @@ def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like
 
 
 @pytest.mark.slow
-def test_what_lacks_an_effect_that_is_not_asked_stays_unexplained_and_shows_partial_steps(one_not_asked):
+def test_what_lacks_an_effect_that_is_not_asked_stays_unexplained_and_shows_partial_steps():
+    one_not_asked = asked(*(name for name in CANDIDATES if name != "latch_release"))
     assert one_not_asked.verdict == "unexplained"
     assert one_not_asked.effects == one_not_asked.answer_set == ()
     assert one_not_asked.missing_force is not None
-    assert len(one_not_asked.force_table)
-    assert len(one_not_asked.learned_table)
-    steps = [step.effect for step in one_not_asked.rounds[0].partial]
-    assert steps
-    ladder = one_not_asked.ladder
-    assert ladder is not None
+    steps, ladder = [step.effect for step in one_not_asked.rounds[0].partial], one_not_asked.ladder
+    assert all((len(one_not_asked.force_table), len(one_not_asked.learned_table), steps))
     assert tuple(ladder.columns) == LADDER_COLUMNS
     assert ladder["partial"].tolist() == [False, *[True] * len(steps)]
     assert ladder["added"].tolist() == ["", *steps]
     assert ladder["rms_in_sample_m"].iloc[-1] < ladder["rms_in_sample_m"].iloc[0]
-    stored = Diagnosis.from_json(json.loads(json.dumps(one_not_asked.to_json(), default=str)))
-    assert [one.effect for one in stored.rounds[0].partial] == steps
+    assert [one.effect for one in stored(one_not_asked).rounds[0].partial] == steps

@@ -51,12 +51,9 @@ def test_no_module_outside_the_room_of_prose_parses_it():
     assert cut == []
 
 
-def test_every_difference_between_trials_has_a_remedy():
-    assert BETWEEN_REMEDIES.keys() == BETWEEN_SUMMARIES.keys()
-
-
-def test_every_code_has_a_sentence_and_every_sentence_a_code():
+def test_every_code_has_a_sentence_every_sentence_a_code_and_every_difference_a_remedy():
     makers = ("inference", "diagnosis", "planning", "pipeline")
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name in makers)
     assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= SENTENCES.keys() | REMARKS.keys()
     assert [code for code in (*SENTENCES, *REMARKS) if not re.search(rf"""["']{code}["']""", source)] == []
+    assert BETWEEN_REMEDIES.keys() == BETWEEN_SUMMARIES.keys()

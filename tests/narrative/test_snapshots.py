@@ -36,11 +36,10 @@ POWER = Power(
 
 def verdicts() -> str:
     told = [Diagnosis.from_json(diagnosis(verdict)) for verdict in VERDICTS]
-    facts = [[f"{f.question}: {f.answer} ({f.note})" for f in summary_facts(said, None)] for said in told]
-    parts = [
-        "\n".join([verdict_sentence(said), verdict_meaning(said), *of_it, "", str(said)])
-        for said, of_it in zip(told, facts, strict=True)
-    ]
+    parts = []
+    for said in told:
+        facts = [f"{fact.question}: {fact.answer} ({fact.note})" for fact in summary_facts(said, None)]
+        parts.append("\n".join([verdict_sentence(said), verdict_meaning(said), *facts, "", str(said)]))
     return "\n\n----\n".join(parts)
 
 
@@ -50,10 +49,8 @@ def power() -> str:
 
 
 def plan() -> str:
-    entry = POWER["fold_inertia"]
-    none = FurtherTrials(entry, 0.5, 0.9, 0.2)
-    enough = replace(none, before=0.95)
-    never = replace(none, unlimited=0.4, n_conditions=12)
+    none = FurtherTrials(POWER["fold_inertia"], 0.5, 0.9, 0.2)
+    enough, never = replace(none, before=0.95), replace(none, unlimited=0.4, n_conditions=12)
     trials = [{"replicates": 2, "pressure_kPa": 30.0, "payload_g": 20.0, "diameter_mm": 24.0, "thickness_um": 200.0,
                "length_mm": 280.0, "chamber_l": 3.7, "inlet_mm": 5.7, "growth_angle_deg": math.nan,
                "new_vine": False, "changed": ["inlet_mm"]}]  # fmt: skip
@@ -62,9 +59,8 @@ def plan() -> str:
     facts |= {"simulated": {pair: (4.0, 0.5)}, "unresolved": [], "measurement": remark("")}
     made = [remark(code, **facts) for code in ("trials_to_make", "no_trials_separate")]
     first = remark("measure_first", faults=["length_scale", "time_base"], measurement=remark(""))
-    return "\n".join(
-        [*(line for one in (none, enough, never) for line in further_lines(one)), *map(str, [*made, first])]
-    )
+    further = [line for one in (none, enough, never) for line in further_lines(one)]
+    return "\n".join([*further, *map(str, [*made, first])])
 
 
 @pytest.mark.parametrize("make", [verdicts, power, plan])

@@ -18,19 +18,19 @@ from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_R
 
 EXACT = vt.StatedValues(n=0.37, spreads=(0.0, 0.0))
 SIZES = {"diameter_mm": 24, "thickness_um": 200, "length_mm": 280, "pressure_kPa": 28, "yield_pressure_kPa": 3}
+SIZES["chamber_l"] = 3.7
 
 
 def trial(**values: object) -> Trial:
-    return vt.planned_trial({name: str(value) for name, value in {**SIZES, "chamber_l": 3.7, **values}.items()}).trials[
-        0
-    ]
+    cells = {name: str(value) for name, value in {**SIZES, **values}.items()}
+    return vt.planned_trial(cells).trials[0]
 
 
 def room(pressure_kPa: float = 62, **values: object) -> prediction.Room:
     options = {name: str(values.pop(name)) for name in ("payload_g", "growth_angle_deg") if name in values}
     rig = vt.planned_trial({"yield_pressure_kPa": "3", **options}, needed=()).trials[0]
-    known: dict[str, object] = {"films_m": (100e-6,), "diameter_m": (5e-3, 25e-3), "length_m": (0.1, 0.4)}
-    return prediction.Room(pressure_Pa=1e3 * pressure_kPa, rig=rig, **{**known, "burst_share": 1.0, **values})  # type: ignore[arg-type]
+    known = {"films_m": (100e-6,), "diameter_m": (5e-3, 25e-3), "length_m": (0.1, 0.4), "burst_share": 1.0}
+    return prediction.Room(pressure_Pa=1e3 * pressure_kPa, rig=rig, **(known | values))
 
 
 def test_the_papers_fast_vine_is_the_fastest_of_its_setup():
@@ -42,11 +42,8 @@ def test_the_papers_fast_vine_is_the_fastest_of_its_setup():
 def test_no_vine_of_a_fine_grid_is_faster():
     limits = room(pressure_kPa=60, diameter_m=(10e-3, 60e-3), length_m=(0.1, 0.3), payload_g=20)
     (choice,) = prediction.fastest(limits, EXACT, samples=50)
-    grid = [
-        vt.predictive_inputs(limits.trial(D, 100e-6, L), EXACT)
-        for D in np.linspace(10e-3, 60e-3, 41)
-        for L in np.linspace(0.1, 0.3, 9)
-    ]
+    sizes = [(D, L) for D in np.linspace(10e-3, 60e-3, 41) for L in np.linspace(0.1, 0.3, 9)]
+    grid = [vt.predictive_inputs(limits.trial(D, 100e-6, L), EXACT) for D, L in sizes]
     speeds = [prediction.final_speeds(inputs.model, [inputs.trial], 0.95)[0] for inputs in grid]
     assert choice.prediction.final.median > 0.995 * max(speeds)
     assert (choice.prediction.final.name, choice.prediction.final.y_over_L) == ("ejection speed of the payload", 1.0)
@@ -56,16 +53,10 @@ def test_at_the_burst_stress_acceleration_is_the_same_for_every_film():
     """P = 2tσ/D: force ½PA = ¼πσtD, mass λL = ρπDtL, so a = σ/(4ρL) whatever t and D; without damping speeds agree."""
     limits = room(1000, films_m=(50e-6, 200e-6), burst_share=0.5, growth_angle_deg=90)
     limits = replace(limits, rig=replace(limits.rig, yield_pressure_Pa=0.0))
-    sights = [
-        prediction.predict_vine(
-            vt.predictive_inputs(limits.trial(D, film, 0.4), vt.StatedValues(B=1e-9, n=0.37, spreads=(0.0, 0.0))),
-            samples=2,
-            at_fraction=0.8,
-        )
-        for D, film in ((10e-3, 50e-6), (20e-3, 200e-6))
-    ]
+    vines = [limits.trial(D, film, 0.4) for D, film in ((10e-3, 50e-6), (20e-3, 200e-6))]
+    inputs = [vt.predictive_inputs(vine, replace(EXACT, B=1e-9)) for vine in vines]
+    speeds = [vt.predict_vine(one, samples=2, at_fraction=0.8).final.median for one in inputs]
     expected = 0.5 * math.sqrt(4 * math.log(5) * 0.5 * 7.8e6 / (2 * 1200 * 2))  # ẋ² = 4F/λ ln 5, F/λ = σ/(4ρ)
-    speeds = [prediction.final.median for prediction in sights]
     assert speeds[0] == pytest.approx(speeds[1], rel=0.01)
     assert speeds[1] == pytest.approx(expected, rel=0.01)
 
@@ -82,11 +73,9 @@ def test_a_chamber_that_is_sized_loses_just_what_it_may(gamma, loss):
 
 def test_speeds_with_a_chamber_are_those_of_the_effect():
     inputs = vt.predictive_inputs(trial(payload_g=35.6), vt.StatedValues(B=6.44, n=0.37))
-    model = vt.make_model([*inputs.model.names, "reservoir_depletion"]).with_values(
-        {**inputs.model.values, "reservoir_depletion.gamma": 1.0}
-    )
-    times = np.linspace(0.0, 1.0, 20_001)
-    found = vt.simulate(model, inputs.trial, times)
+    values = {**inputs.model.values, "reservoir_depletion.gamma": 1.0}
+    model = vt.make_model([*inputs.model.names, "reservoir_depletion"]).with_values(values)
+    found = vt.simulate(model, inputs.trial, np.linspace(0.0, 1.0, 20_001))
     assert prediction.final_with(inputs, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
 
 
@@ -99,7 +88,7 @@ def test_a_quick_supply_saves_a_chamber():
 
 
 def made(pressure_kPa: float, **more: object) -> Trial:
-    return replace(trial(pressure_kPa=pressure_kPa, chamber_l=""), **more)  # type: ignore[arg-type]
+    return replace(trial(pressure_kPa=pressure_kPa, chamber_l=""), **more)
 
 
 def looked_at(trials: list[Trial], **limits: Any) -> list[Condition]:
