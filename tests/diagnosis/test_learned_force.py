@@ -27,9 +27,6 @@ from vinetrack.effects import own_effects
 from vinetrack.inference.sensitivity import PRESSURE
 
 GROWTH = laws.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
-BOTH = laws.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, math.inf))
-
-
 FAR = math.sqrt(5) / 0.4
 ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
@@ -61,7 +58,6 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
     pairs = hidden_force(sheet((4,), replicates=2), 131, "waves", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     table = proposal.table
-    assert table is not None
     assert table.effect.name == "learned_growth"
     size = next(number for number in table.ratio.fit.numbers if number.key == "learned_growth.a")
     assert size.value == pytest.approx(1.0, abs=0.1)
@@ -72,91 +68,58 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
     grid = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
     y = grid["lead_position_m"].to_numpy(float)
     middle = (y > np.quantile(y, 0.05)) & (y < np.quantile(y, 0.95))
-    true_N = -0.3 * np.sin(2 * math.pi * (y / 0.12) ** 1.5)
     # A constant is taken over by the yield pressure.
-    off = grid["force_N"].to_numpy(float) - true_N
+    off = grid["force_N"].to_numpy(float) + 0.3 * np.sin(2 * math.pi * (y / 0.12) ** 1.5)
     assert np.mean(np.abs(off - np.median(off))[middle] < 0.06) > 0.8
 
 
-# Marginal likelihood and posterior of a smooth force, against closed forms of the normal distribution.
-
-
 def seen(design: Floats, positions: Floats) -> inversion.CoefficientLikelihood:
-    return inversion.CoefficientLikelihood(
-        design.T @ design, design.T @ positions, float(positions @ positions), 0.0, 0.0
-    )
+    square = float(positions @ positions)
+    return inversion.CoefficientLikelihood(design.T @ design, design.T @ positions, square, 0.0, 0.0)
 
 
-def test_marginal_likelihood_equals_that_of_the_normal_distribution():
+def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters():
+    """Each length scale and amplitude by the normal distribution of the positions, weighted by its density."""
     draw = np.random.default_rng(3)
     design = inversion.uniform_splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
-    logs: dict[str, list[float]] = {laws.ZERO_AT_START: [], laws.CONSTANT_AT_START: []}
-    for length in laws.LENGTH_SCALES:
-        directions, variances = laws.covariance_modes(12, length, zero_at_start=True)
-        variances = np.where(variances > laws.KEPT_VARIANCE * variances.max(), variances, 0.0)
-        process = (directions * variances) @ directions.T
-        for begins, covariance in ((laws.ZERO_AT_START, process), (laws.CONSTANT_AT_START, process + 1.0)):
-            unit = design @ covariance @ design.T
-            logs[begins] += [
-                multivariate_normal(cov=np.eye(60) + a**2 * unit).logpdf(positions)
-                for a in 2 * laws.RELATIVE_AMPLITUDES
-            ]
     choice = learned_force.marginal_likelihood(GROWTH, seen(design, positions), 1.0, 2.0)
-    normal = -30 * math.log(2 * math.pi)
+    assert {each.at_start for each in choice.posteriors} == {laws.ZERO_AT_START, laws.CONSTANT_AT_START}
+    evidences, normal = [], 30 * math.log(2 * math.pi)
     for posterior in choice.posteriors:
-        expected = logs[posterior.at_start]
-        assert posterior.log_evidence + normal == pytest.approx(float(np.log(np.mean(np.exp(expected)))), abs=1e-6)
-        assert posterior.length_scales == (
-            laws.LENGTH_SCALES[int(np.argmax(expected)) // laws.RELATIVE_AMPLITUDES.size],
-        )
-        assert np.all(np.linalg.eigvalsh(posterior.covariance) > -1e-12)
-    both = np.mean([np.mean(np.exp(each)) for each in logs.values()])
-    assert choice.log_evidence + normal == pytest.approx(float(np.log(both)), abs=1e-6)
+        logs, means, covariances = [], [], []
+        for length in laws.LENGTH_SCALES:
+            directions, variances = laws.covariance_modes(12, length, zero_at_start=True)
+            variances = np.where(variances > laws.KEPT_VARIANCE * variances.max(), variances, 0.0)
+            process = (directions * variances) @ directions.T + (posterior.at_start == laws.CONSTANT_AT_START)
+            for prior in process * (2 * laws.RELATIVE_AMPLITUDES[:, None, None]) ** 2:
+                predicted = np.eye(60) + design @ prior @ design.T
+                gain = prior @ np.linalg.solve(predicted, design).T
+                logs.append(multivariate_normal(cov=predicted).logpdf(positions))
+                means.append(gain @ positions)
+                covariances.append(prior - gain @ design @ prior)
+        evidences.append(np.mean(np.exp(logs)))
+        assert posterior.log_evidence == pytest.approx(np.log(evidences[-1]) + normal, abs=1e-6)
+        best = int(np.argmax(logs)) // laws.RELATIVE_AMPLITUDES.size
+        assert posterior.length_scales == (laws.LENGTH_SCALES[best],)
+        density = np.exp(np.array(logs) - max(logs))
+        weights = density * (density > math.exp(-learned_force.NEGLIGIBLE_LOG_RATIO))
+        weights /= weights.sum()
+        mean = weights @ means
+        spread = np.tensordot(weights, covariances, 1) + ((means - mean).T * weights) @ (means - mean)
+        assert posterior.mean == pytest.approx(mean, abs=1e-9)
+        assert posterior.covariance == pytest.approx(spread, abs=1e-9)
+    assert choice.log_evidence == pytest.approx(np.log(np.mean(evidences)) + normal, abs=1e-6)
 
 
 def test_one_variable_and_two_have_equal_prior_odds():
     design = inversion.uniform_splines(np.linspace(0, 1, 60), 12)
     choice = learned_force.marginal_likelihood(GROWTH, seen(design, np.zeros(60)), 1.0, 2.0)
     single = replace(choice, log_evidence=0.0)
-    pairs = [
-        replace(single, domain=replace(BOTH, variables=names)) for names in (("growth", "speed"), ("growth", "time"))
-    ]
+    pairs = [replace(single, domain=replace(DOMAINS[1], variables=("growth", other))) for other in ("speed", "time")]
     weights = learned_force.variable_weights([single, *pairs], 1.0)
     assert weights["growth"] == pytest.approx(0.5)
     assert weights["growth+speed"] == pytest.approx(0.25)
-
-
-def test_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters():
-    """Each length scale and amplitude by the closed form for a normal prior, weighted by its likelihood."""
-    draw = np.random.default_rng(11)
-    design = inversion.uniform_splines(draw.uniform(0, 1, 40), 12)
-    told = seen(design, design @ draw.standard_normal(12) + draw.standard_normal(40))
-    parts = []
-    for length in laws.LENGTH_SCALES:
-        mix = GROWTH.prior_modes((length,), laws.CONSTANT_AT_START)
-        for sd_N in 2 * laws.RELATIVE_AMPLITUDES:
-            prior = np.eye(mix.shape[1]) / sd_N**2
-            covariance = mix @ np.linalg.inv(mix.T @ told.information @ mix + prior) @ mix.T
-            shrunk = np.linalg.slogdet(np.eye(mix.shape[1]) + sd_N**2 * mix.T @ told.information @ mix)[1]
-            parts.append((0.5 * float(told.score @ covariance @ told.score - shrunk), covariance))
-    logs = np.array([log for log, _ in parts])
-    weights = np.where(logs > logs.max() - learned_force.NEGLIGIBLE_LOG_RATIO, np.exp(logs - logs.max()), 0.0)
-    weights /= weights.sum()
-    means = np.array([covariance @ told.score for _, covariance in parts])
-    mean = weights @ means
-    spread = np.tensordot(weights, np.array([covariance for _, covariance in parts]), 1)
-    spread += ((means - mean).T * weights) @ (means - mean)
-    posterior = next(
-        each
-        for each in learned_force.marginal_likelihood(GROWTH, told, 1.0, 2.0).posteriors
-        if each.at_start == laws.CONSTANT_AT_START
-    )
-    assert posterior.mean == pytest.approx(mean, abs=1e-9)
-    assert posterior.covariance == pytest.approx(spread, abs=1e-9)
-
-
-# The compiled variational equations against the same method in arrays, and against a closed form.
 
 
 def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
@@ -169,9 +132,6 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
 
 
-# Nonlinear fit of a force: its score against finite differences, and motions beyond the end of growth of the model.
-
-
 def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
@@ -180,16 +140,15 @@ def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pres
     growth, pressure = (inversion.uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
     force = -0.5 * np.outer(*steep).ravel()
-    settled = replace(
-        tracks, force=laws.SmoothForce(domain, np.eye(domain.size)), amplitude=force, motions_include_force=True
-    )
+    surface = laws.SmoothForce(domain, np.eye(domain.size))
 
     def at(point: inversion.ForcePoint, times: int) -> inversion.ForcePoint:
         for _ in range(times):
             point = inversion._with_updated_motions(slowed.fit, point)
         return point
 
-    settled = at(settled, 12)  # where a point far off the tracks is settled depends on where it begins
+    # Where a point far off the tracks is settled depends on where it begins.
+    settled = at(replace(tracks, force=surface, amplitude=force, motions_include_force=True), 12)
     slope = slowed.linearised(settled).grams[0, PRESSURE, -1]
     costs = []
     for step in (-1e-4, 1e-4):
@@ -197,9 +156,6 @@ def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pres
         effects[0, PRESSURE] += step
         costs.append(slowed.linearised(at(replace(settled, trial_effects=effects), 3)).cost)
     assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.005)
-
-
-# Forces outside the catalogue, hidden by effect files of a user: their curves, and the simple laws identified.
 
 
 def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
@@ -255,25 +211,16 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
     answers = inversion.acceleration_sensitivities(found, own, motions, pushes)
     jobs = found.predictor.jobs(found.solution.state.theta, own)
     times = [item.time_s - job.release_s for item, job in zip(found.predictor.data, jobs, strict=True)]
-    with_force = model + own_effects([effect_file(tmp_path)])["hidden"]
+    with_force, trials = model + own_effects([effect_file(tmp_path)])["hidden"], [motion.trial for motion in motions]
     for k, name in enumerate(shapes):
-        kind = float(list(FORCES).index(name))
-        moved = [
-            simulate_many(
-                with_force,
-                [motion.trial for motion in motions],
-                times,
-                parameters=np.array([[*job.row, step, kind] for job in jobs]),
-                relative_tolerance=1e-7,
-            )
-            for step in (1e-3, -1e-3)
-        ]
-        for i, answer in enumerate(answers):
-            exact = (moved[0][i].observed_position_m - moved[1][i].observed_position_m) / 2e-3
+        moved = []
+        for step in (1e-3, -1e-3):
+            rows = np.array([[*job.row, step, float(list(FORCES).index(name))] for job in jobs])
+            moved.append(simulate_many(with_force, trials, times, parameters=rows, relative_tolerance=1e-7))
+        for answer, more, less in zip(answers, *moved, strict=True):
+            exact = (more.observed_position_m - less.observed_position_m) / 2e-3
             assert np.max(np.abs(answer[:, k] - exact)) < 2e-3 * np.max(np.abs(exact))
 
-
-# A learned force as a table in an effect file, and the variables that it may depend on.
 
 DOMAINS = [
     laws.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
@@ -287,9 +234,8 @@ def learned(domain: laws.Domain, seed: int) -> learned_force.LearnedForce:
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4}
     table = pd.DataFrame([where | {"force_N": -0.1, "sigma_N": 0.01, "trials": 2, "condition": ""}])
     surface, lengths = laws.SmoothForce(domain, np.eye(domain.size)), (1.0,) * len(domain.variables)
-    best = learned_force.ForcePosterior(
-        laws.ZERO_AT_START, 50.0, surface, lengths, coefficients, np.eye(domain.size) * 1e-4, 1.0
-    )
+    known = coefficients, np.eye(domain.size) * 1e-4, 1.0
+    best = learned_force.ForcePosterior(laws.ZERO_AT_START, 50.0, surface, lengths, *known)
     return learned_force.LearnedForce(best, (), {domain.name: 1.0}, (), 50.0, 0.99, table, "It depends.")
 
 
@@ -299,11 +245,8 @@ def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(dom
     path = tmp_path / f"{table_name(force)}.py"
     path.write_text(table_text(force, "From 24 trials of a bench."), encoding="utf-8")
     effect = own_effects([path])[path.stem]
-    draw = np.random.default_rng(5)
-    at = [
-        draw.uniform(low - 0.1 * (high - low), high * 1.2, 40)
-        for low, high in zip(domain.low, domain.high, strict=True)
-    ]
+    draw, ends = np.random.default_rng(5), zip(domain.low, domain.high, strict=True)
+    at = [draw.uniform(low - 0.1 * (high - low), high * 1.2, 40) for low, high in ends]
     names = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
     state = SimpleNamespace(**{names[name]: value for name, value in zip(domain.variables, at, strict=True)})
     expected = domain.basis(at) @ force.best.mean
@@ -311,8 +254,6 @@ def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(dom
     assert shown == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
     assert effect.functions["tail_force"](state, None, 0.0) == pytest.approx(0.0 * expected)
 
-
-# Laws of force outside the catalogue, as effects: their files reproduce the laws, and the right one is proposed.
 
 LAWS = [
     laws.Law("constant"),
@@ -342,10 +283,8 @@ LAWS = [
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
     path = tmp_path / f"proposed_{law.name}.py"
-    seen = RankedLaw(
-        law, inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1), 0.0
-    )
-    path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
+    estimate = inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1)
+    path.write_text(effect_text(RankedLaw(law, estimate, 0.0), "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]
     assert effect.worked[0].expected != 0
