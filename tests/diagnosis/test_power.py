@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,40 +14,39 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis import campaign_power, linear_power
+from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.further_trials import _alone_and_distinct, exploratory_trials, further_trials
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.experiment.settings import Limits
 from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
-CAMERA = FilmingPlan(500.0, 1e-4)
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
 
 
 def planned(
-    replicates: int,
-    spreads: tuple[float, float] = (0.01, 0.03),
-    pressures: tuple[str, ...] = ("14", "24", "34"),
-    candidates: tuple[str, ...] = CANDIDATES,
-    **cells: str,
-) -> campaign_power.CampaignDesign:
+    replicates: int, spreads: Any = (0.01, 0.03), kPa: Any = (14, 24, 34), candidates: Any = CANDIDATES, **cells: str
+) -> CampaignDesign:
     trials: list[Trial] = []
-    for pressure in pressures:
-        texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "pressure_kPa": pressure}
-        trial = vt.planned_trial({**texts, "yield_pressure_kPa": "3", **cells}).trials[0]
+    known = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "yield_pressure_kPa": "3", **cells}
+    for pressure in kPa:
+        trial = vt.planned_trial({"pressure_kPa": f"{pressure}", **known}).trials[0]
         trials += [replace(trial, name=f"P{pressure}_{k}", position_systematic_m=0.0) for k in range(replicates)]
-    model = vt.predictive_inputs(trials[0]).model
-    return with_trials(campaign_power.CampaignDesign(model, (), (), spreads, candidates), trials)
+    return with_trials(CampaignDesign(vt.predictive_inputs(trials[0]).model, (), (), spreads, candidates), trials)
 
 
-def with_trials(design: campaign_power.CampaignDesign, added: Sequence[Trial]) -> campaign_power.CampaignDesign:
+def with_trials(design: CampaignDesign, added: Sequence[Trial]) -> CampaignDesign:
     trials = (*design.trials, *added)
-    return replace(design, trials=trials, cameras=(CAMERA,) * len(trials))
+    return replace(design, trials=trials, cameras=(FilmingPlan(500.0, 1e-4),) * len(trials))
+
+
+def power_with(design: CampaignDesign, **how: bool) -> Power:
+    return linear_power.power_of(planned_tests(design)[0], **how)
 
 
 @pytest.fixture(scope="module")
 def six():
-    return campaign_power.planned_tests(planned(2))[0]
+    return planned_tests(planned(2))[0]
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +59,10 @@ def place_of(questions: MisfitTests, name: str) -> int:
 
 
 def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
-    noise_m = 1e-3
-    design = replace(planned(2), cameras=(FilmingPlan(500.0, noise_m),) * 6)
-    promised = campaign_power.planned_tests(design)[0].fit
+    design = replace(planned(2), cameras=(FilmingPlan(500.0, 1e-3),) * 6)
+    promised = planned_tests(design)[0].fit
     pairs = make(design.model, design.trials, design.cameras, design.spreads, np.random.default_rng(1))
-    filmed = vt.fit(design.to_fit, pairs, spreads=design.spreads, noise=(noise_m, 0.0), profile=False)
+    filmed = vt.fit(design.to_fit, pairs, spreads=design.spreads, noise=(1e-3, 0.0), profile=False)
     assert [n.sigma for n in promised.numbers] == pytest.approx([n.sigma for n in filmed.numbers], rel=0.04)
     precisions = [fit.solution.problem.release_origin_precision for fit in (promised, filmed)]
     assert precisions[0] == pytest.approx(precisions[1], rel=0.5)
@@ -83,17 +82,14 @@ def test_detectable_sizes_follow_the_normal_distribution(six, power):
 @pytest.mark.slow
 def test_four_times_the_trials_halve_the_detectable_size(power):
     # Where scatter of trials alone is in the way, and positions are known as good as exactly.
-    few = linear_power.power_of(campaign_power.planned_tests(planned(4))[0])["leak"].size_at(0.5)
-    many = linear_power.power_of(campaign_power.planned_tests(planned(16))[0])["leak"].size_at(0.5)
+    few, many = (power_with(planned(replicates))["leak"].size_at(0.5) for replicates in (4, 16))
     assert few / many == pytest.approx(2.0, rel=0.25)
     assert power["leak"].size_at(0.5) > few
 
 
 def test_two_equivalent_effects_are_confused_with_each_other():
     # A diameter and a pressure that are off by a part act alike but for the film's mass.
-    power = linear_power.power_of(
-        campaign_power.planned_tests(replace(planned(2), candidates=("area_scale", "pressure_gain")))[0]
-    )
+    power = power_with(planned(2, candidates=("area_scale", "pressure_gain")))
     assert "pressure_gain" in power["area_scale"].taken_for
     assert "area_scale" in power["pressure_gain"].taken_for
 
@@ -122,14 +118,9 @@ def test_probabilities_invert_sizes():
 
 
 def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate():
-    answers = [
-        campaign_power.SimulatedDiagnosis("leak", "missing", ("leak",)),
-        campaign_power.SimulatedDiagnosis("leak", "ambiguous", ("supply_refill", "leak")),
-        campaign_power.SimulatedDiagnosis("leak", "missing", ("supply_refill",)),
-        campaign_power.SimulatedDiagnosis("leak", "adequate"),
-        campaign_power.SimulatedDiagnosis("leak", failed="FitError: none"),
-    ]
-    rates = campaign_power.rates_of(answers, 0.5, 0.9)
+    told = [("missing", ("leak",)), ("ambiguous", ("supply_refill", "leak")), ("missing", ("supply_refill",))]
+    told += [("adequate", (), ()), ("", (), (), "FitError: none")]
+    rates = campaign_power.rates_of([campaign_power.SimulatedDiagnosis("leak", *said) for said in told], 0.5, 0.9)
     assert (rates.detections, rates.alarms, rates.failed) == (Rate(2, 4), Rate(3, 4), 1)
     # Clopper and Pearson's for nine of ten, from the quantiles of the beta distribution.
     assert Rate(9, 10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
@@ -144,43 +135,31 @@ def test_a_simulated_campaign_is_diagnosed_with_its_effect():
 
 
 def test_the_design_of_a_fit_records_as_long_as_its_trials():
-    questions, _ = campaign_power.planned_tests(planned(1))
-    design = campaign_power.design_of_fit(questions.fit)
-    for camera, trial in zip(design.cameras, questions.fit.trials, strict=True):
+    fit = planned_tests(planned(1))[0].fit
+    design = campaign_power.design_of_fit(fit)
+    for camera, trial in zip(design.cameras, fit.trials, strict=True):
         assert camera.stops_s == pytest.approx(trial.time_s[-1] - trial.release_s)
         assert camera.capture_fps == pytest.approx(500.0)
     assert design.spreads == (0.01, 0.03)
 
-
-# The fewest further trials that give an effect of some size a target power.
 
 LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
 def few():
-    return planned(2, pressures=("14", "24"), candidates=("air_drag", "tail_friction", "leak"))
+    """Four trials, and what they can tell."""
+    design = planned(2, kPa=(14, 24), candidates=("air_drag", "tail_friction", "leak"))
+    return design, power_with(design, nonlinear=True)
 
 
-@pytest.fixture(scope="module")
-def few_power(few):
-    return linear_power.power_of(campaign_power.planned_tests(few)[0], nonlinear=True)
-
-
-@pytest.fixture(scope="module")
-def further(few, few_power):
-    return further_trials(few, few_power["leak"], 0.6 * few_power["leak"].size_at(0.9), 0.9, LIMITS)
-
-
-def test_the_power_of_a_plan_is_that_of_a_sheet_with_its_trials(few, further):
+def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_come_in_pairs_and_are_few(few):
+    design, power = few
+    further = further_trials(design, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
     assert further.before < 0.9 <= further.after
-    made = with_trials(few, [added.trial for added in further.trials])
-    again = linear_power.effect_power(campaign_power.planned_tests(made)[0], "leak")
-    assert again is not None
+    made = with_trials(design, [added.trial for added in further.trials])
+    again = linear_power.effect_power(planned_tests(made)[0], "leak")
     assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
-
-
-def test_trials_stay_within_the_limits_come_in_pairs_and_are_no_more_than_needed(further):
     fewer = [added.probability for added in further.trials if added.probability < further.target]
     assert len(fewer) == len(further.trials) - 2
     pressures = [added.trial.pressure_Pa for added in further.trials]
@@ -189,15 +168,13 @@ def test_trials_stay_within_the_limits_come_in_pairs_and_are_no_more_than_needed
     assert all(count % 2 == 0 for count in np.unique(pressures, return_counts=True)[1])
 
 
-def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_reported(few, few_power):
-    enough = further_trials(few, few_power["leak"], 1.5 * few_power["leak"].size_at(0.98), 0.9, LIMITS)
-    assert enough.trials == ()
-    never = further_trials(few, few_power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
+def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_reported(few):
+    design, power = few
+    assert further_trials(design, power["leak"], 1.5 * power["leak"].size_at(0.98), 0.9, LIMITS).trials == ()
+    never = further_trials(design, power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
     assert not never.is_reached
     assert never.unlimited < 0.9
 
-
-# Further trials where nothing is found.
 
 CONNECTOR_LIMITS = Limits(
     pressure_kPa=(14.0, 40.0), payload_g=(0.0, 0.0), inlet_mm=(5.5, 8.0), chamber_l=(3.7,), trials=4
@@ -209,20 +186,15 @@ def sizes_with(design: campaign_power.CampaignDesign, settings: list[tuple[float
     """Sizes of all effects found nine times in ten with trials at these pressures, kPa, and connectors, mm, as well."""
     like = design.trials[0]
     added = [replace(like, name=f"a{k}", pressure_Pa=1e3 * P, inlet_m=mm / 1e3) for k, (P, mm) in enumerate(settings)]
-    powers = [
-        linear_power.effect_power(campaign_power.planned_tests(with_trials(design, added))[0], name) for name in NAMES
-    ]
-    return np.array([power.size_at(0.9) for power in powers if power is not None])
+    tests, _ = planned_tests(with_trials(design, added))
+    return np.array([linear_power.effect_power(tests, name).size_at(0.9) for name in NAMES])
 
 
 @pytest.mark.slow
 def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promised():
     """After three trials of one vine at each of two pressures, through a connector that is always the same."""
-    design = planned(3, (0.005, 0.02), ("14", "24"), NAMES, chamber_l="3.7", inlet_mm="8")
-    found = exploratory_trials(
-        design, linear_power.power_of(campaign_power.planned_tests(design)[0], nonlinear=True), CONNECTOR_LIMITS
-    )
-    assert found is not None
+    design = planned(3, (0.005, 0.02), (14, 24), NAMES, chamber_l="3.7", inlet_mm="8")
+    found = exploratory_trials(design, power_with(design, nonlinear=True), CONNECTOR_LIMITS)
     settings = [(t["pressure_kPa"], t["inlet_mm"]) for t in found.trials for _ in range(t["replicates"])]
     assert len(settings) == 4
     recommended = np.array([found.then[name].size_at(0.9) for name in NAMES])
