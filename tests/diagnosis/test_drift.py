@@ -74,9 +74,6 @@ def test_vines_of_different_exponents_are_told():
     assert np.ptp(values) == pytest.approx(0.07, abs=0.03)
 
 
-# Where a model fails by more than the scatter of replicates, on vines from the virtual laboratory.
-
-
 @pytest.mark.slow
 def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_large_as_replicates_make_them():
     """In the third campaign the noise remembers itself, in the fourth trials scatter little.
@@ -112,8 +109,7 @@ def test_an_emptying_chamber_makes_it_fail(emptying):
 def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign():
     """Eight millimetres ahead in the middle of the growth of one condition, by hand."""
     pairs = pairs_of(grown(sheet((4,)), 77, damping_scatter=0.005, pressure_scatter=0.002))
-    chosen = pairs[4][0].condition
-    bent = []
+    chosen, bent = pairs[4][0].condition, []
     for trial, track in pairs:
         y = track.lead_position_m - track.lead_position_m[:5].mean()
         bump = 8e-3 * np.exp(-0.5 * ((y - 0.14) / 0.03) ** 2) * (trial.condition == chosen)

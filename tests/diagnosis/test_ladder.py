@@ -26,8 +26,8 @@ DEPLETION = "reservoir_depletion"
 
 def hidden(seed: int, *effects: str) -> Pairs:
     """Vines at four pressures each on a chamber of 3.7 L that nothing refills."""
-    vines = {scale: campaign(isometric_vine(scale), (24, 30, 38, 48), 3, prefix=f"R{scale}_") for scale in (2, 4)}
-    trials = with_names([replace(trial, chamber_m3=3.7e-3) for vine in vines.values() for trial in vine])
+    vines = [campaign(isometric_vine(scale), (24, 30, 38, 48), 3, prefix=f"R{scale}_") for scale in (2, 4)]
+    trials = with_names([replace(trial, chamber_m3=3.7e-3) for vine in vines for trial in vine])
     return pairs_of(grown(list(trials), seed, effects))
 
 
@@ -65,11 +65,9 @@ def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs)
     found = vt.fit(vt.base_model(), one_vine, profile=False)
     predicted = []
     for condition in dict.fromkeys(trial.condition for trial, _ in one_vine):
-        seen = [pair for pair in one_vine if pair[0].condition != condition]
-        unseen = [pair for pair in one_vine if pair[0].condition == condition]
-        predicted += predict_prepared(
-            vt.fit(vt.base_model(), seen, profile=False), prepared_pairs(unseen), from_rest=True
-        )
+        others = vt.fit(vt.base_model(), [pair for pair in one_vine if pair[0].condition != condition], profile=False)
+        unseen = prepared_pairs([pair for pair in one_vine if pair[0].condition == condition])
+        predicted += predict_prepared(others, unseen, from_rest=True)
     by_hand = Errors(tuple(predicted), {}).rms_m
     assert left_out(found).rms_m == pytest.approx(by_hand, rel=0.05)
     assert by_hand > 1.1 * in_sample(found).rms_m

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -20,18 +19,14 @@ import vinetrack as vt
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis import score_test as hypotheses
 from vinetrack.diagnosis.ladder import candidates_of, host_for
-from vinetrack.diagnosis.misfit_tests import (
-    FALSE_ALARM_LEVEL_FIRST_ROUND,
-    FALSE_ALARM_LEVEL_LATER_ROUNDS,
-    MisfitTests,
-    misfit_tests,
-)
+from vinetrack.diagnosis.misfit_tests import MisfitTests, misfit_tests
 from vinetrack.diagnosis.score_test import fit_columns, levers_of
 from vinetrack.diagnosis.selection import confounders_of, size_not_excluded
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
-from vinetrack.inference.fit import fit
 from vinetrack.inference.robust_covariance import Systematics
+
+FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
 
 
 def careful(payload_g: float, seed: int) -> Pairs:
@@ -42,9 +37,9 @@ def careful(payload_g: float, seed: int) -> Pairs:
     return pairs_of(grown(trials, seed, **care))
 
 
-def questioned(pairs: Pairs, model: vt.Model, level: float = FALSE_ALARM_LEVEL_FIRST_ROUND) -> MisfitTests:
+def questioned(pairs: Pairs, model: vt.Model, level: float = FIRST) -> MisfitTests:
     candidates = candidates_of(model, None, None)
-    found = fit(model, pairs, host=host_for(model, candidates), profile=False)
+    found = vt.fit(model, pairs, host=host_for(model, candidates), profile=False)
     return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], level)
 
 
@@ -71,19 +66,16 @@ def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(mak
     asked = questioned(make(), vt.base_model())
     assert not asked.rejects_model
     monkeypatch.setattr(questions, "systematics_of", none)
-    assert misfit_tests(asked.fit, asked.effects, FALSE_ALARM_LEVEL_FIRST_ROUND).rejects_model
+    assert misfit_tests(asked.fit, asked.effects, FIRST).rejects_model
 
 
 def through_a_lens(allowance_m: float) -> Pairs:
     """Tracks through a lens that displaces the edge by up to 0.1 mm (k₃ u³ for u of 0.14 m about the middle)."""
-    k3 = 1e-4 / 0.14**3
-    return [
-        (
-            replace(trial, position_systematic_m=allowance_m),
-            replace(track, lead_position_m=track.lead_position_m + k3 * (track.lead_position_m - 0.14) ** 3),
-        )
-        for trial, track in careful(0.0, 10)
-    ]
+    made = []
+    for trial, track in careful(0.0, 10):
+        bent_m = track.lead_position_m + 1e-4 * ((track.lead_position_m - 0.14) / 0.14) ** 3
+        made.append((replace(trial, position_systematic_m=allowance_m), replace(track, lead_position_m=bent_m)))
+    return made
 
 
 @pytest.mark.slow
@@ -92,24 +84,19 @@ def test_a_lens_of_a_tenth_of_a_millimetre_is_no_physics_where_that_much_is_allo
     assert questioned(through_a_lens(0.0), vt.base_model()).rejects_model
 
 
-# What of a fitted size another effect may account for: against refits and quadrature.
-
 DRAG, INLET = "air_drag.C_D", "inlet_loss.K"
-TRUE_DRAG, TRUE_INLET = 1.2, 1.0
-
-
-@lru_cache(maxsize=1)
-def both_act() -> Pairs:
-    """Trials of two tubes through connectors a third as wide: air slows down there as drag would slow the vine."""
-    trials = [replace(trial, inlet_m=0.33 * trial.diameter_m) for trial in sheet()]
-    care = {"damping_scatter": 5e-3, "pressure_scatter": 1e-3, "yield_error_kPa": 0.05, "noise_m": 3e-5}
-    return pairs_of(grown(trials, 31, ["inlet_loss", "air_drag"], {INLET: TRUE_INLET, DRAG: TRUE_DRAG}, **care))
+TRUE_INLET = 1.0
 
 
 @pytest.fixture(scope="module")
 def after():
-    """The model with the inlet loss alone, fitted to trials that have drag too, held against all other effects."""
-    return questioned(both_act(), vt.base_model() + vt.effects.inlet_loss, FALSE_ALARM_LEVEL_LATER_ROUNDS)
+    """The model with the inlet loss alone, held against all other effects, fitted to trials that have drag too: of two
+    tubes through connectors a third as wide, where air slows down as drag would slow the vine.
+    """
+    trials = [replace(trial, inlet_m=0.33 * trial.diameter_m) for trial in sheet()]
+    care = {"damping_scatter": 5e-3, "pressure_scatter": 1e-3, "yield_error_kPa": 0.05, "noise_m": 3e-5}
+    both_act = grown(trials, 31, ["inlet_loss", "air_drag"], {INLET: TRUE_INLET, DRAG: 1.2}, **care)
+    return questioned(pairs_of(both_act), vt.base_model() + vt.effects.inlet_loss, LATER)
 
 
 def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after):
@@ -118,7 +105,7 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after):
     lever = float(levers_of(after.fit, after.products)[k, place])
     drag = 0.2
     model = (after.fit.model + vt.effects.air_drag).with_values({DRAG: drag})
-    with_drag = fit(model, both_act(), fixed=[DRAG], profile=False)
+    with_drag = vt.fit(model, after.fit.pairs, fixed=[DRAG], profile=False)
     fell = after.fit[INLET].value - with_drag[INLET].value
     # First order in C_D; spreads and noise are estimated anew in the refit.
     assert fell == pytest.approx(lever * drag, rel=0.1)
@@ -159,18 +146,13 @@ def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour():
         assert limit == pytest.approx(mean + np.sign(estimate) * 1.644854 * sd, rel=1e-6)
 
 
-# A fit is tested with sensitivities past the end of growth or, where they cannot be computed, with its last ones.
-
-
 def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_columns(monkeypatch):
+    """Usually they are past the end of growth."""
     fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False, thorough=False)
     before = fit_columns(fit)
-
     cannot = Mock(side_effect=SimulationError("Trial t: the model could not be integrated beyond 3.7 s."))
     monkeypatch.setattr(fit.predictor, "linearise", cannot)
-    columns = fit_columns(replace(fit))
-    assert len(columns) == len(before)
-    for known, fresh in zip(columns, before, strict=True):
+    for known, fresh in zip(fit_columns(replace(fit)), before, strict=True):
         assert np.allclose(known[:, -1], fresh[:, -1], atol=1e-12)
         # Where growth ends a step changes more than a derivative says.
         usual = np.median(np.abs(known - fresh), axis=0)

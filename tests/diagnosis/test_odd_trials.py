@@ -24,14 +24,13 @@ from vinetrack.inference.fit_data import prepare
 PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
 
 
-def grown(name: str, kPa: float, seed: int, diameter_mm: float = 12.0) -> tuple[Trial, Track]:
-    trial = vine_trial("", kPa, diameter_mm, length_m=0.3, growth_angle_rad=np.pi / 2)
-    draw = np.random.default_rng(seed)
+def grown(name: str, kPa: float, seed: int) -> tuple[Trial, Track]:
+    more = {"vine": "12mm", "condition": f"12mm_{kPa}", "length_m": 0.3, "growth_angle_rad": np.pi / 2}
+    trial, draw = vine_trial(name, kPa, 12.0, **more), np.random.default_rng(seed)
     time = np.arange(0, 0.3, 0.001)
     position = grown_position(trial, time - 0.02, 1.83 * np.exp(0.02 * draw.normal()), 0.37)
-    time, position = time[np.isfinite(position)], position[np.isfinite(position)]
-    trial = replace(trial, name=name, vine="12mm", condition=f"12mm_{kPa}")
-    return trial, make_track(time, position + draw.normal(0, 1e-4, time.size))
+    seen = np.isfinite(position)
+    return trial, make_track(time[seen], position[seen] + draw.normal(0, 1e-4, np.count_nonzero(seen)))
 
 
 @pytest.fixture(scope="module")
@@ -92,16 +91,12 @@ def test_an_odd_trial_of_an_adequate_campaign_is_a_note(adequate):
 @pytest.mark.slow
 @pytest.mark.parametrize("others_say", ["tail_friction", "air_drag", "nothing"])
 def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they_do_not(adequate, others_say):
-    (row,) = [candidate for candidate in adequate.rounds[0].ranking if candidate.effect == "tail_friction"]
-    ranking = (replace(row, in_answer_set=True),)
-    last = replace(adequate.rounds[-1], verdict="missing", answer_set=("tail_friction",), ranking=ranking)
+    ranking = [replace(row, in_answer_set=True) for row in adequate.rounds[0].ranking if row.effect == "tail_friction"]
+    last = replace(adequate.rounds[-1], verdict="missing", answer_set=("tail_friction",), ranking=tuple(ranking))
     named = replace(adequate, rounds=(last,), effects=("tail_friction",), explanation="A friction is missing.")
-    others = {
-        "tail_friction": named,
-        "air_drag": replace(named, rounds=(replace(last, answer_set=("air_drag",)),)),
-        "nothing": adequate,
-    }[others_say]
-    outcome = with_odd_trials(named, [OddTrial("t2", 12e3, 21e3)], lambda _: others)
+    others = {"tail_friction": named, "nothing": adequate}
+    others["air_drag"] = replace(named, rounds=(replace(last, answer_set=("air_drag",)),))
+    outcome = with_odd_trials(named, [OddTrial("t2", 12e3, 21e3)], lambda _: others[others_say])
     said = (outcome.verdict, outcome.answer_set, outcome.effects)
     if others_say == "tail_friction":
         assert said == ("missing", ("tail_friction",), ("tail_friction",))
@@ -119,12 +114,10 @@ def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(adequat
 
 
 def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(campaign):
-    data, _ = prepare(campaign)
-    data = [
-        replace(trial_data, trace=(trial_data.time_s, np.full(trial_data.time_s.size, pressure_Pa)))
-        for trial_data in data
-        for pressure_Pa in [12e3 if trial_data.trial.name == "t2" else trial_data.trial.pressure_Pa]
-    ]
+    data = []
+    for one in prepare(campaign)[0]:
+        pressure_Pa = 12e3 if one.trial.name == "t2" else one.trial.pressure_Pa
+        data.append(replace(one, trace=(one.time_s, np.full(one.time_s.size, pressure_Pa))))
     (slip,) = odd_trials(data)
     assert (slip.name, slip.stated_Pa) == ("t2", 12e3)
     assert slip.implied_pressure_Pa == pytest.approx(21e3, rel=0.05)
@@ -136,8 +129,7 @@ def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
     given |= {"_stated_Pa": lambda _: math.nan, "_implied_pressure_Pa": lambda *_: math.nan, "CHANCE": 1e-2}
     for name, value in given.items():
         monkeypatch.setattr(odd_trials_module, name, value)
-    draw = np.random.default_rng(20050)
-    campaigns_with_odd = 0
+    draw, campaigns_with_odd = np.random.default_rng(20050), 0
     for _ in range(150):
         log_speed = draw.uniform(0, 1.5, 24)
         force_N = np.exp(0.37 * log_speed + 0.05 * draw.standard_normal(24))
