@@ -23,10 +23,8 @@ from vinetrack.planning.predictive_inputs import damping_prior
 
 pytestmark = pytest.mark.slow
 
-HOST = vt.make_model(
-    [*BASE, "air_drag", "inlet_loss", "reservoir_depletion", "tail_friction", "length_scale", "time_base"]
-)
-"""One compiled model serves all that are fitted here."""
+FITTED = ["air_drag", "inlet_loss", "reservoir_depletion", "tail_friction", "length_scale", "time_base"]
+HOST = vt.make_model([*BASE, *FITTED])  # one compiled model serves all that are fitted here
 
 B_KNOWN, N = 6.44, 0.37
 
@@ -81,12 +79,9 @@ def dragged():
     return pairs, fits
 
 
-@pytest.fixture(scope="module")
-def advised(dragged):
-    return next_experiment(dragged[1])
-
-
-def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_without_a_new_vine(advised):
+def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_without_a_new_vine(dragged):
+    pairs, fits = dragged
+    advised = next_experiment(fits)
     assert not any(trial["new_vine"] for trial in advised.trials)
     assert {trial["inlet_mm"] for trial in advised.trials} - {8.0}
     assert sum(trial["replicates"] for trial in advised.trials) == 4
@@ -94,10 +89,7 @@ def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_witho
     assert advised.advice.code == "trials_to_make"
     (sigma,), ((mean, _),) = advised.separation_sigma.values(), advised.simulated_sigma.values()
     assert sigma == pytest.approx(mean, rel=0.2)
-
-
-def test_the_predicted_separation_agrees_with_that_of_the_trials_once_made(dragged, advised):
-    pairs, fits = dragged
+    # And as it is with the trials once made.
     new = grown(as_trials(advised, pairs[0][0]), 4101)
     predicted = advised.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
