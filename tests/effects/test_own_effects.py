@@ -1,9 +1,10 @@
-"""A user's own effect: read, tried out, named before it runs, listed, simulated; and every way to be none."""
+"""The contract of an effect's file, in the catalogue or a user's own: read, tried out, listed, simulated, refused."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -14,9 +15,10 @@ from by_hand import LOADED, followed
 from commanded import run
 
 import vinetrack as vt
+import vinetrack.effects as effects
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.effects import Effect, EffectError, air_drag, catalogue, load_effect
-from vinetrack.effects._catalogue import _is_independent_of_path, behaviour_faults, own_effects
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, State, air_drag, catalogue, find_effect, load_effect
+from vinetrack.effects._catalogue import _RIG, _STATE, _is_independent_of_path, behaviour_faults, own_effects
 
 BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
 
@@ -196,3 +198,64 @@ def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file, monkeyp
     with pytest.raises(EffectError):
         load_effect(effect_file)
     assert not effect_file.with_suffix(".ran").exists()
+
+
+FOLDER = Path(effects.__file__).parent
+FILES = sorted(path for path in FOLDER.glob("*.py") if not path.stem.startswith("_"))
+ALL = [load_effect(path) for path in FILES]
+PARAMETERS = [(effect, parameter) for effect in ALL for parameter in effect.parameters]
+
+each_effect = pytest.mark.parametrize("effect", ALL, ids=lambda effect: effect.name)
+
+
+def test_the_folder_is_the_catalogue_with_the_base_first():
+    assert set(catalogue()) == {path.stem for path in FILES}
+    assert tuple(catalogue())[:4] == BASE_EFFECTS
+
+
+@each_effect
+def test_a_file_names_describes_and_works_out_its_effect(effect):
+    assert effect.name == effect.path.stem
+    assert getattr(effects, effect.name) == effect == find_effect(effect.name)
+    assert all((effect.summary, effect.formula, "Source:" in effect.text))
+    assert {worked.hook for worked in effect.worked} == set(effect.functions)
+    assert all(worked.rel <= 1e-2 for worked in effect.worked)
+    assert set(effect.replaces) <= set(catalogue()) - {effect.name}
+    assert (effect.kind == "base") == (effect.name in BASE_EFFECTS)
+    if effect.kind == "measurement":
+        read_off = {"true_time", "trace_time", "observed_position", "row_delay", "gauge", "yield_gauge", "area"}
+        read_off |= {"film_gain", "averaged_over"}
+        # They turn, and add to, a weight and a mass that are there.
+        weight = {"growth_angle": {"tail_force"}, "payload_mass": {"tail_force", "added_mass"}}
+        assert set(effect.functions) <= read_off | weight.get(effect.name, set())
+
+
+@pytest.mark.parametrize(("effect", "parameter"), PARAMETERS, ids=[f"{e.name}-{p.name}" for e, p in PARAMETERS])
+def test_parameters_have_symbol_unit_meaning_and_bounds_that_hold_the_default(effect, parameter):
+    assert effect.parameters.count(parameter) == 1
+    assert all((parameter.symbol, parameter.unit, parameter.meaning))
+    low, high = parameter.bounds
+    assert -math.inf < low < high < math.inf
+    assert low <= parameter.default <= high
+    assert parameter.shared in ("all", "vine", "day")
+    assert low <= parameter.plausible[0] < parameter.plausible[1] <= high
+
+
+@each_effect
+def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect):
+    sizes = [parameter.default for parameter in effect.parameters]
+    factors = np.array([0.5, 1.0, 1.7])
+    rows = State(*(np.asarray(value * factors) for value in _STATE))
+    rest = _STATE._replace(time=0.0, lead_position=0.0, lead_velocity=0.0, tail_position=0.0, tail_velocity=0.0)
+    for hook in effect.functions.values():
+        found = np.broadcast_to(np.asarray(hook(rows, _RIG, *sizes)), factors.shape)
+        singly = [float(hook(State(*(float(value * f) for value in _STATE)), _RIG, *sizes)) for f in factors]
+        np.testing.assert_allclose(found, singly, rtol=1e-13)
+        assert np.isfinite(float(hook(rest, _RIG, *sizes)))
+
+
+def test_effects_are_told_apart_by_name_and_file(tmp_path):
+    twin = tmp_path / "gravity.py"
+    twin.write_text((FOLDER / "gravity.py").read_text())
+    assert {load_effect(FOLDER / "gravity.py")} == {effects.gravity}
+    assert load_effect(twin) != effects.gravity
