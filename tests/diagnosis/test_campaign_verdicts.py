@@ -90,16 +90,11 @@ FILM, DRAG = catalogue()["film_mass"], catalogue()["air_drag"]
 TRIALS = [Trial(name="t1", vine="a"), Trial(name="t2", vine="b")]
 
 
-@pytest.fixture(scope="module")
-def answered(tmp_path_factory):
-    """The truth about two vines whose film is off by +1.4 and −8.3 per cent, and what is said of them."""
-    truths, experiment = laboratory(tmp_path_factory.mktemp("film"), "film_uneven", 909, (24, 26))
-    return truths, diagnosed(experiment)
-
-
 @pytest.mark.slow
-def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
-    truths, said = answered
+def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(tmp_path):
+    """Of two vines whose film is off by +1.4 and −8.3 per cent."""
+    truths, experiment = laboratory(tmp_path, "film_uneven", 909, (24, 26))
+    said = diagnosed(experiment)
     assert (said.verdict, said.answer_set) == ("artefact", ("film_mass",))
     named = row_of(said, "film_mass")
     (n,) = (number for number in named.along if number.key == "eversion_damping.n")
@@ -107,6 +102,24 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
     assert f"Fitted together with film_mass, n = {with_error(n.value, n.sigma)} instead of" in said.explanation
     for k, number in enumerate(named.numbers):
         assert abs(number.value - truths[f"film_mass.eps.{k}"]) < 3 * number.sigma < 0.03
+    # What one vine answers alone adds up to what all answer.
+    fit = said.fits[0]
+    vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
+    asked = effect_sensitivities(fit, shapes_of(FILM, [trial.trial for trial in fit.trials]))
+    assert [shape.group for shape in asked.shapes] == ["", *vines]
+    for trial, columns in zip(fit.trials, asked.columns, strict=True):
+        alone = {vine: columns[:, 1 + k] for k, vine in enumerate(vines)}
+        assert np.any(alone.pop(trial.trial.vine))
+        assert not any(np.any(of_other) for of_other in alone.values())
+        np.testing.assert_allclose(columns[:, 1:].sum(axis=1), columns[:, 0], rtol=0.02, atol=1e-5)
+    # Film gains what a fit with free film gains, less its prior.
+    film_free = vt.refit(fit, fit.model + "film_mass")
+    sizes = [number.value for number in film_free.numbers if number.key == "film_mass.eps"]
+    fall = 2 * (film_free.log_likelihood - fit.log_likelihood)
+    gained = film_gain(fit)
+    # The prior pulls sizes in, so it costs less than at the sizes of the free fit, and more than nothing.
+    assert fall - sum((size / FILM_ERROR) ** 2 for size in sizes) < gained < fall
+    assert film_gain(film_free) == 0
 
 
 def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_has_one():
@@ -118,31 +131,6 @@ def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_h
         assert [shape.group for shape in shapes_of(catalogue()["time_base"], of)] == ["", *days]
         assert groups_of(of, "day") == (days or [""] * len(of))
     assert group_names([replace(known[0], day=day) for day in ("10", "2", "2")], "day") == ["day 2", "day 10"]
-
-
-@pytest.mark.slow
-def test_what_one_vine_answers_alone_adds_up_to_what_all_answer(answered):
-    fit = answered[1].fits[0]
-    vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
-    asked = effect_sensitivities(fit, shapes_of(FILM, [trial.trial for trial in fit.trials]))
-    assert [shape.group for shape in asked.shapes] == ["", *vines]
-    for trial, columns in zip(fit.trials, asked.columns, strict=True):
-        alone = {vine: columns[:, 1 + k] for k, vine in enumerate(vines)}
-        assert np.any(alone.pop(trial.trial.vine))
-        assert not any(np.any(of_other) for of_other in alone.values())
-        np.testing.assert_allclose(columns[:, 1:].sum(axis=1), columns[:, 0], rtol=0.02, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_film_gains_what_a_fit_with_free_film_gains_less_its_prior(answered):
-    fit = answered[1].fits[0]
-    film_free = vt.refit(fit, fit.model + "film_mass")
-    sizes = [number.value for number in film_free.numbers if number.key == "film_mass.eps"]
-    fall = 2 * (film_free.log_likelihood - fit.log_likelihood)
-    gained = film_gain(fit)
-    # The prior pulls sizes in, so it costs less than at the sizes of the free fit, and more than nothing.
-    assert fall - sum((size / FILM_ERROR) ** 2 for size in sizes) < gained < fall
-    assert film_gain(film_free) == 0
 
 
 @pytest.mark.parametrize(
@@ -186,14 +174,10 @@ def test_two_predictions_are_as_far_apart_as_the_noise_of_the_fit_makes_them():
     assert likelihood_ratio._distance(fit(difference), fit(0 * difference)) == pytest.approx(expected)
 
 
-@pytest.fixture(scope="module")
-def of_two_days(tmp_path_factory):
-    """A campaign of two days, the camera running by 4 to 8 % otherwise on the second."""
-    return laboratory(tmp_path_factory.mktemp("day"), "rate_day", 909, (24, 26))[1]
-
-
 @pytest.mark.slow
-def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day(of_two_days):
+def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day_and_known_to_predictions(tmp_path):
+    """A campaign of two days, the camera running by 4 to 8 % otherwise on the second."""
+    of_two_days = laboratory(tmp_path, "rate_day", 909, (24, 26))[1]
     said = diagnosed(of_two_days)
     assert said.verdict == "artefact"
     assert "time_base" in said.answer_set
@@ -202,11 +186,7 @@ def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day(of_two_days)
     assert abs(first.value) < 3 * first.sigma < 0.02
     assert 0.03 < abs(second.value) < 0.09
     assert second.sigma < 0.01
-
-
-@pytest.mark.slow
-def test_a_fit_with_a_number_for_each_day_predicts_the_trials_of_each(of_two_days):
-    """A band around a prediction takes over the error of the number of its day."""
+    # A band around a prediction takes over the error of the number of its day.
     fitted_by_day = vt.fit(vt.base_model() + "time_base", of_two_days, profile=False)
     pairs = [pair for pair in fitted_by_day.pairs if pair[0].day == "2"]
     known = vt.predict(fitted_by_day, pairs)

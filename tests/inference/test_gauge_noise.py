@@ -40,9 +40,12 @@ def test_most_of_the_noise_is_removed(sigma_Pa):
     assert np.max(np.abs(lefts)) < 5 * sigma_Pa
 
 
-def test_exact_pressures_are_unchanged():
+def test_exact_pressures_are_unchanged_and_equal_readings_handled():
     for exact_Pa in (LET_DOWN, 16e3 * -np.expm1(-TIMES_S / 0.2), np.full(5, 3.0)):
         np.testing.assert_array_equal(without_noise(exact_Pa), exact_Pa)
+    told_Pa = 20e3 + 100.0 * (np.arange(60) == 30)  # readings that are nearly all equal
+    assert noise_correlation([told_Pa] * 4) == 0.0
+    assert np.isfinite(without_noise(told_Pa)).all()
 
 
 GROWTH_M = 0.3 * -np.expm1(-np.maximum(TIMES_S - 0.06, 0.0) / 0.3)
@@ -193,13 +196,6 @@ def test_a_fall_in_steps_coarser_than_its_noise_is_smooth_to_a_fraction_of_a_ste
     assert np.max(np.abs(np.diff(off))) < 10.0  # no step is left
     assert np.sqrt(np.mean(np.square(off))) < 50.0 / np.sqrt(12)
     assert np.sqrt(np.mean(np.square(off) / np.square(stated))) < 1.5
-
-
-def test_readings_that_are_nearly_all_equal_are_handled():
-    told_Pa = np.full(60, 20e3)
-    told_Pa[30] = 20.1e3
-    assert noise_correlation([told_Pa] * 4) == 0.0
-    assert np.isfinite(without_noise(told_Pa)).all()
 
 
 @pytest.mark.parametrize("digit_Pa", [1.0, 10.0, 100.0])

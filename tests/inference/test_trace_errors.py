@@ -34,13 +34,20 @@ def fit(laboratory):
     return vt.fit(vt.base_model(), laboratory[0], profile=False)
 
 
-def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit, laboratory):
+def test_residuals_are_position_noise_and_errors_of_their_stated_size_enter_the_likelihood(fit, laboratory):
     assert fit.noise_m == pytest.approx(laboratory[1], rel=0.1)
     assert fit.chi2_per_dof < 1.1
     told = np.concatenate([each.trace_error_sizes for each in fit.predictor.data if each.trace_error_sizes is not None])
     assert told.size > 12
     assert 0.4 < np.sqrt(np.mean(told**2)) < 1.6
     assert solving.trace_error_penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
+    data = [replace(each, trace_error_sizes=None) for each in fit.predictor.data]
+    predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
+    free = solving.assemble(predictor, fit.solution, {}, fit.options, profile=False)
+    assert free.log_likelihood - fit.log_likelihood == pytest.approx(
+        0.5 * solving.trace_error_penalty(fit.predictor.data)
+    )
+    assert solving.trace_error_penalty(fit.predictor.data) > 1.0
 
 
 def test_an_error_of_a_trace_is_estimated(fit):
@@ -73,16 +80,6 @@ def test_trace_errors_suggest_no_exponent_per_vine(fit):
     assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
 
 
-def test_estimated_errors_enter_the_likelihood(fit):
-    data = [replace(each, trace_error_sizes=None) for each in fit.predictor.data]
-    predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
-    free = solving.assemble(predictor, fit.solution, {}, fit.options, profile=False)
-    assert free.log_likelihood - fit.log_likelihood == pytest.approx(
-        0.5 * solving.trace_error_penalty(fit.predictor.data)
-    )
-    assert solving.trace_error_penalty(fit.predictor.data) > 1.0
-
-
 def test_the_tests_see_the_pressures_that_were_recorded(fit):
     state = fit.solution.state
     recorded = Predictor(fit.predictor.layout, list(map(solving.as_recorded, fit.predictor.data)), fit.predictor.host)
@@ -95,7 +92,7 @@ def test_the_tests_see_the_pressures_that_were_recorded(fit):
     assert np.sqrt(np.mean(off**2)) < 0.01 * np.sqrt(np.mean(moved**2))
 
 
-def test_left_out_trials_are_predicted_from_the_recorded_pressure(fit, monkeypatch):
+def test_left_out_trials_are_predicted_and_other_models_start_from_the_recorded_pressure(fit, monkeypatch):
     """Pressures corrected by a trial's own motion would predict it too well."""
     seen = Mock(wraps=predict_prepared)
     monkeypatch.setattr("vinetrack.diagnosis.ladder.predict_prepared", seen)
@@ -103,10 +100,7 @@ def test_left_out_trials_are_predicted_from_the_recorded_pressure(fit, monkeypat
     given = [trial_data for call in seen.call_args_list for trial_data in call.args[1]]
     assert len(given) == len(fit.trials)
     assert all(trial_data.trace_error_sizes is None for trial_data in given)
-
-
-def test_another_model_starts_from_the_recorded_pressure(fit):
-    """An effect whose curve the errors had absorbed would not be found otherwise."""
+    # An effect whose curve the errors had absorbed would not be found otherwise.
     with patch("vinetrack.inference.fit.make_layout", side_effect=InterruptedError) as begun:
         for model in (fit.model + "air_drag", fit.model):
             with pytest.raises(InterruptedError):
