@@ -223,7 +223,6 @@ def test_one_mistyped_payload_of_several_is_named_with_its_vine(tmp_path):
 
 
 FLAT = 2 / math.pi - 1
-FAULTS = ("area_scale", "film_mass", "length_scale", "pressure_gain", "time_base", "inlet_loss", "air_drag")
 DIAMETER = catalogue()["area_scale"].parameters[0]
 
 
@@ -240,7 +239,8 @@ DIAMETER = catalogue()["area_scale"].parameters[0]
 def test_a_slip_in_a_column_is_named(tmp_path, column, factor, named, size):
     pairs, _ = pairs_of(laboratory(tmp_path, "clean", 909, (10, 14))[1])
     slipped = [(replace(t, **{column: factor * getattr(t, column)}), track) for t, track in pairs]
-    said = diagnosed(slipped, FAULTS)
+    faults = ("area_scale", "film_mass", "length_scale", "pressure_gain", "time_base", "inlet_loss", "air_drag")
+    said = diagnosed(slipped, faults)
     assert said.verdict in ("artefact", "ambiguous")
     assert named in said.answer_set
     row = row_of(said, named)
@@ -272,7 +272,7 @@ def test_nothing_is_missing_from_a_simulation_of_the_model_itself(tmp_path, monk
     said = diagnosed(experiment)
     assert said.verdict == "adequate"
     fit = said.fits[0]
-    assert all(trial_data.noise_m**2 < variance_floor([trial_data])[0] for trial_data in fit.predictor.data)
+    assert all(seen.noise_m**2 < variance_floor([seen])[0] for seen in fit.predictor.data)
     assert np.isfinite(fit.chi2_per_dof)
     assert noise_in_motion_p(fit) == 1.0
     assert fit["n"].value == pytest.approx(truths["eversion_damping.n"], abs=3 * fit["n"].sigma)

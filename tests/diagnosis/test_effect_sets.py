@@ -152,7 +152,7 @@ LATCH = {"latch_release.F": 1.0, "latch_release.reach": 0.01}
 
 def asked(*names: str, **how: bool) -> Diagnosis:
     """Of a campaign with each condition once."""
-    return vt.diagnose(grown(TRUTH, seed=7200, trials=sheet()[::2]), candidates=names, **how)
+    return vt.diagnose(grown(TRUTH | LATCH, seed=7200, trials=sheet()[::2]), candidates=names, **how)
 
 
 @pytest.fixture(scope="module")

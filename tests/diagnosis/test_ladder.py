@@ -28,16 +28,12 @@ from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 DEPLETION = "reservoir_depletion"
 
 
-def hidden(seed: int, *effects: str) -> Pairs:
+@pytest.fixture(scope="module")
+def pairs():
     """Vines at four pressures each on a chamber of 3.7 L that nothing refills."""
     vines = [campaign(isometric_vine(scale), (24, 30, 38, 48), 3, prefix=f"R{scale}_") for scale in (2, 4)]
     trials = with_names([replace(trial, chamber_m3=3.7e-3) for vine in vines for trial in vine])
-    return pairs_of(grown(list(trials), seed, effects))
-
-
-@pytest.fixture(scope="module")
-def pairs():
-    return hidden(31, DEPLETION)
+    return pairs_of(grown(list(trials), 31, [DEPLETION]))
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, filmed, grown_position, small_campaign, vine_trial
-from vine_truth import make_track
+from lsoda_vine import B_TRUE, as_track, filmed, grown_position, small_campaign, vine_trial
 
 import vinetrack as vt
-import vinetrack.diagnosis.replicates as odd_trials_module
 from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
@@ -53,18 +51,15 @@ def grown(
     return trial_fit(name, time_s, position_m, 1.9, clock_s, origin_m)
 
 
-def another_model(trial: TrialFit) -> TrialFit:
-    """The same measurement, put by another model 7 ms and 5 mm elsewhere and predicted to grow half as fast."""
-    release_s, origin_m = trial.release_s + 7e-3, trial.origin_m + 5e-3
-    return trial_fit(trial.name, trial.time_s, trial.lead_position_m, 0.9, release_s, origin_m)
-
-
 @pytest.mark.parametrize("rest", [30, 0])
 def test_the_floor_is_the_same_for_every_model(rest):
-    draw = np.random.default_rng(20000)
-    speeds = 1 + 0.02 * draw.standard_normal(4)
+    """Also for one that puts trials 7 ms and 5 mm elsewhere and predicts them to grow half as fast."""
+    speeds = 1 + 0.02 * np.random.default_rng(20000).standard_normal(4)
     trials = [grown("t" * (i + 1), speed=speed, noise_m=5e-5, rest=rest) for i, speed in enumerate(speeds)]
-    others = [another_model(trial) if i % 2 else trial for i, trial in enumerate(trials)]
+    others = list(trials)
+    for i in (1, 3):
+        seen = trials[i].name, trials[i].time_s, trials[i].lead_position_m
+        others[i] = trial_fit(*seen, 0.9, trials[i].release_s + 7e-3, trials[i].origin_m + 5e-3)
     one, other = (position_errors(each, replicates_of(each)) for each in (trials, others))
     assert one["replicate_floor_m"] == other["replicate_floor_m"] > 0
     assert one["replicate_floor_sigma_m"] == other["replicate_floor_sigma_m"]
@@ -79,11 +74,10 @@ def test_equal_motions_with_clocks_and_origins_of_their_own_differ_by_nothing(re
 
 
 def test_a_track_that_begins_in_motion_is_laid_on_one_that_shows_its_rest():
-    one, whole = grown("a"), grown("b", clock_s=0.2)
+    whole = grown("b", clock_s=0.2)
     kept = whole.time_s > 0.2 + 0.015
-    arrays = ("time_s", "lead_position_m", "predicted_position_m", "residual_m")
-    late = replace(whole, **{name: getattr(whole, name)[kept] for name in arrays})
-    aligned = align_replicates([one, late])
+    late = trial_fit("b", whole.time_s[kept], whole.lead_position_m[kept], 1.9, whole.release_s, whole.origin_m)
+    aligned = align_replicates([grown("a"), late])
     assert aligned.floor_m < 2e-5
     assert aligned.release_s[1] - aligned.release_s[0] == pytest.approx(0.2, abs=5e-4)
 
@@ -183,21 +177,16 @@ def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model():
     assert error == pytest.approx(final_m_s(B_TRUE[24.0]) - final_m_s(12.0), rel=0.1)
 
 
-PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
-
-
-def filmed_vine(name: str, kPa: float, seed: int) -> tuple[Trial, Track]:
-    more = {"vine": "12mm", "condition": f"12mm_{kPa}", "length_m": 0.3, "growth_angle_rad": np.pi / 2}
-    trial, draw = vine_trial(name, kPa, 12.0, **more), np.random.default_rng(seed)
-    time = np.arange(0, 0.3, 0.001)
-    position = grown_position(trial, time - 0.02, 1.83 * np.exp(0.02 * draw.normal()), 0.37)
-    seen = np.isfinite(position)
-    return trial, make_track(time[seen], position[seen] + draw.normal(0, 1e-4, np.count_nonzero(seen)))
-
-
 @pytest.fixture(scope="module")
 def campaign():
-    return [filmed_vine(f"t{k}", kPa, 20000 + k) for k, kPa in enumerate(PRESSURES_KPA)]
+    pairs, time = [], np.arange(0, 0.3, 0.001)
+    for k, kPa in enumerate((18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)):
+        more = {"vine": "12mm", "condition": f"12mm_{kPa}", "length_m": 0.3, "growth_angle_rad": np.pi / 2}
+        trial, draw = vine_trial(f"t{k}", kPa, 12.0, **more), np.random.default_rng(20000 + k)
+        position = grown_position(trial, time - 0.02, 1.83 * np.exp(0.02 * draw.normal()), 0.37)
+        seen = np.isfinite(position)
+        pairs.append((trial, as_track(time[seen], position[seen] + draw.normal(0, 1e-4, np.count_nonzero(seen)))))
+    return pairs
 
 
 def stated(pairs: list[tuple[Trial, Track]], **kPa: float) -> list[tuple[Trial, Track]]:
@@ -290,7 +279,7 @@ def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
     given = {"middle_speed": lambda data: data.speed, "_force_N": lambda trial, _: trial.force_N}
     given |= {"_stated_Pa": lambda _: math.nan, "_implied_pressure_Pa": lambda *_: math.nan, "CHANCE": 1e-2}
     for name, value in given.items():
-        monkeypatch.setattr(odd_trials_module, name, value)
+        monkeypatch.setattr(f"vinetrack.diagnosis.replicates.{name}", value)
     draw, campaigns_with_odd = np.random.default_rng(20050), 0
     for _ in range(150):
         log_speed = draw.uniform(0, 1.5, 24)
