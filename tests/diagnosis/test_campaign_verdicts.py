@@ -21,10 +21,8 @@ import vinetrack as vt
 from vinetrack.core.problems import Remark
 from vinetrack.core.records import Trial
 from vinetrack.core.units import with_error
-from vinetrack.diagnosis import likelihood_ratio
+from vinetrack.diagnosis import likelihood_ratio, misfit_tests, result
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, film_gain
-from vinetrack.diagnosis.misfit_tests import noise_in_motion_p
-from vinetrack.diagnosis.result import NOT_TESTABLE, Candidate, Diagnosis
 from vinetrack.diagnosis.score_test import (
     RANGE_SHARE_BESIDE_SLIP,
     effect_sensitivities,
@@ -44,7 +42,7 @@ from vinetrack.laboratory.tracks import Vine
 from vinetrack.laboratory.tracks import campaign as laboratory_campaign
 
 
-def diagnosed(pairs: Any, candidates: Sequence[str] | None = None) -> Diagnosis:
+def diagnosed(pairs: Any, candidates: Sequence[str] | None = None) -> result.Diagnosis:
     return vt.diagnose(pairs, candidates=candidates, ladder=False, advice=False)
 
 
@@ -55,7 +53,7 @@ def laboratory(folder: Path, row: str, seed: int, size: tuple[int, int], **more:
     return known.truth["truths"], vt.read_experiment(folder / "e")
 
 
-def row_of(said: Diagnosis, effect: str) -> Candidate:
+def row_of(said: result.Diagnosis, effect: str) -> result.Candidate:
     (row,) = (row for row in said.rounds[0].ranking if row.effect == effect)
     return row
 
@@ -274,7 +272,7 @@ def test_nothing_is_missing_from_a_simulation_of_the_model_itself(tmp_path, monk
     fit = said.fits[0]
     assert all(seen.noise_m**2 < variance_floor([seen])[0] for seen in fit.predictor.data)
     assert np.isfinite(fit.chi2_per_dof)
-    assert noise_in_motion_p(fit) == 1.0
+    assert misfit_tests.noise_in_motion_p(fit) == 1.0
     assert fit["n"].value == pytest.approx(truths["eversion_damping.n"], abs=3 * fit["n"].sigma)
 
 
@@ -303,4 +301,4 @@ def test_a_bare_vine_of_light_film_cannot_tell():
     bare = filmed(Vine(12, 100, 140), (24, 30, 38, 48), 0, 90, 0)
     told = diagnosed([(replace(t, position_systematic_m=1e-4), track) for t, track in bare], ANGLE_RIVALS)
     assert told.verdict == "adequate"
-    assert row_of(told, "growth_angle").status == NOT_TESTABLE
+    assert row_of(told, "growth_angle").status == result.NOT_TESTABLE

@@ -13,9 +13,8 @@ from hidden_truth import grown, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.diagnosis import candidate_fits, ladder
 from vinetrack.diagnosis import score_test as hypotheses
-from vinetrack.diagnosis.candidate_fits import SubsetFitter, full_fit, with_curves, without_curves
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, select_effects, slack_fit
@@ -44,13 +43,13 @@ def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_foun
     """A friction at rest beside the yield pressure that was found without it would hold the vine back altogether."""
     base = vt.fit(vt.base_model(), grown({"pressure_damping.beta": 1.5e-5}, seed=33), profile=False)
     start = {"pressure_damping.beta": 1e-5}
-    climb = SubsetFitter(base).fit_hypothesis((vt.effects.pressure_damping,), start, iterations=9)
+    climb = candidate_fits.SubsetFitter(base).fit_hypothesis((vt.effects.pressure_damping,), start, iterations=9)
     yields_Pa = {number.name: number.value for number in base.numbers if number.key == YIELD_PRESSURE}
     assert climb.yields_Pa.keys() == yields_Pa.keys()
     assert any(abs(climb.yields_Pa[name] - value) > 1.0 for name, value in yields_Pa.items())
     watched = Mock(wraps=solve_onward)
     monkeypatch.setattr("vinetrack.inference.fit.solve_onward", watched)
-    assert full_fit(base, climb) is not None
+    assert candidate_fits.full_fit(base, climb) is not None
     layout, theta = watched.call_args_list[0].args[0].layout, watched.call_args_list[0].args[2]
     begun = dict(zip((number.name for number in layout.free), layout.values(theta), strict=True))
     assert climb.yields_Pa == pytest.approx({name: begun[name] for name in climb.yields_Pa})
@@ -98,12 +97,12 @@ def test_a_static_yield_far_above_the_yield_pressure_is_found():
 def test_a_fit_is_the_same_once_its_curves_are_made_again():
     """Of trials whose tail rubs. Of many trials a search lets go of curves."""
     model, pairs = vt.base_model(), grown({"tail_friction.mu_w": 1.0}, seed=7270)
-    fit = initial_fit(model, pairs, candidates_of(model, ["tail_friction"]), profile=False)
-    light = without_curves(fit)
+    fit = ladder.initial_fit(model, pairs, ladder.candidates_of(model, ["tail_friction"]), profile=False)
+    light = candidate_fits.without_curves(fit)
     assert not light.trials
     assert relative_residual(light.predictor, light.solution) == relative_residual(fit.predictor, fit.solution)
     steps = fit.predictor.steps.copy()
-    again = with_curves(light)
+    again = candidate_fits.with_curves(light)
     assert np.array_equal(fit.predictor.steps, steps)
     assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)
     for trial, before_trial in zip(again.trials, fit.trials, strict=True):
@@ -146,7 +145,7 @@ def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_bette
     trials = [replace(one, growth_angle_rad=np.pi / 2) for one in sheet()]
     virtual = campaigns.grown(trials, 6, ["tail_friction"], {"tail_friction.mu_w": 0.04}, noise_m=5e-5)
     found = vt.fit(vt.base_model(), pairs_of(virtual), profile=False)
-    effects, _ = hypotheses.testable(candidates_of(found.model, ["tail_friction"], None), found.predictor.data)
+    effects, _ = hypotheses.testable(ladder.candidates_of(found.model, ["tail_friction"], None), found.predictor.data)
     questions = misfit_tests(found, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
     assert questions.rejects_model
     assert not questions.far_off

@@ -14,11 +14,9 @@ from scipy.stats import chi2, norm
 
 import vinetrack as vt
 from vinetrack.core.problems import Remark
-from vinetrack.diagnosis import selection
+from vinetrack.diagnosis import result, score_test, selection
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
-from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.diagnosis.score_test import FamilyTest
 from vinetrack.diagnosis.selection import EffectSets
 from vinetrack.effects import find_effect
 
@@ -32,7 +30,7 @@ def of(names: Iterable[str], log_likelihood: float, inflation: float = 1.0, numb
 
 
 def sets_of(known: list[LikelihoodRatio], thresholds: Mapping[str, float] | None = None) -> EffectSets:
-    family = FamilyTest(3e-3, 1e-4, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
+    family = score_test.FamilyTest(3e-3, 1e-4, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
     tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
     search: Any = SimpleNamespace(tests=tests, tests_after=lambda _fit: after)
     return EffectSets(search, known, lambda _line: None)
@@ -150,7 +148,7 @@ TRUTH = {"reservoir_depletion.gamma": 1.3, "tail_friction.mu_w": 1.0}
 LATCH = {"latch_release.F": 1.0, "latch_release.reach": 0.01}
 
 
-def asked(*names: str, **how: bool) -> Diagnosis:
+def asked(*names: str, **how: bool) -> result.Diagnosis:
     """Of a campaign with each condition once."""
     return vt.diagnose(grown(TRUTH | LATCH, seed=7200, trials=sheet()[::2]), candidates=names, **how)
 
@@ -165,8 +163,8 @@ def one_not_asked():
     return asked(*(name for name in CANDIDATES if name != "latch_release"))
 
 
-def stored(said: Diagnosis) -> Diagnosis:
-    return Diagnosis.from_json(json.loads(json.dumps(said.to_json(), default=str)))
+def stored(said: result.Diagnosis) -> result.Diagnosis:
+    return result.Diagnosis.from_json(json.loads(json.dumps(said.to_json(), default=str)))
 
 
 @pytest.mark.slow

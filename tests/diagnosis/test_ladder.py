@@ -11,18 +11,14 @@ import pytest
 from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis import diagnose
+from vinetrack.diagnosis import diagnose, replicates, result, selection
 from vinetrack.diagnosis import ladder as ladder_module
 from vinetrack.diagnosis.drift import drift
 from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
 from vinetrack.diagnosis.locate import locate
-from vinetrack.diagnosis.replicates import align_trials, per_trial_estimates
-from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.diagnosis.selection import contradictions
 from vinetrack.experiment.schema import with_names
+from vinetrack.inference import fit_data, fit_result
 from vinetrack.inference.fit import predict_prepared, prepared_pairs
-from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 
 DEPLETION = "reservoir_depletion"
@@ -103,7 +99,7 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
     note = table.attrs["notes"][0]
     assert (note.code, note.facts["left_out"], note.facts["count"]) == ("left_out_error_without", "conditions", 3)
     # The reader sees an error in sample of all trials beside one without them: a diagnosis says so.
-    told = diagnose._with_ladder(Diagnosis(rounds=(), effects=(), explanation="", fits=(found,)), lambda _: None)
+    told = diagnose._with_ladder(result.Diagnosis(rounds=(), effects=(), explanation="", fits=(found,)), lambda _: None)
     assert told.notes == tuple(table.attrs["notes"])
 
 
@@ -111,7 +107,7 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
 def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(fits, monkeypatch):
     stuck = fits[0].trials[4].name
 
-    def predicted(fit: Fit, data: Sequence[FitTrial], **told: bool) -> list[TrialFit]:
+    def predicted(fit: fit_result.Fit, data: Sequence[fit_data.FitTrial], **told: bool) -> list[fit_result.TrialFit]:
         if any(trial_data.trial.name == stuck for trial_data in data):
             raise vt.FitError("The model cannot be followed: it ends at 1.4 s")
         return predict_prepared(fit, data, **told)
@@ -135,7 +131,7 @@ def test_of_a_single_condition_nothing_can_be_left_out(pairs):
 B = "eversion_damping.B"
 
 
-def fitted(pairs: Pairs) -> Fit:
+def fitted(pairs: Pairs) -> fit_result.Fit:
     return vt.fit(vt.base_model(), pairs, profile=False)
 
 
@@ -168,7 +164,7 @@ def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(emptying):
 def test_every_trial_finds_the_b_it_was_grown_with():
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
-    values = per_trial_estimates(found, B, align_trials(found))
+    values = replicates.per_trial_estimates(found, B, replicates.align_trials(found))
     true = np.array([one.model.values[B] for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
     away = np.log(values.value / true)
@@ -183,7 +179,7 @@ def test_every_trial_finds_the_b_it_was_grown_with():
 def test_vines_of_different_exponents_are_told():
     one, other = ([trial for trial in sheet() if (trial.diameter_m > 0.02) == wide] for wide in (False, True))
     fit = fitted(pairs_of([*grown(one, 58, values={"eversion_damping.n": 0.3}), *grown(other, 58)]))
-    assert {told.code for told in contradictions((fit,), (), None)} == {"still_drifts"}
+    assert {told.code for told in selection.contradictions((fit,), (), None)} == {"still_drifts"}
     found = drift(fit)
     row = found.table[found.table["parameter"] == "eversion_damping.n"].iloc[0]
     assert row["significant"]

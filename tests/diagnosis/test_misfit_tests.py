@@ -21,9 +21,9 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
+from vinetrack.diagnosis import ladder, score_test, selection
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis import score_test as hypotheses
-from vinetrack.diagnosis.ladder import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import (
     CAREFUL_DAMPING_SCATTER,
     STRETCH_FRAMES,
@@ -33,13 +33,10 @@ from vinetrack.diagnosis.misfit_tests import (
     misfit_tests,
     noise_in_motion_p,
 )
-from vinetrack.diagnosis.score_test import fit_columns, levers_of
-from vinetrack.diagnosis.selection import confounders_of, size_not_excluded
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.robust_covariance import Systematics
+from vinetrack.inference import fit_result, robust_covariance
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
@@ -54,8 +51,8 @@ def careful(payload_g: float, seed: int) -> Pairs:
 
 
 def questioned(pairs: Pairs, model: vt.Model, level: float = FIRST) -> MisfitTests:
-    candidates = candidates_of(model, None, None)
-    found = vt.fit(model, pairs, host=host_for(model, candidates), profile=False)
+    candidates = ladder.candidates_of(model, None, None)
+    found = vt.fit(model, pairs, host=ladder.host_for(model, candidates), profile=False)
     return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], level)
 
 
@@ -76,8 +73,8 @@ def seen_crookedly() -> Pairs:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(make, monkeypatch):
-    def none(*about: Any, film: bool) -> Systematics:  # noqa: ARG001
-        return Systematics.none([trial.time_s.size for trial in about[-1]])
+    def none(*about: Any, film: bool) -> robust_covariance.Systematics:  # noqa: ARG001
+        return robust_covariance.Systematics.none([trial.time_s.size for trial in about[-1]])
 
     asked = questioned(make(), vt.base_model())
     assert not asked.rejects_model
@@ -118,7 +115,7 @@ def after():
 def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after):
     place = after.ranked_shapes("air_drag")[0]
     k = next(k for k, number in enumerate(after.fit.numbers) if number.key == INLET)
-    lever = float(levers_of(after.fit, after.products)[k, place])
+    lever = float(score_test.levers_of(after.fit, after.products)[k, place])
     drag = 0.2
     model = (after.fit.model + vt.effects.air_drag).with_values({DRAG: drag})
     with_drag = vt.fit(model, after.fit.pairs, fixed=[DRAG], profile=False)
@@ -128,14 +125,14 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after):
 
 
 def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth(after):
-    by_effect = {one.effect: one for one in confounders_of(after, ["inlet_loss"])}
+    by_effect = {one.effect: one for one in selection.confounders_of(after, ["inlet_loss"])}
     # Linear damping takes the same sign of the force, fold inertia the other: found in refits with either held.
     linear, fold = by_effect["linear_damping"], by_effect["fold_inertia"]
     assert linear.value < linear.number.value < fold.value
     number = after.fit[INLET]
     for one in by_effect.values():
         assert one.low_95 <= number.low < TRUE_INLET < number.high <= one.high_95
-    assert confounders_of(after, ["air_drag"]) == ()
+    assert selection.confounders_of(after, ["air_drag"]) == ()
 
 
 @pytest.mark.parametrize(("estimate", "sigma"), [(0.3, 0.2), (-0.5, 0.4), (2.0, 5.0)])
@@ -148,7 +145,7 @@ def test_what_trajectories_and_plausibility_say_of_a_size_is_the_posterior_by_qu
     whole = quad(density, 0, 20)[0]
     mean = quad(lambda size: size * density(size), 0, 20)[0] / whole
     variance = quad(lambda size: (size - mean) ** 2 * density(size), 0, 20)[0] / whole
-    got_mean, got_sd, limit = size_not_excluded(estimate, sigma, parameter)
+    got_mean, got_sd, limit = selection.size_not_excluded(estimate, sigma, parameter)
     assert (got_mean, got_sd) == pytest.approx((mean, math.sqrt(variance)), rel=1e-6)
     assert quad(density, 0, limit)[0] / whole == pytest.approx(0.95, abs=1e-6)
 
@@ -157,7 +154,7 @@ def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour():
     parameter = Parameter("e", "ε", "1", 0.0, plausible=(-0.1, 0.1))
     precision = 1 / 0.02**2 + (1.959964 / 0.1) ** 2
     for estimate in (0.03, -0.03):
-        mean, sd, limit = size_not_excluded(estimate, 0.02, parameter)
+        mean, sd, limit = selection.size_not_excluded(estimate, 0.02, parameter)
         assert (mean, sd) == pytest.approx((estimate / 0.02**2 / precision, precision**-0.5), rel=1e-6)
         assert limit == pytest.approx(mean + np.sign(estimate) * 1.644854 * sd, rel=1e-6)
 
@@ -165,10 +162,10 @@ def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour():
 def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_columns(monkeypatch):
     """Usually they are past the end of growth."""
     fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False, thorough=False)
-    before = fit_columns(fit)
+    before = score_test.fit_columns(fit)
     cannot = Mock(side_effect=SimulationError("Trial t: the model could not be integrated beyond 3.7 s."))
     monkeypatch.setattr(fit.predictor, "linearise", cannot)
-    for known, fresh in zip(fit_columns(replace(fit)), before, strict=True):
+    for known, fresh in zip(score_test.fit_columns(replace(fit)), before, strict=True):
         assert np.allclose(known[:, -1], fresh[:, -1], atol=1e-12)
         # Where growth ends a step changes more than a derivative says.
         usual = np.median(np.abs(known - fresh), axis=0)
@@ -178,7 +175,7 @@ def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_colu
 WANDER_M, B = 2e-4, "eversion_damping.B"
 
 
-def fitted(pairs: Pairs) -> Fit:
+def fitted(pairs: Pairs) -> fit_result.Fit:
     return vt.fit(vt.base_model(), pairs, profile=False)
 
 

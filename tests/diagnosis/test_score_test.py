@@ -26,8 +26,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
 from vinetrack.diagnosis.misfit_tests import MisfitTests, structure_from_scores
 from vinetrack.diagnosis.score_test import Scores
 from vinetrack.effects import Parameter, catalogue
-from vinetrack.inference.fit_result import Number
-from vinetrack.inference.marginal_likelihood import FitState
+from vinetrack.inference import fit_result, marginal_likelihood
 
 FIRST, LATER = misfit_tests.FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests.FALSE_ALARM_LEVEL_LATER_ROUNDS
 QUIET = misfit_tests.Structure(0.0, 0, 1.0, 0.0)
@@ -196,11 +195,11 @@ def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
     assert (together.trial_scores @ turn).sum(axis=0) == pytest.approx(score)
 
 
-def number_of(key: str, value: float, sigma: float) -> Number:
-    return Number(key, "", "s", "1", value, sigma, value - 2 * sigma, value + 2 * sigma, math.inf, "linear")
+def number_of(key: str, value: float, sigma: float) -> fit_result.Number:
+    return fit_result.Number(key, "", "s", "1", value, sigma, value - 2 * sigma, value + 2 * sigma, math.inf, "linear")
 
 
-def known_fit(log_likelihood: float, *numbers: Number) -> Any:
+def known_fit(log_likelihood: float, *numbers: fit_result.Number) -> Any:
     """What a likelihood ratio asks of a fit of few trials, whose film is free already."""
     known = {"covariance": np.diag([number.sigma**2 for number in numbers]), "trials": (), "model": ("film_mass",)}
     return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, **known)
@@ -291,7 +290,7 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
     arrays = {"index": [[0, 1]], "places": [[0, 1]], "places_of_pairs": [0, 1, 3, 4], "points": [float(n)]}
     arrays |= {"prior_mean": np.zeros(2), "prior_precision": np.zeros(2), "free": [True, True]}
     problem = SimpleNamespace(**{name: np.array(values) for name, values in arrays.items()})
-    state = FitState(np.zeros(2), np.zeros((1, 4)), (1e-5, 1e-5), 0.0, np.ones(1))
+    state = marginal_likelihood.FitState(np.zeros(2), np.zeros((1, 4)), (1e-5, 1e-5), 0.0, np.ones(1))
     numbers = [SimpleNamespace(bound=math.nan), SimpleNamespace(bound=bound)]
     fit: Any = SimpleNamespace(solution=SimpleNamespace(state=state, problem=problem), numbers=numbers)
     sizes = {"n_keys": 2, "n_shapes": 1, "n_tested": 1}

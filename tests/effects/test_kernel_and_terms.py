@@ -18,11 +18,9 @@ from own_effect import NAME, write_effect
 
 import vinetrack as vt
 from vinetrack.core.records import Bend, Trial
-from vinetrack.dynamics.audit import evaluate
-from vinetrack.dynamics.equations import TrialArrays
+from vinetrack.dynamics import audit, equations, simulate
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import effects_on
-from vinetrack.dynamics.simulate import trial_inputs
 from vinetrack.effects import Effect, catalogue
 
 PACKAGE = Path(vt.__file__).parent
@@ -43,9 +41,9 @@ def accelerations(
     """Of the tail, by the compiled rates, at these pressures of the chamber (none: as at release)."""
     chamber_at_release, acceleration = callable_parts(model.effects)
     theta = model.parameters_for(trial.vine)
-    on, rig = effects_on(model, theta[None])[0], np.array(trial_inputs(trial))
+    on, rig = effects_on(model, theta[None])[0], np.array(simulate.trial_inputs(trial))
     bends = np.array([(b.start_m, b.arc_m, b.radius_m) for b in trial.bends]).reshape(-1, 3)
-    arrays = TrialArrays(on, rig, theta, np.empty(0), np.empty(0), bends)
+    arrays = equations.TrialArrays(on, rig, theta, np.empty(0), np.empty(0), bends)
     pressures = np.full(time.size, chamber_at_release(arrays)) if chamber is None else chamber
     return [acceleration(t, 2 * a, 2 * b, p, arrays) for t, a, b, p in zip(time, y, v, pressures, strict=True)]
 
@@ -61,7 +59,7 @@ def test_each_effect_and_all_together(name, vine):
     sizes = {f"{one}.{p.name}": p.default for one in names for p in catalogue()[one].parameters}
     model, trial = whole_catalogue(sizes | less), vine.trial(bends=BENDS)
     time, y, v = (np.linspace(*ends, 25) for ends in ((0.01, 0.1), (0.01, 0.95 * vine.L), (0.2, 12.0)))
-    terms = evaluate(model, trial, time, y, v)
+    terms = audit.evaluate(model, trial, time, y, v)
     chamber = terms.pressure_Pa if name == "supply_refill" else None
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
 
@@ -99,7 +97,7 @@ def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau):
     model = whole_catalogue({"supply_refill.tau": tau, "supply_refill.gamma": 1.4, "eversion_damping.B": LOADED.B})
     times = np.linspace(0, 0.15, 1501)
     got = vt.simulate(model, LOADED.trial(), times)
-    terms = evaluate(model, LOADED.trial(), times, got.lead_position_m, got.lead_velocity_m_s)
+    terms = audit.evaluate(model, LOADED.trial(), times, got.lead_position_m, got.lead_velocity_m_s)
     # Ṗ by hand, at points of the motion: what the table of pressures says changes as its equation asks.
     P, y, ydot, A = terms.pressure_Pa, got.lead_position_m, got.lead_velocity_m_s, LOADED.A
     rate = -1.4 * (P + 101_325) * A * ydot / (3.7e-3 + A * y) + (LOADED.P - P) / tau
@@ -111,7 +109,7 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice():
     # At the end a bare vine's moving mass is its fold, λπt, and a quarter of the gas ρ_gas A L; nothing on top of it.
     vine, model = BARE, whole_catalogue({"gas_inertia.factor": 1.0})
     at_end = model, vine.trial(), np.zeros(1), np.array([vine.L]), np.zeros(1)
-    terms, compiled = evaluate(*at_end), accelerations(*at_end)
+    terms, compiled = audit.evaluate(*at_end), accelerations(*at_end)
     gas, fold = (vine.P + 101_325) / (287 * 293) * vine.A * vine.L / 4, vine.lam * math.pi * vine.t
     assert terms.inertia_kg[0] == pytest.approx(fold + gas, rel=1e-9)
     np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)

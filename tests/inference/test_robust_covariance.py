@@ -16,10 +16,8 @@ import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.drift import against_the_sheet
-from vinetrack.inference import optimiser
-from vinetrack.inference.fit_result import Fit, Number, TrialFit
+from vinetrack.inference import fit_result, optimiser, position_errors
 from vinetrack.inference.optimiser import solve
-from vinetrack.inference.position_errors import precision
 from vinetrack.inference.robust_covariance import (
     PRESSURE_ERROR_PA,
     Systematics,
@@ -65,7 +63,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds)
     by_noise, stated = [], []
     for seed in seeds:
         found = vt.fit(vt.base_model(), make(seed), profile=False)
-        narrow = np.sqrt(np.diag(precision(found.solution).covariance))
+        narrow = np.sqrt(np.diag(position_errors.precision(found.solution).covariance))
         for k, number in enumerate(found.numbers):
             if number.key == "yield_pressure.P_y":
                 continue
@@ -88,7 +86,7 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch):
     found = vt.fit(vt.base_model(), unlike(20620), profile=False)
     plain, robust = (np.diag(matrix) for matrix in robust_covariance(found.predictor, found.solution))
     assert np.max(robust / plain) > 1.5
-    known = precision(found.solution)
+    known = position_errors.precision(found.solution)
     nothing = Systematics.none([trial.time_s.size for trial in found.predictor.data])
     monkeypatch.setattr("vinetrack.inference.robust_covariance.systematics_of", lambda *_, **__: nothing)
     stated = np.diag(widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
@@ -193,14 +191,14 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     model = vt.base_model().with_values({"eversion_damping.n": 0.4})
     found = vt.fit(model, pairs, fixed=["n", "P_y"], profile=False)
     B = found["B"]
-    assert precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
+    assert position_errors.precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
     standard_error = float(np.std(np.log(factors), ddof=1)) / math.sqrt(trials)
     assert B.sigma / B.value == pytest.approx(standard_error, rel=0.1)
     half_width = math.log(B.high / B.low) / 2
     assert half_width / (B.sigma / B.value) == pytest.approx(student.ppf(0.975, B.dof), rel=1e-3)
 
 
-def last_of(drops: Pairs) -> TrialFit:
+def last_of(drops: Pairs) -> fit_result.TrialFit:
     """The last drop predicted from all others."""
     return vt.predict(vt.fit(FALL, drops[:-1], profile=False), drops[-1:])[0]
 
@@ -216,7 +214,7 @@ def test_the_band_of_drops_that_agree_is_their_noise():
     assert np.median(last.band_m) == pytest.approx(1.96 * 2e-3, rel=0.2)
 
 
-def fitted(seed: int = 1, replicates: int = 3, **changes: float) -> Fit:
+def fitted(seed: int = 1, replicates: int = 3, **changes: float) -> fit_result.Fit:
     pairs, _ = small_campaign(seed, damping=5e-3, pressure=2e-3, replicates=replicates)
     return vt.fit(vt.base_model(), [(replace(trial, **changes), track) for trial, track in pairs], profile=False)
 
@@ -234,7 +232,7 @@ def test_what_trials_share_stays_where_their_number_grows():
     for one, other in zip(few.numbers, many.numbers, strict=True):
         assert other.shared["set pressures"] >= one.shared["set pressures"]
         assert other.sigma < one.sigma
-        assert Number.from_json(one.to_json()).shared == one.shared
+        assert fit_result.Number.from_json(one.to_json()).shared == one.shared
 
 
 def test_a_yield_pressure_is_pulled_by_what_the_fit_adds_to_the_sheet():

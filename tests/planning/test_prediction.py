@@ -13,8 +13,7 @@ from lsoda_vine import grown_position, small_campaign
 import vinetrack as vt
 from vinetrack.core import published
 from vinetrack.core.records import Trial
-from vinetrack.experiment.schema import with_names
-from vinetrack.experiment.settings import Limits
+from vinetrack.experiment import schema, settings
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.planning import prediction
@@ -375,7 +374,7 @@ def made(pressure_kPa: float, **more: object) -> Trial:
 
 
 def looked_at(trials: list[Trial], **limits: Any) -> list[Condition]:
-    return feasible_conditions(with_names(trials), Limits(**limits))
+    return feasible_conditions(schema.with_names(trials), settings.Limits(**limits))
 
 
 def test_pressures_go_from_the_lowest_used_to_a_quarter_above_the_highest():
