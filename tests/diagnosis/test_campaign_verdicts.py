@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +29,6 @@ from vinetrack.diagnosis.score_test import (
     slip_of,
 )
 from vinetrack.effects import catalogue
-from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import values_for_trial
 from vinetrack.inference.fit_data import pairs_of
@@ -42,11 +39,11 @@ from vinetrack.laboratory.tracks import Vine
 from vinetrack.laboratory.tracks import campaign as laboratory_campaign
 
 
-def diagnosed(pairs: Any, candidates: Sequence[str] | None = None) -> result.Diagnosis:
+def diagnosed(pairs, candidates=None) -> result.Diagnosis:
     return vt.diagnose(pairs, candidates=candidates, ladder=False, advice=False)
 
 
-def laboratory(folder: Path, row: str, seed: int, size: tuple[int, int], **more: bool) -> tuple[Any, Experiment]:
+def laboratory(folder: Path, row: str, seed: int, size: tuple[int, int], **more: bool):
     """The truth about a campaign of a laboratory, and its folder as it is read."""
     known = campaign(row, seed, size, **more)
     write_experiment(known, folder / "e")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from hidden_truth import grown, sheet
@@ -24,15 +22,15 @@ NAMES = ("air_drag", "leak", "tail_friction")
 TRIPLE = -1000.0
 
 
-def of(names: Iterable[str], log_likelihood: float, inflation: float = 1.0, numbers: Any = ()) -> LikelihoodRatio:
-    fit: Any = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers)
+def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> LikelihoodRatio:
+    fit = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers)
     return LikelihoodRatio(tuple(map(find_effect, names)), fit, 0.0, 0.0, True, Remark(), inflation=inflation)
 
 
-def sets_of(known: list[LikelihoodRatio], thresholds: Mapping[str, float] | None = None) -> EffectSets:
+def sets_of(known: list[LikelihoodRatio], thresholds=None) -> EffectSets:
     family = score_test.FamilyTest(3e-3, 1e-4, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
     tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
-    search: Any = SimpleNamespace(tests=tests, tests_after=lambda _fit: after)
+    search = SimpleNamespace(tests=tests, tests_after=lambda _fit: after)
     return EffectSets(search, known, lambda _line: None)
 
 
@@ -111,14 +109,14 @@ def test_significance_is_that_of_the_tail_however_far_out(delta_chi2, degrees):
         assert math.log(2) + norm.logsf(sigmas) == pytest.approx(-delta_chi2 / 2, rel=1e-9)
 
 
-def refits_end_at(monkeypatch: pytest.MonkeyPatch, found: Mapping[frozenset[str], float]) -> None:
+def refits_end_at(monkeypatch: pytest.MonkeyPatch, found) -> None:
     """Refits have these likelihoods, that of the triple less 450 where none is given."""
 
-    def refitted(_sets: EffectSets, _fit: Any, effects: tuple[Any, ...]) -> Any:
+    def refitted(_sets: EffectSets, _fit, effects):
         names = frozenset(effect.name for effect in effects)
         return SimpleNamespace(log_likelihood=found.get(names, TRIPLE - 450.0), model=(), numbers=())
 
-    def ratio(_before: Any, effects: tuple[Any, ...], fit: Any) -> LikelihoodRatio:
+    def ratio(_before, effects, fit) -> LikelihoodRatio:
         return of(tuple(effect.name for effect in effects), fit.log_likelihood)
 
     monkeypatch.setattr(EffectSets, "_refitted", refitted)
@@ -189,7 +187,7 @@ def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like
     singles = [SimpleNamespace(names=(e.name,), delta_chi2=gain) for e, gain in ((latch, 900.0), (lens, gained))]
     pair = SimpleNamespace(names=("latch_release", "lens"), effects=(latch, lens), delta_chi2=1000.0, fit=None)
     known = {"fitted": dict(enumerate(singles)), "search": SimpleNamespace(tests_after=lambda _: None)}
-    sets: Any = SimpleNamespace(subset=lambda *_: None, **known)
+    sets = SimpleNamespace(subset=lambda *_: None, **known)
     monkeypatch.setattr(selection, "_shared_step", lambda verdict, *parts: (verdict, parts[4]))
     monkeypatch.setattr(selection, "_remainder", lambda *_: SimpleNamespace(names=("lens",), effects=(lens,)))
     monkeypatch.setattr(selection, "SelectionStep", lambda *_, **__: None)

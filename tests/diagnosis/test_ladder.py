@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from vinetrack.diagnosis.drift import drift
 from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
 from vinetrack.diagnosis.locate import locate
 from vinetrack.experiment.schema import with_names
-from vinetrack.inference import fit_data, fit_result
 from vinetrack.inference.fit import predict_prepared, prepared_pairs
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 
@@ -107,7 +105,7 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs):
 def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(fits, monkeypatch):
     stuck = fits[0].trials[4].name
 
-    def predicted(fit: fit_result.Fit, data: Sequence[fit_data.FitTrial], **told: bool) -> list[fit_result.TrialFit]:
+    def predicted(fit, data, **told: bool):
         if any(trial_data.trial.name == stuck for trial_data in data):
             raise vt.FitError("The model cannot be followed: it ends at 1.4 s")
         return predict_prepared(fit, data, **told)
@@ -131,7 +129,7 @@ def test_of_a_single_condition_nothing_can_be_left_out(pairs):
 B = "eversion_damping.B"
 
 
-def fitted(pairs: Pairs) -> fit_result.Fit:
+def fitted(pairs: Pairs):
     return vt.fit(vt.base_model(), pairs, profile=False)
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import grown as campaigns
@@ -20,14 +18,12 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import vinetrack as vt
-from vinetrack.core.records import Trial
 from vinetrack.diagnosis import ladder, score_test, selection
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis import score_test as hypotheses
 from vinetrack.diagnosis.misfit_tests import (
     CAREFUL_DAMPING_SCATTER,
     STRETCH_FRAMES,
-    MisfitTests,
     between_conditions_p,
     has_excess_scatter,
     misfit_tests,
@@ -36,7 +32,7 @@ from vinetrack.diagnosis.misfit_tests import (
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
-from vinetrack.inference import fit_result, robust_covariance
+from vinetrack.inference import robust_covariance
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
@@ -50,7 +46,7 @@ def careful(payload_g: float, seed: int) -> Pairs:
     return pairs_of(campaigns.grown(trials, seed, **care))
 
 
-def questioned(pairs: Pairs, model: vt.Model, level: float = FIRST) -> MisfitTests:
+def questioned(pairs: Pairs, model: vt.Model, level: float = FIRST):
     candidates = ladder.candidates_of(model, None, None)
     found = vt.fit(model, pairs, host=ladder.host_for(model, candidates), profile=False)
     return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], level)
@@ -73,7 +69,7 @@ def seen_crookedly() -> Pairs:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(make, monkeypatch):
-    def none(*about: Any, film: bool) -> robust_covariance.Systematics:  # noqa: ARG001
+    def none(*about, film: bool) -> robust_covariance.Systematics:  # noqa: ARG001
         return robust_covariance.Systematics.none([trial.time_s.size for trial in about[-1]])
 
     asked = questioned(make(), vt.base_model())
@@ -175,11 +171,11 @@ def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_colu
 WANDER_M, B = 2e-4, "eversion_damping.B"
 
 
-def fitted(pairs: Pairs) -> fit_result.Fit:
+def fitted(pairs: Pairs):
     return vt.fit(vt.base_model(), pairs, profile=False)
 
 
-def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials: Sequence[Trial] = ()) -> Pairs:
+def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials=()) -> Pairs:
     """Trials whose B is another at some of the pressures, kPa, alike in replicates but for some scatter."""
     pairs: Pairs = []
     for k, trial in enumerate(trials or sheet()):
@@ -262,6 +258,6 @@ def test_heavy_tails_alone_are_not_louder_in_motion(heavy, most):
         data = SimpleNamespace(
             slow_m=None, gauge_error=0.0, n_rest=8 * STRETCH_FRAMES, noise_m=1e-4, lead_position_m=np.array([0.0, 0.3])
         )
-        fit: Any = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
+        fit = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
         alarms += noise_in_motion_p(fit) < 0.01
     assert alarms / 600 < most

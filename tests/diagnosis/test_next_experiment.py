@@ -6,7 +6,6 @@ Seeds 4001 to 4003 are for scoring; those below 1000 were used while the method 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -17,7 +16,6 @@ from vinetrack.core.records import Trial
 from vinetrack.diagnosis.further_trials import NextExperiment, next_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
@@ -29,7 +27,7 @@ HOST = vt.make_model([*BASE, *FITTED])  # one compiled model serves all that are
 B_KNOWN, N = 6.44, 0.37
 
 
-def grown(trials: Sequence[Trial], seed: int, off: float = 1.0) -> Pairs:
+def grown(trials, seed: int, off: float = 1.0) -> Pairs:
     """Trials with a strong drag; B of vines other than 24 mm × 200 µm is the scaling prior times `off`."""
     damping = {trial.vine: off * damping_prior(trial.diameter_m, trial.thickness_m) for trial in trials}
     known = {t.vine: B_KNOWN for t in trials if (round(t.diameter_m * 1e3), round(t.thickness_m * 1e6)) == (24, 200)}
@@ -38,7 +36,7 @@ def grown(trials: Sequence[Trial], seed: int, off: float = 1.0) -> Pairs:
     return pairs_of(grow(trials, nature))
 
 
-def fits_of(pairs: Pairs, *effects: str) -> list[Fit]:
+def fits_of(pairs: Pairs, *effects: str):
     base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST)
     return [vt.refit(base, base.model + getattr(vt.effects, name)) for name in effects]
 
@@ -57,7 +55,7 @@ def as_trials(found: NextExperiment, like: Trial) -> list[Trial]:
     return made
 
 
-def shown(fits: Sequence[Fit], pairs: Pairs) -> float:
+def shown(fits, pairs: Pairs) -> float:
     """By how many σ all trials favour the first hypothesis over the second, in excess of those so far."""
     base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST)
     likelihood = []

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from vinetrack.core.records import Trial
 from vinetrack.diagnosis import campaign_power, linear_power
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.further_trials import _alone_and_distinct, exploratory_trials, further_trials
-from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.experiment.settings import Limits
 from vinetrack.planning.simulated_campaigns import FilmingPlan, make
@@ -25,7 +22,7 @@ CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain",
 
 
 def planned(
-    replicates: int, spreads: Any = (0.01, 0.03), kPa: Any = (14, 24, 34), candidates: Any = CANDIDATES, **cells: str
+    replicates: int, spreads=(0.01, 0.03), kPa=(14, 24, 34), candidates=CANDIDATES, **cells: str
 ) -> CampaignDesign:
     trials: list[Trial] = []
     known = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "yield_pressure_kPa": "3", **cells}
@@ -35,7 +32,7 @@ def planned(
     return with_trials(CampaignDesign(vt.predictive_inputs(trials[0]).model, (), (), spreads, candidates), trials)
 
 
-def with_trials(design: CampaignDesign, added: Sequence[Trial]) -> CampaignDesign:
+def with_trials(design: CampaignDesign, added) -> CampaignDesign:
     trials = (*design.trials, *added)
     return replace(design, trials=trials, cameras=(FilmingPlan(500.0, 1e-4),) * len(trials))
 
@@ -54,7 +51,7 @@ def power(six):
     return linear_power.power_of(six)
 
 
-def place_of(questions: MisfitTests, name: str) -> int:
+def place_of(questions, name: str) -> int:
     return questions.sensitivities.effects.index(name)
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
-import pandas as pd
 import pytest
 from by_hand import BARE, LOADED, N
 from own_effect import NAME, write_effect
@@ -83,7 +81,7 @@ def test_base_models_and_those_with_an_own_effect_are_compiled_by_themselves(tmp
 def test_a_tail_that_may_go_slack_is_not_compiled_with_the_whole_catalogue(monkeypatch):
     asked: list[tuple[int, bool]] = []
 
-    def noted(effects: tuple[Effect, ...], tail_free: bool) -> ModuleType:
+    def noted(effects: tuple[Effect, ...], tail_free: bool):
         asked.append((len(effects), tail_free))
         return kernel(vt.base_model().effects)
 
@@ -121,7 +119,7 @@ def steady(of: Trial, speed_m_s: float = 2.0, share: float = 0.95, pressure: np.
     return AuditedMotion(of, y / speed_m_s, y, np.full(101, speed_m_s), pressure)
 
 
-def row(found: Audit, term: str) -> pd.Series:
+def row(found: Audit, term: str):
     (at,) = found.table.index[found.table["term"] == term]
     return found.table.loc[at]
 

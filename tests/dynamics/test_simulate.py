@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -115,7 +114,7 @@ FALL_AND_RISE = (np.array([0.0, 0.05, 0.06, 0.10, 0.11, 1.0]), np.array([28e3, 2
 
 
 def by_hand(
-    times: np.ndarray, pressure: Callable[[float, float], float], first_Pa: float, tau: float, down: float, mu: float
+    times: np.ndarray, pressure, first_Pa: float, tau: float, down: float, mu: float
 ) -> tuple[np.ndarray, list[float]]:
     """Lead positions, and when the tail went slack and taut in turn.
 
@@ -160,7 +159,7 @@ def test_the_tip_follows_its_own_law_while_the_payload_falls(case):
     # Effects at no size: one compiled model for all cases.
     sizes = {"payload_friction.mu_p": 0.0, "supply_refill.tau": 0.0, "supply_refill.gamma": 0.0}
     P, trace, tau, down, mu, last_s, expected = 20e3, None, 0.5, 1.0, 0.0, 0.15, 1
-    pressure: Callable[[float, float], float] = lambda _t, P: P  # noqa: E731
+    pressure = lambda _t, P: P  # noqa: E731
     if case == "rubs":  # the tail coasts, and its slack is taken up again
         P, trace, down, mu, last_s, expected = 28e3, FALL_AND_RISE, 0.0, MU, 0.2, 2
         sizes["payload_friction.mu_p"], pressure = MU, lambda t, _P: float(np.interp(t, *FALL_AND_RISE))

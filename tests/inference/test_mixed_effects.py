@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
 
 
 def given(
-    n_trials: int, count: int, keys: int, spread: float = 1e-5, *, rho: float = RHO, sigma: float = SIGMA, **more: Any
+    n_trials: int, count: int, keys: int, spread: float = 1e-5, *, rho: float = RHO, sigma: float = SIGMA, **more
 ) -> tuple[marginal.MixedProblem, marginal.FitState]:
     """A problem whose releases and origins are free, only B deviates and nothing has bounds or priors; its state."""
     own = {"has_deviation": np.tile([False, True], (n_trials, 1)), "gauge_error": np.zeros(n_trials)}

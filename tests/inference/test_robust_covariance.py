@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -41,7 +40,7 @@ def misread(seed: int) -> Pairs:
     return [(replace(trial, pressure_Pa=trial.pressure_Pa + wrong[trial.condition]), track) for trial, track in pairs]
 
 
-def bent(pairs: Pairs, bends_m: Iterable[float]) -> Pairs:
+def bent(pairs: Pairs, bends_m) -> Pairs:
     """Pictures that are bent, each trial's by so much."""
     made = []
     for (trial, track), bend_m in zip(pairs, bends_m, strict=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -122,7 +121,7 @@ def fitted(n_trials: int = 2, B_is_estimated: bool = True) -> guess.FitNumbers:
     )
     covariance = np.array([[0.0036, -0.00048, 0.0], [-0.00048, 1e-4, 0.0], [0.0, 0.0, 1e4]])
     spreads = {"pressure": BetweenTrialSpread(0.02, True), "B": BetweenTrialSpread(0.05, B_is_estimated)}
-    rest: Any = {"covariance": covariance, "spreads": spreads, "trials": dict.fromkeys(range(n_trials))}
+    rest = {"covariance": covariance, "spreads": spreads, "trials": dict.fromkeys(range(n_trials))}
     return guess.fit_numbers(FitSummary(vt.base_model().names, numbers=numbers, **rest), "a")
 
 
@@ -373,7 +372,7 @@ def made(pressure_kPa: float, **more: object) -> Trial:
     return replace(on_chamber(pressure_kPa=pressure_kPa, chamber_l=""), **more)
 
 
-def looked_at(trials: list[Trial], **limits: Any) -> list[Condition]:
+def looked_at(trials: list[Trial], **limits) -> list[Condition]:
     return feasible_conditions(schema.with_names(trials), settings.Limits(**limits))
 
 
