@@ -133,12 +133,6 @@ def fitted(pairs: Pairs):
     return vt.fit(vt.base_model(), pairs, profile=False)
 
 
-@pytest.fixture(scope="module")
-def emptying():
-    """Vines on a chamber that nothing refills, without it."""
-    return fitted(pairs_of(grown(sheet(), 51, ["reservoir_depletion"])))
-
-
 def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure():
     """The higher the pressure, the wider and faster a vine is whose wall gives way."""
     table = drift(fitted(pairs_of(grown(sheet(), 51, ["wall_stretch"])))).table
@@ -149,14 +143,22 @@ def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure():
 
 
 @pytest.mark.slow
-def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(emptying):
+def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way_and_it_fails_by_condition(fits):
     """n and the yield pressures are free, and take what they can upon themselves."""
-    found = drift(emptying)
+    found = drift(fits[0])
     rows = found.table[found.table["against"] == "growth"]
     assert rows["significant"].all()
     assert (rows["to_level"] > rows["from_level"]).all()
     best = np.maximum(found.table["z"], found.table["z_constancy"]).to_numpy()
     assert best[0] == best.max()
+    failing = locate(fits[0])
+    assert failing.fails
+    worst = failing.by_condition.iloc[0]
+    assert worst["rms_m"] == failing.by_condition["rms_m"].max()
+    assert failing.by_condition["z"].max() > 3.5
+    together = failing.along_position[failing.along_position["condition"] == ""]
+    assert set(together["vine"]) == set(failing.by_condition["vine"])
+    assert together["n_trials"].max() == 12
 
 
 def test_every_trial_finds_the_b_it_was_grown_with():
@@ -202,18 +204,6 @@ def test_where_nothing_is_missing_nothing_drifts_or_fails_and_errors_are_as_larg
         z = np.concatenate([getattr(found, name)["z"] for found in complete])
         assert 0.4 < np.sqrt(np.mean(z**2)) < 1.3
         assert np.mean(np.abs(z) > 3) < 0.02
-
-
-@pytest.mark.slow
-def test_an_emptying_chamber_makes_it_fail(emptying):
-    failing = locate(emptying)
-    assert failing.fails
-    worst = failing.by_condition.iloc[0]
-    assert worst["rms_m"] == failing.by_condition["rms_m"].max()
-    assert failing.by_condition["z"].max() > 3.5
-    together = failing.along_position[failing.along_position["condition"] == ""]
-    assert set(together["vine"]) == set(failing.by_condition["vine"])
-    assert together["n_trials"].max() == 12
 
 
 @pytest.mark.slow

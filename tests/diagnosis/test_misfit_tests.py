@@ -97,18 +97,14 @@ DRAG, INLET = "air_drag.C_D", "inlet_loss.K"
 TRUE_INLET = 1.0
 
 
-@pytest.fixture(scope="module")
-def after():
-    """The model with the inlet loss alone, held against all other effects, fitted to trials that have drag too: of two
-    tubes through connectors a third as wide, where air slows down as drag would slow the vine.
+def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size_and_what_nobody_can_exclude_is_named():
+    """Of the model with the inlet loss alone, held against all other effects, fitted to trials that have drag too: of
+    two tubes through connectors a third as wide, where air slows down as drag would slow the vine.
     """
     trials = [replace(trial, inlet_m=0.33 * trial.diameter_m) for trial in sheet()]
     care = {"damping_scatter": 5e-3, "pressure_scatter": 1e-3, "yield_error_kPa": 0.05, "noise_m": 3e-5}
     both_act = campaigns.grown(trials, 31, ["inlet_loss", "air_drag"], {INLET: TRUE_INLET, DRAG: 1.2}, **care)
-    return questioned(pairs_of(both_act), vt.base_model() + vt.effects.inlet_loss, LATER)
-
-
-def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after):
+    after = questioned(pairs_of(both_act), vt.base_model() + vt.effects.inlet_loss, LATER)
     place = after.ranked_shapes("air_drag")[0]
     k = next(k for k, number in enumerate(after.fit.numbers) if number.key == INLET)
     lever = float(score_test.levers_of(after.fit, after.products)[k, place])
@@ -118,9 +114,7 @@ def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after):
     fell = after.fit[INLET].value - with_drag[INLET].value
     # First order in C_D; spreads and noise are estimated anew in the refit.
     assert fell == pytest.approx(lever * drag, rel=0.1)
-
-
-def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth(after):
+    # The wider interval holds the truth.
     by_effect = {one.effect: one for one in selection.confounders_of(after, ["inlet_loss"])}
     # Linear damping takes the same sign of the force, fold inertia the other: found in refits with either held.
     linear, fold = by_effect["linear_damping"], by_effect["fold_inertia"]

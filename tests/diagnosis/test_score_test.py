@@ -321,14 +321,11 @@ def test_the_marginal_likelihood_is_the_integral_over_the_prior(value, sigma):
     assert log_evidence(fitted(value, sigma), GAUGE) == pytest.approx(math.log(whole), abs=1e-6)
 
 
-def test_a_gauge_seven_kilopascals_off_is_a_surprise_and_one_within_two_is_none():
+def test_a_gauge_seven_kilopascals_off_is_a_surprise_one_within_two_is_none_and_one_unknown_costs_nothing():
     # z² = 7.1² / (1.7² + 1²) = 12.96 with a prior of 1 kPa; less 4 at the edge of the plausible range.
     assert prior_penalty(fitted(7.1e3, 1.7e3), GAUGE) == pytest.approx(12.96 - 4, abs=0.01)
     assert prior_penalty(fitted(1.9e3, 100.0), GAUGE) == 0
     assert prior_penalty(fitted(7.1e3, 5e3), GAUGE) == 0
-
-
-def test_a_number_of_which_the_data_say_nothing_costs_nothing_and_weights_follow_the_evidence():
     assert log_evidence(fitted(0.0, 1e7), GAUGE) == pytest.approx(-10, abs=1e-6)
     assert posterior_weights([-10.0, -10.0 - math.log(3), -800.0]) == pytest.approx([0.75, 0.25, 0.0])
     assert posterior_weights([]) == []

@@ -65,13 +65,7 @@ def test_a_vine_grows_from_rest_to_its_end_as_the_equation_says(trial, B, n, rel
     assert found.end_lead_velocity_m_s == pytest.approx(truth.state(end)[1] / 2, rel=1e-3)
 
 
-def test_the_result_does_not_depend_on_the_requested_times():
-    many = vt.simulate(MODEL, VINE, np.linspace(0, 0.5, 501))
-    few = vt.simulate(MODEL, VINE, np.array([0.1, 0.25, 0.5]))
-    np.testing.assert_allclose(few.lead_position_m, many.lead_position_m[[100, 250, 500]], rtol=0, atol=1e-9)
-
-
-def test_many_at_once_agree_with_each_alone():
+def test_a_motion_depends_neither_on_others_at_once_nor_on_the_requested_times():
     trials = [VINE, LOADED, replace(VINE, pressure_Pa=3.1e3)]
     times = [np.linspace(0, t, 20) for t in (0.3, 0.5, 2.0)]
     traces = [None, (np.array([0.0, 1.0]), np.array([14e3, 10e3])), None]
@@ -79,6 +73,9 @@ def test_many_at_once_agree_with_each_alone():
     for trial, times_s, trace, found in zip(trials, times, traces, together, strict=True):
         alone = vt.simulate(MODEL, trial, times_s, trace=trace)
         np.testing.assert_array_equal(found.lead_position_m, alone.lead_position_m)
+    many = vt.simulate(MODEL, VINE, np.linspace(0, 0.5, 501))
+    few = vt.simulate(MODEL, VINE, np.array([0.1, 0.25, 0.5]))
+    np.testing.assert_allclose(few.lead_position_m, many.lead_position_m[[100, 250, 500]], rtol=0, atol=1e-9)
 
 
 BAND = '''"""Band: a force that grows from a place along the way.

@@ -103,12 +103,18 @@ def test_one_B_for_all_vines_if_requested(campaign):
     assert abs(shared["B"].value - B_TRUE[24.0]) < 3 * shared["B"].sigma
 
 
-def test_a_parameter_at_its_bound_has_an_interval_by_profile():
+def test_a_parameter_at_its_bound_has_an_interval_by_profile_and_gains_no_likelihood_beyond_it(campaign):
     """No chamber depletes, and the model lets it do so at least isothermally."""
     pairs = [(replace(t, chamber_m3=3.7e-3), track) for t, track in small_campaign(seed=5, replicates=1)[0]]
     gamma = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs)["gamma"]
     assert gamma.bound == gamma.lower == 0.6
     assert (gamma.low, gamma.method) == (0.6, "profile")
+    # n is held too low, so that a drag is wanted; the fold's inertia acts the other way and stays at nothing.
+    low = {"eversion_damping.n": N_TRUE - 0.06}
+    plain = vt.fit(vt.base_model(), campaign[1], fixed=("n",), start=low, profile=False)
+    folded = vt.refit(plain, plain.model + vt.effects.fold_inertia)
+    assert folded["eta"].bound == 0.0
+    assert plain.log_likelihood - 2 < folded.log_likelihood < plain.log_likelihood + 0.1
 
 
 def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch):
@@ -121,15 +127,6 @@ def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch):
     assert (n.method, n.value) == ("profile", linear["n"].value)
     assert n.high - n.low == pytest.approx(linear["n"].high - linear["n"].low, rel=0.02)
     assert n.low < n.value < n.high
-
-
-def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign):
-    # n is held too low, so that a drag is wanted; the fold's inertia acts the other way and stays at nothing.
-    low = {"eversion_damping.n": N_TRUE - 0.06}
-    plain = vt.fit(vt.base_model(), campaign[1], fixed=("n",), start=low, profile=False)
-    folded = vt.refit(plain, plain.model + vt.effects.fold_inertia)
-    assert folded["eta"].bound == 0.0
-    assert plain.log_likelihood - 2 < folded.log_likelihood < plain.log_likelihood + 0.1
 
 
 @pytest.mark.parametrize(
@@ -151,7 +148,7 @@ def test_a_parameter_without_influence_has_no_error():
     assert math.isinf(vt.fit(vt.base_model(), level, free=("g",))["g"].sigma)
 
 
-def test_missing_frames_begin_a_new_stretch_and_change_little(campaign):
+def test_missing_frames_begin_a_new_stretch_and_points_flagged_unusable_are_not_used(campaign):
     fit, pairs, _ = campaign
     kept = [np.arange(track.time_s.size) % 50 != 37 for _, track in pairs]
     holed = [(t, as_track(x.time_s[k], x.lead_position_m[k])) for (t, x), k in zip(pairs, kept, strict=True)]
@@ -159,10 +156,7 @@ def test_missing_frames_begin_a_new_stretch_and_change_little(campaign):
     first = again.predictor.data[0].first
     assert np.count_nonzero(first) == 1 + np.count_nonzero(np.diff(again.trials[0].time_s) > 1.5 / FPS)
     assert abs(again["n"].value - fit["n"].value) < fit["n"].sigma
-
-
-def test_points_flagged_unusable_are_not_used(campaign):
-    fit, spoilt = campaign[0], []
+    spoilt = []
     for trial, track in campaign[1]:
         bad = np.arange(track.time_s.size) == track.time_s.size // 2
         position, flag = np.where(bad, 5.0, track.lead_position_m), np.where(bad, "rejected", track.flag)

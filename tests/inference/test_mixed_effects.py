@@ -127,15 +127,6 @@ def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions():
     assert log_det == pytest.approx(math.log(determinant), rel=1e-9)
 
 
-def test_collinear_parameters_are_left_to_least_squares():
-    draw = np.random.default_rng(10)
-    rows, seen = draw.standard_normal((30, 4)), draw.standard_normal(30)
-    twice = np.column_stack([rows, rows[:, 1]])
-    step, _ = marginal.bounded_solve(twice.T @ twice, twice.T @ seen, given(1, 5, 5)[0], np.zeros(5))
-    assert twice @ step == pytest.approx(rows @ np.linalg.lstsq(rows, seen, rcond=None)[0], abs=1e-9)
-    assert step[1] == pytest.approx(step[4])
-
-
 def test_the_restricted_likelihood_adds_the_information():
     columns = columns_of(4, 20, 2, seed=3)
     frame, state = given(4, 20, 2, 0.5)
@@ -220,7 +211,7 @@ def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge():
     assert marginal.trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(np.array(expected))
 
 
-def test_collinear_parameters_are_detected():
+def test_collinear_parameters_are_detected_and_left_to_least_squares():
     columns = columns_of(4, 25, 3, seed=10)
     for c in columns:
         c[:, 6] = 2 * c[:, 5]
@@ -229,6 +220,12 @@ def test_collinear_parameters_are_detected():
     assert found.collinear.tolist() == [False, True, True]
     assert np.isinf(found.covariance[1, 1])
     assert np.isfinite(found.covariance[0, 0])
+    draw = np.random.default_rng(10)
+    rows, seen = draw.standard_normal((30, 4)), draw.standard_normal(30)
+    twice = np.column_stack([rows, rows[:, 1]])
+    step, _ = marginal.bounded_solve(twice.T @ twice, twice.T @ seen, given(1, 5, 5)[0], np.zeros(5))
+    assert twice @ step == pytest.approx(rows @ np.linalg.lstsq(rows, seen, rcond=None)[0], abs=1e-9)
+    assert step[1] == pytest.approx(step[4])
 
 
 def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate():

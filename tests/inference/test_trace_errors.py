@@ -120,33 +120,22 @@ def test_errors_without_influence_on_the_motion_are_zero(fit):
         np.testing.assert_allclose(back[: each.trace_error_sizes.size], -3.0, atol=0.05)
 
 
-GAUGE_NOISE_PA = 100.0
-
-
-@pytest.fixture(scope="module")
-def traced():
+@pytest.mark.slow
+def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_the_gauge_each_in_its_own_trial():
     """Sixteen trials; the gauge sees each pressure as it is, not as it was set, give or take 0.1 kPa a sample."""
     pairs, truth = small_campaign(seed=21)
-    seen, draw = [], np.random.default_rng(21)
+    seen, draw, gauge_noise_Pa = [], np.random.default_rng(21), 100.0
     for (trial, track), true in zip(pairs, truth, strict=True):
-        gauge_Pa = trial.pressure_Pa * true["pressure"] + GAUGE_NOISE_PA * draw.standard_normal(track.time_s.size)
+        gauge_Pa = trial.pressure_Pa * true["pressure"] + gauge_noise_Pa * draw.standard_normal(track.time_s.size)
         seen.append((trial, as_track(track.time_s, track.lead_position_m, gauge_Pa)))
-    return vt.fit(vt.base_model(), seen, profile=False)
-
-
-@pytest.mark.slow
-def test_tracks_are_explained_to_their_noise_and_pressures_deviate_by_that_of_the_gauge(traced):
+    traced = vt.fit(vt.base_model(), seen, profile=False)
     assert traced.chi2_per_dof < 1.15
     assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
     for trial, item in zip(traced.trials, traced.predictor.data, strict=True):
         samples = np.count_nonzero(item.time_s >= trial.release_s)
-        assert item.gauge_error == pytest.approx(GAUGE_NOISE_PA / np.sqrt(samples) / trial.trial.pressure_Pa, rel=0.4)
+        assert item.gauge_error == pytest.approx(gauge_noise_Pa / np.sqrt(samples) / trial.trial.pressure_Pa, rel=0.4)
         assert abs(trial.pressure_deviation) < 4 * item.gauge_error
-
-
-@pytest.mark.slow
-def test_an_error_of_a_recorded_pressure_affects_its_own_trial_alone(traced):
-    """The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds."""
+    # The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds.
     predictor = traced.predictor
     trace = predictor.data[3].trace
     ramp = np.linspace(-100.0, 100.0, trace[0].size)
