@@ -56,6 +56,9 @@ def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others
     if not enough:
         assert (told.code, told.facts["effect"]) == ("too_weak_in_set", "tail_friction")
         assert (told.facts["sigmas"], told.facts["required"]) == (pytest.approx(worth), 6.0)
+    # One that is tried in many shapes is asked for its own threshold.
+    assert not sets_of(pairs(6.5), {"tail_friction": 6.4}).superfluous(triple)
+    assert sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple).facts["required"] == 6.6
 
 
 @pytest.mark.parametrize(("scattered", "worth"), [(2, 5.5), (0, 11.0)])
@@ -64,12 +67,6 @@ def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely_in_its_own_
     triple, sets = of(NAMES, TRIPLE, inflation=4.0), sets_of(pairs(11.0))
     assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
     assert bool(sets.superfluous(triple)) == (worth < 6)
-
-
-def test_a_member_that_is_tried_in_many_shapes_is_asked_for_its_own_threshold():
-    triple = of(NAMES, TRIPLE)
-    assert not sets_of(pairs(6.5), {"tail_friction": 6.4}).superfluous(triple)
-    assert sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple).facts["required"] == 6.6
 
 
 @pytest.mark.parametrize(

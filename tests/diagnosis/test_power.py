@@ -65,7 +65,7 @@ def test_a_planned_campaign_is_known_as_well_as_the_same_campaign_filmed():
     assert precisions[0] == pytest.approx(precisions[1], rel=0.5)
 
 
-def test_detectable_sizes_follow_the_normal_distribution(six, power):
+def test_detectable_sizes_follow_the_normal_distribution_and_small_effects_linear_theory(six, power):
     assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold  # without noise there is no alarm
     # Fewer trials than a scatter can be told from: only the noise model decides.
     sigma = six.scores.plain_sigma[place_of(six, "tail_friction")]
@@ -74,6 +74,12 @@ def test_detectable_sizes_follow_the_normal_distribution(six, power):
     assert entry.size_at(0.5) / sigma >= six.family.threshold("tail_friction") - 0.1
     assert power["leak"].is_visible
     assert not power["air_drag"].is_visible
+    k, start, size = place_of(six, "leak"), linear_power.noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
+    assert linear_power.score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
+    moved_m = size * linear_power.residual_displacements(six.fit, six.products)[k]
+    after = linear_power.fitted_without(six.fit, six.sensitivities.shapes[k], size, start)
+    left = [block[:, -1] for block in after.solution.columns]
+    assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
 
 
 @pytest.mark.slow
@@ -89,15 +95,6 @@ def test_two_equivalent_effects_are_confused_with_each_other():
     power = power_with(planned(2, candidates=("area_scale", "pressure_gain")))
     assert "pressure_gain" in power["area_scale"].taken_for
     assert "area_scale" in power["pressure_gain"].taken_for
-
-
-def test_a_small_effect_has_the_score_of_linear_theory_and_leaves_what_a_refit_without_it_leaves(six, power):
-    k, start, size = place_of(six, "leak"), linear_power.noiseless_start(six.fit), 0.5 * power["leak"].size_at(0.5)
-    assert linear_power.score_ratio(six, k, 0.6 * size, start) == pytest.approx(1.0, abs=0.03)
-    moved_m = size * linear_power.residual_displacements(six.fit, six.products)[k]
-    after = linear_power.fitted_without(six.fit, six.sensitivities.shapes[k], size, start)
-    left = [block[:, -1] for block in after.solution.columns]
-    assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
 
 
 def test_power_is_unchanged_by_writing_and_reading(power):

@@ -67,13 +67,10 @@ def test_the_floor_is_the_same_for_every_model(rest):
 
 
 @pytest.mark.parametrize("rest", [30, 0])
-def test_equal_motions_with_clocks_and_origins_of_their_own_differ_by_nothing(rest):
+def test_equal_motions_with_clocks_and_origins_of_their_own_differ_by_nothing_nor_one_that_begins_in_motion(rest):
     trials = [grown("a", rest=rest), grown("b", rest=rest, clock_s=0.31234, origin_m=0.1)]
     # What is left is the curvature within half a frame beside the smoothed reference.
     assert align_replicates(trials).floor_m < 2e-5
-
-
-def test_a_track_that_begins_in_motion_is_laid_on_one_that_shows_its_rest():
     whole = grown("b", clock_s=0.2)
     kept = whole.time_s > 0.2 + 0.015
     late = trial_fit("b", whole.time_s[kept], whole.lead_position_m[kept], 1.9, whole.release_s, whole.origin_m)

@@ -139,17 +139,14 @@ def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a
     assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)
 
 
-def test_draws_from_a_fit_have_its_covariance():
+def test_draws_have_the_covariance_of_the_fit_and_its_spreads_with_the_doubt_of_few_trials():
     inputs = vt.predictive_inputs(unsaid(**VINE), vt.StatedValues(spreads=(0.0, 0.0)), fitted())
     draws = inputs.draw(40_000, seed=3)
     found = np.cov([np.log(draws[B]), draws[N], draws[YIELD] / 1e5])
     # ln B has 0.06/6 = 1 %, and n the correlation −0.00048/(0.06 × 0.01) = −0.8 with it.
     expected = [[1e-4, -0.8e-4, 0.0], [-0.8e-4, 1e-4, 0.0], [0.0, 0.0, 1e-6]]
     assert found == pytest.approx(np.array(expected), abs=3e-6)
-
-
-def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials():
-    """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
+    # Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8).
     inputs = vt.predictive_inputs(unsaid(**VINE), None, fitted(13, B_is_estimated=False))
     draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
     assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
