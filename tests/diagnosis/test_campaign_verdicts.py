@@ -142,9 +142,7 @@ def test_vines_and_days_are_asked_alone_where_there_are_several_and_each_trial_h
         ({"supply_refill": (110, 0, 3), "reservoir_depletion": (100, 0, 3)}, {"reservoir_depletion"}),
     ],
 )
-def test_what_is_as_likely_with_film_a_little_off_is_not_excluded_unless_film_explains_all_alone(
-    monkeypatch, given, kept
-):
+def test_what_is_as_likely_with_film_a_little_off_is_excluded_only_by_film_alone(monkeypatch, given, kept):
     """By ln L, gain by film and inflation; none predicts the curve of another. A larger form must gain as much."""
     monkeypatch.setattr(likelihood_ratio, "_distance", lambda *_: 1e3)
     ratios = []

@@ -125,9 +125,8 @@ def test_one_variable_and_two_have_equal_prior_odds():
 def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     """ẍ = 1 − ω²x from rest: x = (1 − cos ωt)/ω²."""
     omega, time_s = 20.0, np.linspace(0, 0.3, 401)[None]
-    moved, sped = inversion.integrate_responses(
-        time_s, np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1)), inversion.SDIRK_GAMMA
-    )
+    pushed = np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1))
+    moved, sped = inversion.integrate_responses(time_s, *pushed, inversion.SDIRK_GAMMA)
     assert moved[0, :, 0] == pytest.approx((1 - np.cos(omega * time_s[0])) / omega**2, abs=1e-4 / omega**2)
     assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
 

@@ -249,9 +249,8 @@ def test_heavy_tails_alone_are_not_louder_in_motion(heavy, most):
         if heavy:
             white /= np.sqrt(draw.chisquare(5, (12, 16, 1)) / 5)
         trials = [SimpleNamespace(whitened=one.ravel()) for one in white]
-        data = SimpleNamespace(
-            slow_m=None, gauge_error=0.0, n_rest=8 * STRETCH_FRAMES, noise_m=1e-4, lead_position_m=np.array([0.0, 0.3])
-        )
+        seen = {"slow_m": None, "gauge_error": 0.0, "noise_m": 1e-4, "lead_position_m": np.array([0.0, 0.3])}
+        data = SimpleNamespace(n_rest=8 * STRETCH_FRAMES, **seen)
         fit = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
         alarms += noise_in_motion_p(fit) < 0.01
     assert alarms / 600 < most

@@ -76,9 +76,8 @@ def test_a_size_explains_its_own_part_of_how_trials_scatter():
         (20604, 24, 1.0, "m" * 20 + "o", 0.02, 500, 18),  # at 2 %, more once in 100
     ],
 )
-def test_candidates_of_one_shape_or_many_are_false_alarms_as_seldom_as_they_should_be_together(
-    seed, trials, scatter, named, level, campaigns, most
-):
+def test_candidates_are_false_alarms_as_seldom_as_they_say(seed, trials, scatter, named, level, campaigns, most):
+    """Of one shape each, or one of twenty beside one."""
     draw = np.random.default_rng(seed)
     asked = [questioned(scores(draw, trials, len(named), scatter), QUIET, level, named) for _ in range(campaigns)]
     # Their cosines are all near 0: one family of thresholds serves them all.
@@ -141,9 +140,7 @@ def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselve
     ],
     ids=["slow errors of a film", "noise alone", "an unknown lens", "more than either", "within the noise"],
 )
-def test_a_misfit_no_larger_than_the_slow_errors_of_tracks_is_not_far_off(
-    chi2, residual_m, slow, systematic_m, exceeds
-):
+def test_a_misfit_no_larger_than_slow_errors_of_tracks_is_not_far_off(chi2, residual_m, slow, systematic_m, exceeds):
     """Of 100 mm of growth. Nothing is then sought beyond a model that passes: 14 s instead of 71 for 24 films."""
     seen = {"lead_position_m": np.array([0.0, 0.1]), "slow_m": 0.0 if slow else None, "trace": None}
     track = SimpleNamespace(position_systematic_m=systematic_m, **seen)

@@ -22,9 +22,8 @@ from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue, load
 
 
 def test_removing_by_effect_or_by_name_removes_its_values():
-    larger = (vt.base_model() + effects.reservoir_depletion).with_values(
-        {"reservoir_depletion.gamma": 1.2, "eversion_damping.B": 2.0}
-    )
+    values = {"reservoir_depletion.gamma": 1.2, "eversion_damping.B": 2.0}
+    larger = (vt.base_model() + effects.reservoir_depletion).with_values(values)
     for smaller in (larger - effects.reservoir_depletion, larger - "reservoir_depletion"):
         assert smaller.names == BASE_EFFECTS
         assert dict(smaller.values) == {"eversion_damping.B": 2.0}

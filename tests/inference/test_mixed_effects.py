@@ -93,9 +93,8 @@ def test_residuals_at_zero_deviations_are_restored():
     for column, effects in zip(whole, state.trial_effects, strict=True):
         column[:, -1] += column[:, 2:4] @ effects[2:]
     white = at_correlation(crossed(columns), RHO)
-    assert marginal.at_prior_means(white, frame, state, -1) == pytest.approx(
-        at_correlation(crossed(whole), RHO), rel=1e-9
-    )
+    restored = marginal.at_prior_means(white, frame, state, -1)
+    assert restored == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
 
 
 def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions():
@@ -131,11 +130,9 @@ def test_the_restricted_likelihood_adds_the_information():
     columns = columns_of(4, 20, 2, seed=3)
     frame, state = given(4, 20, 2, 0.5)
     part = marginal.marginal(crossed(columns), frame, state)
-    more = marginal.deviance(part, frame, state, state.spread) - marginal.deviance(
-        part, frame, state, state.spread, restricted=False
-    )
+    restricted, plain = (marginal.deviance(part, frame, state, state.spread, restricted=how) for how in (True, False))
     known = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
-    assert more == pytest.approx(-np.linalg.slogdet(known.covariance)[1], rel=1e-8)
+    assert restricted - plain == pytest.approx(-np.linalg.slogdet(known.covariance)[1], rel=1e-8)
 
 
 def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance():
@@ -147,9 +144,8 @@ def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance():
     means = np.array([c[:, -1].mean() for c in columns])
     cross_products = crossed(columns)
     frame, state = given(n_trials, count, 1, 0.3, rho=0.0, sigma=0.01)
-    found = marginal.estimate_between_trial_sd(
-        marginal.marginal(cross_products, frame, state), frame, state, (False, True)
-    )
+    part = marginal.marginal(cross_products, frame, state)
+    found = marginal.estimate_between_trial_sd(part, frame, state, (False, True))
     solution = Solution(replace(state, spread=found), frame, cross_products, (), (False, True), True, 1)
     assert found[1] == pytest.approx(math.sqrt(means.var(ddof=1) - 0.01**2 / 25), rel=2e-3)
     assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)

@@ -172,9 +172,8 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
     found = vt.fit(vt.base_model(), bent(pairs, bends_m), profile=False)
     alone = np.diag(robust_covariance(found.predictor, found.solution)[1])
-    found.predictor.data = [
-        replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in enumerate(found.predictor.data)
-    ]
+    told = enumerate(found.predictor.data)
+    found.predictor.data = [replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in told]
     by_day = np.diag(robust_covariance(found.predictor, found.solution)[1])
     assert np.all(by_day >= alone)
     assert np.max(by_day / alone) > 1.2
