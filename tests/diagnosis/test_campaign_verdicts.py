@@ -44,7 +44,6 @@ def diagnosed(pairs, candidates=None) -> result.Diagnosis:
 
 
 def laboratory(folder: Path, row: str, seed: int, size: tuple[int, int], **more: bool):
-    """The truth about a campaign of a laboratory, and its folder as it is read."""
     known = campaign(row, seed, size, **more)
     write_experiment(known, folder / "e")
     return known.truth["truths"], vt.read_experiment(folder / "e")
@@ -206,7 +205,6 @@ def test_a_chamber_that_was_misread_is_a_depletion(tmp_path, row, seed):
 
 @pytest.mark.slow
 def test_one_mistyped_payload_of_several_is_named_with_its_vine(tmp_path):
-    """The payload of one of two vines weighs 15 % more than stated."""
     said = diagnosed(laboratory(tmp_path, "payload_mistyped", 912, (24, 40))[1])
     assert (said.verdict, said.answer_set) == ("artefact", ("payload_mass",))
     off = [number for number in row_of(said, "payload_mass").numbers if abs(number.value) > 4 * number.sigma]

@@ -96,7 +96,6 @@ def test_sizes_of_several_vines_are_as_many_degrees_of_freedom():
 @pytest.mark.parametrize("delta_chi2", [30.0, 600.0, 1420.0, 1500.0, 4e4])
 @pytest.mark.parametrize("degrees", [1, 2, 5])
 def test_significance_is_that_of_the_tail_however_far_out(delta_chi2, degrees):
-    """Held against the logarithm of the tail probability where that has a closed form."""
     sigmas = in_sigmas(delta_chi2, degrees)
     if degrees == 1:
         assert sigmas == pytest.approx(math.sqrt(delta_chi2))
@@ -144,7 +143,6 @@ LATCH = {"latch_release.F": 1.0, "latch_release.reach": 0.01}
 
 
 def asked(*names: str, **how: bool) -> result.Diagnosis:
-    """Of a campaign with each condition once."""
     return vt.diagnose(grown(TRUTH | LATCH, seed=7200, trials=sheet()[::2]), candidates=names, **how)
 
 

@@ -54,7 +54,6 @@ def test_splines_equal_those_of_scipy(knots):
 
 @pytest.mark.slow
 def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_explains_the_misfit(tmp_path):
-    """Waves of decreasing length along the growth."""
     pairs = hidden_force(sheet((4,), replicates=2), 131, "waves", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     table = proposal.table

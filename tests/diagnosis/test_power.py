@@ -142,7 +142,6 @@ LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def few():
-    """Four trials, and what they can tell."""
     design = planned(2, kPa=(14, 24), candidates=("air_drag", "tail_friction", "leak"))
     return design, power_with(design, nonlinear=True)
 
@@ -177,7 +176,6 @@ NAMES = ("inlet_loss", "linear_damping", "leak")
 
 
 def sizes_with(design: campaign_power.CampaignDesign, settings: list[tuple[float, float]]) -> np.ndarray:
-    """Sizes of all effects found nine times in ten with trials at these pressures, kPa, and connectors, mm, as well."""
     like = design.trials[0]
     added = [replace(like, name=f"a{k}", pressure_Pa=1e3 * P, inlet_m=mm / 1e3) for k, (P, mm) in enumerate(settings)]
     tests, _ = planned_tests(with_trials(design, added))

@@ -27,7 +27,6 @@ STEP_S = 1e-3
 def trial_fit(
     name: str, time_s: Floats, position_m: Floats, speed_m_s: float, release_s: float, origin_m: float
 ) -> TrialFit:
-    """A trial and a model that runs at this speed from the release on."""
     since_s = np.maximum(time_s - release_s, 0.0)
     model_m = origin_m + speed_m_s * since_s
     off_m = position_m - model_m

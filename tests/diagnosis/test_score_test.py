@@ -32,7 +32,6 @@ QUIET = misfit_tests.Structure(0.0, 0, 1.0, 0.0)
 
 
 def summed(single: np.ndarray, informations: np.ndarray, groups=()) -> Scores:
-    """The scores of trials, each a group of its own where none are named."""
     named = list(groups) or [str(i) for i in range(len(single))]
     return Scores(single.sum(axis=0), informations.sum(axis=0), single, informations, 1, named)
 
@@ -46,7 +45,6 @@ def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float =
 
 
 def questioned(of: Scores, structure: Any = QUIET, level: float = FIRST, effects=()) -> MisfitTests:
-    """The tests of candidates with these scores, each shape another effect where these are not named."""
     shape = SimpleNamespace(effect=SimpleNamespace(parameters=(1,)), size=SimpleNamespace(sign=0))
     named = tuple(effects) or tuple(f"effect_{k}" for k in range(of.score.size))
     answers: Any = SimpleNamespace(shapes=[shape] * of.score.size, effects=named)

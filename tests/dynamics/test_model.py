@@ -56,7 +56,6 @@ def test_effects_of_size_zero_and_replaced_ones_do_not_act():
 
 
 def test_terms_along_a_motion_by_hand():
-    """At y = 0.1 m and ẏ = 2 m/s, with B 6.44 and n 0.37, everything worked out on paper."""
     model = vt.base_model().with_values({"eversion_damping.B": 6.44})
     terms = evaluate(model, LOADED.trial(), np.array([0.05]), np.array([0.1]), np.array([2.0]))
     mass = 1200 * math.pi * 0.024 * 200e-6 * (0.28 - 0.1) + 0.0356

@@ -38,7 +38,6 @@ def callable_parts(effects: tuple[Effect, ...]) -> tuple:
 def accelerations(
     model: vt.Model, trial: Trial, time: np.ndarray, y: np.ndarray, v: np.ndarray, chamber: np.ndarray | None = None
 ) -> list[float]:
-    """Of the tail, by the compiled rates, at these pressures of the chamber (none: as at release)."""
     chamber_at_release, acceleration = callable_parts(model.effects)
     theta = model.parameters_for(trial.vine)
     on, rig = effects_on(model, theta[None])[0], np.array(simulate.trial_inputs(trial))
@@ -121,7 +120,6 @@ DRAWN_LAST = ("film_mass", "payload_mass")
 
 
 def mixture(seed: int) -> tuple[Vine, dict[str, float]]:
-    """A vine, and two effects in five."""
     rng = np.random.default_rng(seed)
     D, L, P, B = (rng.uniform(*ends) for ends in ((5e-3, 30e-3), (0.15, 0.6), (8e3, 60e3), (0.5, 6.0)))
     payload, down = float(rng.choice([0.0, 35.6e-3])), float(rng.choice([1.0, 0.0, -1.0]))

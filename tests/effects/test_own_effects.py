@@ -58,7 +58,6 @@ def test_it_is_simulated_like_any_other(tmp_path):
 
 
 def copies(folder: Path, text: str) -> list[Effect]:
-    """The effect of this text at two places."""
     for name in "ab":
         (folder / name).mkdir()
     return [own_effects([written(folder / name, text)])["brush"] for name in "ab"]

@@ -23,7 +23,6 @@ LET_DOWN = np.interp(TIMES_S, [0.1, 0.12, 0.2, 0.5], [16e3, 3e3, 3e3, 16e3])
 
 
 def without_noise(pressure_Pa: np.ndarray) -> np.ndarray:
-    """A trace alone, of a tip that stands still."""
     still = as_track(1e-3 * np.arange(pressure_Pa.size), np.zeros(pressure_Pa.size), pressure_Pa)
     return denoised_traces([still])[0].pressure_Pa
 
@@ -112,7 +111,6 @@ def test_a_corner_between_two_readings_is_where_the_growth_begins():
 
 @pytest.mark.slow
 def test_stated_errors_cover_the_actual_errors():
-    """Of chambers that empty: what is left of the noise, along each error, is as large as stated."""
     made = [emptied(seed) for seed in range(40)]
     quiet = denoised_traces([as_track(TIMES_S, growth_m, noisy_Pa) for _, noisy_Pa, growth_m in made])
     sizes = []
@@ -223,7 +221,6 @@ def test_noise_behind_a_filter_is_detected_as_correlated():
 @pytest.mark.slow
 @pytest.mark.parametrize("per_reading", [1, 6])
 def test_steady_pressures_stay_nearly_constant(per_reading):
-    """By a gauge that is read at every frame, or at every sixth and joined by lines."""
     tracks, draw = [], np.random.default_rng(6)
     for _ in range(30):
         frames = np.arange(int(draw.integers(60, 300)))

@@ -51,7 +51,6 @@ def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarr
 
 
 def crossed(columns: list[np.ndarray]) -> np.ndarray:
-    """Cross products of the columns of trials, each in one stretch."""
     return all_products(columns, [np.arange(len(columns[0])) == 0] * len(columns))
 
 

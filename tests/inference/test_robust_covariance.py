@@ -41,7 +41,6 @@ def misread(seed: int) -> Pairs:
 
 
 def bent(pairs: Pairs, bends_m) -> Pairs:
-    """Pictures that are bent, each trial's by so much."""
     made = []
     for (trial, track), bend_m in zip(pairs, bends_m, strict=True):
         part = (track.lead_position_m - track.lead_position_m[0]) / np.ptp(track.lead_position_m)
@@ -50,7 +49,6 @@ def bent(pairs: Pairs, bends_m) -> Pairs:
 
 
 def unlike(seed: int) -> Pairs:
-    """Each trial bent in another way, and some far more than others."""
     pairs, _ = small_campaign(seed, damping=1e-3, pressure=1e-3)
     return bent(pairs, 4e-4 * np.random.default_rng(seed).standard_t(3, len(pairs)))
 
@@ -118,7 +116,6 @@ def dropped(name: str, seed: int, drag: float, noise_m: float = 2e-3) -> tuple[T
 
 
 def scattering(seed: int, campaign: int, count: int) -> Pairs:
-    """Drops whose drag scatters by a tenth."""
     draw = np.random.default_rng([seed, campaign])
     return [dropped(f"t{i}", seed + 10 * campaign + i, 0.5 + 0.05 * draw.standard_normal()) for i in range(count)]
 
@@ -197,7 +194,6 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
 
 
 def last_of(drops: Pairs) -> fit_result.TrialFit:
-    """The last drop predicted from all others."""
     return vt.predict(vt.fit(FALL, drops[:-1], profile=False), drops[-1:])[0]
 
 

@@ -40,7 +40,6 @@ def is_told(node: ast.AST) -> bool:
 
 
 def cuts_prose(node: ast.AST) -> bool:
-    """Whether it looks for constant words in a sentence."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CUTS:
         constant = bool(node.args) and isinstance(node.args[0], ast.Constant)
         return constant and is_told(node.func.value)
