@@ -1,4 +1,4 @@
-"""Power of trials: detectable sizes, simulated campaigns, further trials and the next experiment that are worth making."""
+"""Power of trials: detectable sizes, simulated campaigns, further trials and the next experiment."""
 
 from __future__ import annotations
 

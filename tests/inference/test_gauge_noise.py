@@ -1,4 +1,4 @@
-"""Gauge noise is removed from a recorded pressure; what it leaves is estimated from the motion, not taken for physics."""
+"""Gauge noise is removed from a recorded pressure; what it leaves is estimated and not taken for physics."""
 
 from __future__ import annotations
 
