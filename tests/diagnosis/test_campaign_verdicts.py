@@ -1,7 +1,5 @@
 """Verdicts on whole campaigns of known truth, of two simulators, one per verdict. Seeds from 7000 are used here alone."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """A refit finds an effect from a start that misses by far more than noise; rules and thresholds are fitted too."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from unittest.mock import Mock
 

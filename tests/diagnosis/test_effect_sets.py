@@ -1,7 +1,5 @@
 """Several effects together: what a member of a set is worth, and steps that mend only a part."""
 
-from __future__ import annotations
-
 import json
 import math
 from types import SimpleNamespace

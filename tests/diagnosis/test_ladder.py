@@ -1,7 +1,5 @@
 """Where a model fails: the ladder of errors, conditions beyond the scatter of replicates, and numbers that drift."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

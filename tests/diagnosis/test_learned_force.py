@@ -1,7 +1,5 @@
 """The force that a model lacks: its algebra against closed forms, hidden forces, their laws and effect files."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is never known exactly does not pass for a missing effect; what passes for noise gives a model away."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

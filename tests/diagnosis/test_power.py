@@ -1,7 +1,5 @@
 """Power of trials: detectable sizes, simulated campaigns, further trials and the next experiment."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

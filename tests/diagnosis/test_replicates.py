@@ -1,7 +1,5 @@
 """Replicates laid over each other, the model against the measurement, and rows that belong to other recordings."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Scores and their thresholds: linear campaigns whose scores have a known distribution, against regressions."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any, cast

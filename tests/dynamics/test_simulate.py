@@ -1,7 +1,5 @@
 """Trajectories against closed forms and SciPy; a model as a sum of effects, its terms, and those that it neglects."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the other simulator does not cover: effects together, faults of the camera, rest; written out by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

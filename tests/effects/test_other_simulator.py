@@ -5,8 +5,6 @@ It lives in `benchmarks/hidden` and shares no code with the model; what it makes
 the terms along a known motion say the same, for every effect, all together, and mixtures.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The contract of an effect's file, in the catalogue or a user's own: read, tried out, listed, simulated, refused."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import math

@@ -1,7 +1,5 @@
 """The fit to trajectories and what it is given: vines simulated by SciPy, falling bodies, rounded and uneven tracks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Gauge noise is removed from a recorded pressure; what it leaves is estimated and not taken for physics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from unittest.mock import Mock, patch
 

@@ -1,7 +1,5 @@
 """The statistics of the fit and its steps, compared with dense matrices, textbook results and exact minima."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Errors, intervals and bands are correct where the noise model is wrong, and which part of them all trials share."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Prose stands in one room, a sentence for every code; one stored text of each kind shows a change of words."""
 
-from __future__ import annotations
-
 import ast
 import math
 import re

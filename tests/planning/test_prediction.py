@@ -1,7 +1,5 @@
 """What is predicted, from which inputs, what speaks against a vine, and which vines and trials are worth making."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
