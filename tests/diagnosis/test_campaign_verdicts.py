@@ -1,4 +1,4 @@
-"""Verdicts on whole campaigns of known truth, of two simulators, one per verdict. Seeds from 7000 are used here alone."""
+"""Verdicts on whole campaigns of known truth, by two simulators. Seeds from 7000 are used here alone."""
 
 import json
 import math
