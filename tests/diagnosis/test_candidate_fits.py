@@ -1,7 +1,5 @@
 """A refit finds an effect from a start that misses by far more than noise; rules and thresholds are fitted too."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -13,25 +11,17 @@ from hidden_truth import grown, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.diagnosis import candidate_fits, ladder
 from vinetrack.diagnosis import score_test as hypotheses
-from vinetrack.diagnosis.candidate_fits import SubsetFitter, full_fit, with_curves, without_curves
-from vinetrack.diagnosis.ladder import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, select_effects, slack_fit
-from vinetrack.dynamics.simulate import simulate
-from vinetrack.inference.fit import fit
-from vinetrack.inference.fit_result import YIELD_PRESSURE, Fit
+from vinetrack.inference.fit_result import YIELD_PRESSURE
 from vinetrack.inference.optimiser import relative_residual
 from vinetrack.inference.solving import solve_onward
 
-HIDDEN = {
-    "pressure_damping": ({"pressure_damping.beta": 1.5e-5}, {}),
-    "latch_release": (
-        {"latch_release.F": 0.6, "latch_release.reach": 0.015},
-        {"latch_release.F": 0.3, "latch_release.reach": 0.01},
-    ),
-}
+LATCH, OFF = ({"latch_release.F": F, "latch_release.reach": reach} for F, reach in ((0.6, 0.015), (0.3, 0.01)))
+HIDDEN = {"pressure_damping": ({"pressure_damping.beta": 1.5e-5}, {}), "latch_release": (LATCH, OFF)}
 
 
 @pytest.mark.slow
@@ -50,15 +40,14 @@ def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
 def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_found(monkeypatch):
     """A friction at rest beside the yield pressure that was found without it would hold the vine back altogether."""
     base = vt.fit(vt.base_model(), grown({"pressure_damping.beta": 1.5e-5}, seed=33), profile=False)
-    climb = SubsetFitter(base).fit_hypothesis(
-        (vt.effects.pressure_damping,), {"pressure_damping.beta": 1e-5}, iterations=9
-    )
+    start = {"pressure_damping.beta": 1e-5}
+    climb = candidate_fits.SubsetFitter(base).fit_hypothesis((vt.effects.pressure_damping,), start, iterations=9)
     yields_Pa = {number.name: number.value for number in base.numbers if number.key == YIELD_PRESSURE}
     assert climb.yields_Pa.keys() == yields_Pa.keys()
     assert any(abs(climb.yields_Pa[name] - value) > 1.0 for name, value in yields_Pa.items())
     watched = Mock(wraps=solve_onward)
     monkeypatch.setattr("vinetrack.inference.fit.solve_onward", watched)
-    assert full_fit(base, climb) is not None
+    assert candidate_fits.full_fit(base, climb) is not None
     layout, theta = watched.call_args_list[0].args[0].layout, watched.call_args_list[0].args[2]
     begun = dict(zip((number.name for number in layout.free), layout.values(theta), strict=True))
     assert climb.yields_Pa == pytest.approx({name: begun[name] for name in climb.yields_Pa})
@@ -73,8 +62,6 @@ def test_an_effect_that_adds_nothing_makes_no_fit_worse():
         assert np.isfinite(found.chi2_per_dof)
 
 
-# A pressure to start above the yield pressure is found though its answer jumps: starts lie close enough to it.
-
 P_S_TRUE = 11e3
 
 
@@ -88,10 +75,9 @@ def interrupted(k: int, pressure_Pa: float) -> tuple[Trial, Track]:
     time_s, stop_s = np.linspace(-0.05, 0.9, 191), 0.12 + 0.02 * k
     let_down = [pressure_Pa, 2e3, 2e3, pressure_Pa]
     trace = np.interp(time_s, [stop_s, stop_s + 0.02, stop_s + 0.1, stop_s + 0.5], let_down)
-    truth = (vt.base_model() + vt.effects.static_yield).with_values(
-        {"eversion_damping.B": 6.0, "eversion_damping.n": 0.4, "static_yield.P_s": P_S_TRUE}
-    )
-    y = simulate(truth, trial, time_s, trace=(time_s, trace)).lead_position_m
+    values = {"eversion_damping.B": 6.0, "eversion_damping.n": 0.4, "static_yield.P_s": P_S_TRUE}
+    truth = (vt.base_model() + vt.effects.static_yield).with_values(values)
+    y = vt.simulate(truth, trial, time_s, trace=(time_s, trace)).lead_position_m
     noise_m = 1e-4 * np.random.default_rng(70 + k).standard_normal(time_s.size)
     return trial, plain_track(time_s, y + noise_m, pressure_Pa=trace)
 
@@ -106,23 +92,15 @@ def test_a_static_yield_far_above_the_yield_pressure_is_found():
     assert abs(said.fits[-1]["P_s"].value - P_S_TRUE) < 100.0
 
 
-# Of many trials a search lets go of curves; what it says does not depend on it.
-
-
-@pytest.fixture(scope="module")
-def whole() -> Fit:
-    """The base model fitted to trials whose tail rubs."""
-    pairs = grown({"tail_friction.mu_w": 1.0}, seed=7270)
-    return initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), ["tail_friction"]), profile=False)
-
-
-def test_a_fit_is_the_same_once_its_curves_are_made_again(whole: Fit) -> None:
-    fit = whole
-    light = without_curves(fit)
+def test_a_fit_is_the_same_once_its_curves_are_made_again():
+    """Of trials whose tail rubs. Of many trials a search lets go of curves."""
+    model, pairs = vt.base_model(), grown({"tail_friction.mu_w": 1.0}, seed=7270)
+    fit = ladder.initial_fit(model, pairs, ladder.candidates_of(model, ["tail_friction"]), profile=False)
+    light = candidate_fits.without_curves(fit)
     assert not light.trials
     assert relative_residual(light.predictor, light.solution) == relative_residual(fit.predictor, fit.solution)
     steps = fit.predictor.steps.copy()
-    again = with_curves(light)
+    again = candidate_fits.with_curves(light)
     assert np.array_equal(fit.predictor.steps, steps)
     assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)
     for trial, before_trial in zip(again.trials, fit.trials, strict=True):
@@ -134,9 +112,6 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again(whole: Fit) -> None:
         assert np.all(apart <= 0.02 * whole)
 
 
-# A tail that goes slack under a model whose tail pushes is named.
-
-
 def grown_with_tail(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -> Pairs:
     """Trials of two vines, grown with a tail that may go slack or not, stated as taut."""
     told = {"growth_angle_rad": angle_rad, "tail_slack": tail_slack, "payload_kg": 1e-3 * payload_g}
@@ -145,54 +120,37 @@ def grown_with_tail(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -
     return [(replace(trial, tail_slack="taut"), track) for trial, track in pairs]
 
 
-@pytest.fixture(scope="module")
-def slackened() -> Fit:
-    return fit(vt.base_model(), grown_with_tail(60.0, "free"), profile=False)
-
-
 @pytest.mark.slow
-def test_a_slack_tail_is_found_where_the_model_has_it_push(slackened: Fit):
-    slack = slack_fit(slackened)
-    assert slack is not None
+def test_a_slack_tail_is_found_where_the_model_has_it_push_or_has_bent_its_trials_until_none_pushes():
+    found = vt.fit(vt.base_model(), grown_with_tail(60.0, "free"), profile=False)
+    slack = slack_fit(found)
     assert slack.names == ("tail_slack",)
     assert slack.sigma > 5
     assert all(trial.trial.tail_slack == "free" for trial in slack.fit.trials)
-    assert all(trial.trial.tail_slack == "taut" for trial in slackened.trials)
+    assert all(trial.trial.tail_slack == "taut" for trial in found.trials)
+    # As a fit looks that has taken the slack for scatter: no tail pushes, and pressures deviate by their most.
+    state = replace(found.solution.state, spread=(0.04, 0.15))
+    assert slack_fit(replace(found, solution=replace(found.solution, state=state))).sigma > 5
 
 
 def test_a_bare_vine_on_the_level_pulls_its_tail():
-    found = fit(vt.base_model(), grown_with_tail(0.0, "taut", np.pi / 2), profile=False)
-    assert slack_fit(found) is None
-
-
-@pytest.mark.slow
-def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_pushes(slackened):
-    # As a fit looks that has taken the slack for scatter: no tail pushes, and pressures deviate by their most.
-    solution = slackened.solution
-    bent = replace(slackened, solution=replace(solution, state=replace(solution.state, spread=(0.04, 0.15))))
-    slack = slack_fit(bent)
-    assert slack is not None
-    assert slack.sigma > 5
+    assert slack_fit(vt.fit(vt.base_model(), grown_with_tail(0.0, "taut", np.pi / 2), profile=False)) is None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suspect", [False, True])
-def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_better(
-    monkeypatch: pytest.MonkeyPatch, *, suspect: bool
-) -> None:
+def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_better(monkeypatch, *, suspect):
     trials = [replace(one, growth_angle_rad=np.pi / 2) for one in sheet()]
     virtual = campaigns.grown(trials, 6, ["tail_friction"], {"tail_friction.mu_w": 0.04}, noise_m=5e-5)
-    found = fit(vt.base_model(), pairs_of(virtual), profile=False)
-    effects, _ = hypotheses.testable(candidates_of(found.model, ["tail_friction"], None), found.predictor.data)
+    found = vt.fit(vt.base_model(), pairs_of(virtual), profile=False)
+    effects, _ = hypotheses.testable(ladder.candidates_of(found.model, ["tail_friction"], None), found.predictor.data)
     questions = misfit_tests(found, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
     assert questions.rejects_model
     assert not questions.far_off
     slack = likelihood_ratio(found, (TAIL_SLACK,), found)
     monkeypatch.setattr(MisfitTests, "needs_search", suspect)
-    steps = [
-        SelectionStep("missing", questions, (slack,), (slack,), (), slack.names),
-        SelectionStep("adequate", questions),
-    ]
+    said = SelectionStep("missing", questions, (slack,), (slack,), (), slack.names)
+    steps = [said, SelectionStep("adequate", questions)]
     monkeypatch.setattr("vinetrack.diagnosis.selection._slack_rounds", lambda *_: steps)
     named = select_effects(found, effects, lambda _: None)[0].answer_names
     assert named == (("tail_friction",) if suspect else ("tail_slack",))

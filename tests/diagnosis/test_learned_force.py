@@ -1,7 +1,5 @@
 """The force that a model lacks: its algebra against closed forms, hidden forces, their laws and effect files."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -16,37 +14,9 @@ from scipy.stats import multivariate_normal
 
 import vinetrack as vt
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_inversion import (
-    SDIRK_GAMMA,
-    CoefficientLikelihood,
-    ForceEstimate,
-    ForcePoint,
-    _with_updated_motions,
-    acceleration_sensitivities,
-    integrate_responses,
-    motions_of,
-    splines,
-    uniform_splines,
-)
-from vinetrack.diagnosis.force_laws import (
-    CONSTANT_AT_START,
-    KEPT_VARIANCE,
-    LENGTH_SCALES,
-    RELATIVE_AMPLITUDES,
-    ZERO_AT_START,
-    Domain,
-    Law,
-    SmoothForce,
-    candidate_domains,
-    covariance_modes,
-)
-from vinetrack.diagnosis.learned_force import (
-    NEGLIGIBLE_LOG_RATIO,
-    ForcePosterior,
-    LearnedForce,
-    marginal_likelihood,
-    variable_weights,
-)
+from vinetrack.diagnosis import force_inversion as inversion
+from vinetrack.diagnosis import force_laws as laws
+from vinetrack.diagnosis import learned_force
 from vinetrack.diagnosis.missing_force import MissingForce, RankedLaw, force_problem, missing_force
 from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_text
 from vinetrack.diagnosis.replicates import align_trials
@@ -54,42 +24,37 @@ from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
 from vinetrack.inference.sensitivity import PRESSURE
 
-GROWTH = Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
-BOTH = Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, math.inf))
-
-
+GROWTH = laws.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
 FAR = math.sqrt(5) / 0.4
 ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
 
 
-def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_first_value() -> None:
-    directions, variances = covariance_modes(12, 0.4)
+def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_first_value():
+    directions, variances = laws.covariance_modes(12, 0.4)
     covariance = (directions * variances) @ directions.T
     assert np.diag(covariance) == pytest.approx(np.ones(12))
     # First and last splines lie at the ends: one whole apart.
     assert covariance[0, -1] == pytest.approx(ALIKE)
-    directions, variances = covariance_modes(12, 0.4, zero_at_start=True)
+    directions, variances = laws.covariance_modes(12, 0.4, zero_at_start=True)
     covariance = (directions * variances) @ directions.T
     assert covariance[0] == pytest.approx(np.zeros(12), abs=1e-12)
     assert covariance[-1, -1] == pytest.approx(1 - ALIKE**2)
 
 
 @pytest.mark.parametrize("knots", [np.linspace(0, 1, 18), np.array([0, 0.01, 0.05, 0.3, 0.5, 1.0])])
-def test_splines_equal_those_of_scipy(knots: np.ndarray) -> None:
+def test_splines_equal_those_of_scipy(knots):
     at = np.concatenate([np.random.default_rng(6).uniform(-0.2, 1.2, 300), knots])
     ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
     expected = BSpline.design_matrix(np.clip(at, 0, 1), ends, 3).toarray()
-    assert splines(at, knots) == pytest.approx(expected, abs=1e-14)
+    assert inversion.splines(at, knots) == pytest.approx(expected, abs=1e-14)
 
 
 @pytest.mark.slow
-def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_explains_the_misfit(tmp_path: Path) -> None:
-    """Waves of decreasing length along the growth."""
+def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_explains_the_misfit(tmp_path):
     pairs = hidden_force(sheet((4,), replicates=2), 131, "waves", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     table = proposal.table
-    assert table is not None
     assert table.effect.name == "learned_growth"
     size = next(number for number in table.ratio.fit.numbers if number.key == "learned_growth.a")
     assert size.value == pytest.approx(1.0, abs=0.1)
@@ -100,117 +65,86 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
     grid = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
     y = grid["lead_position_m"].to_numpy(float)
     middle = (y > np.quantile(y, 0.05)) & (y < np.quantile(y, 0.95))
-    true_N = -0.3 * np.sin(2 * math.pi * (y / 0.12) ** 1.5)
     # A constant is taken over by the yield pressure.
-    off = grid["force_N"].to_numpy(float) - true_N
+    off = grid["force_N"].to_numpy(float) + 0.3 * np.sin(2 * math.pi * (y / 0.12) ** 1.5)
     assert np.mean(np.abs(off - np.median(off))[middle] < 0.06) > 0.8
 
 
-# Marginal likelihood and posterior of a smooth force, against closed forms of the normal distribution.
+def seen(design: Floats, positions: Floats) -> inversion.CoefficientLikelihood:
+    square = float(positions @ positions)
+    return inversion.CoefficientLikelihood(design.T @ design, design.T @ positions, square, 0.0, 0.0)
 
 
-def seen(design: Floats, positions: Floats) -> CoefficientLikelihood:
-    return CoefficientLikelihood(design.T @ design, design.T @ positions, float(positions @ positions), 0.0, 0.0)
-
-
-def test_marginal_likelihood_equals_that_of_the_normal_distribution() -> None:
+def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters():
+    """Each length scale and amplitude by the normal distribution of the positions, weighted by its density."""
     draw = np.random.default_rng(3)
-    design = uniform_splines(draw.uniform(0, 1, 60), 12)
+    design = inversion.uniform_splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
-    logs: dict[str, list[float]] = {ZERO_AT_START: [], CONSTANT_AT_START: []}
-    for length in LENGTH_SCALES:
-        directions, variances = covariance_modes(12, length, zero_at_start=True)
-        variances = np.where(variances > KEPT_VARIANCE * variances.max(), variances, 0.0)
-        process = (directions * variances) @ directions.T
-        for begins, covariance in ((ZERO_AT_START, process), (CONSTANT_AT_START, process + 1.0)):
-            unit = design @ covariance @ design.T
-            logs[begins] += [
-                multivariate_normal(cov=np.eye(60) + a**2 * unit).logpdf(positions) for a in 2 * RELATIVE_AMPLITUDES
-            ]
-    choice = marginal_likelihood(GROWTH, seen(design, positions), 1.0, 2.0)
-    normal = -30 * math.log(2 * math.pi)
+    choice = learned_force.marginal_likelihood(GROWTH, seen(design, positions), 1.0, 2.0)
+    assert {each.at_start for each in choice.posteriors} == {laws.ZERO_AT_START, laws.CONSTANT_AT_START}
+    evidences, normal = [], 30 * math.log(2 * math.pi)
     for posterior in choice.posteriors:
-        expected = logs[posterior.at_start]
-        assert posterior.log_evidence + normal == pytest.approx(float(np.log(np.mean(np.exp(expected)))), abs=1e-6)
-        assert posterior.length_scales == (LENGTH_SCALES[int(np.argmax(expected)) // RELATIVE_AMPLITUDES.size],)
-        assert np.all(np.linalg.eigvalsh(posterior.covariance) > -1e-12)
-    both = np.mean([np.mean(np.exp(each)) for each in logs.values()])
-    assert choice.log_evidence + normal == pytest.approx(float(np.log(both)), abs=1e-6)
+        logs, means, covariances = [], [], []
+        for length in laws.LENGTH_SCALES:
+            directions, variances = laws.covariance_modes(12, length, zero_at_start=True)
+            variances = np.where(variances > laws.KEPT_VARIANCE * variances.max(), variances, 0.0)
+            process = (directions * variances) @ directions.T + (posterior.at_start == laws.CONSTANT_AT_START)
+            for prior in process * (2 * laws.RELATIVE_AMPLITUDES[:, None, None]) ** 2:
+                predicted = np.eye(60) + design @ prior @ design.T
+                gain = prior @ np.linalg.solve(predicted, design).T
+                logs.append(multivariate_normal(cov=predicted).logpdf(positions))
+                means.append(gain @ positions)
+                covariances.append(prior - gain @ design @ prior)
+        evidences.append(np.mean(np.exp(logs)))
+        assert posterior.log_evidence == pytest.approx(np.log(evidences[-1]) + normal, abs=1e-6)
+        best = int(np.argmax(logs)) // laws.RELATIVE_AMPLITUDES.size
+        assert posterior.length_scales == (laws.LENGTH_SCALES[best],)
+        density = np.exp(np.array(logs) - max(logs))
+        weights = density * (density > math.exp(-learned_force.NEGLIGIBLE_LOG_RATIO))
+        weights /= weights.sum()
+        mean = weights @ means
+        spread = np.tensordot(weights, covariances, 1) + ((means - mean).T * weights) @ (means - mean)
+        assert posterior.mean == pytest.approx(mean, abs=1e-9)
+        assert posterior.covariance == pytest.approx(spread, abs=1e-9)
+    assert choice.log_evidence == pytest.approx(np.log(np.mean(evidences)) + normal, abs=1e-6)
 
 
-def test_one_variable_and_two_have_equal_prior_odds() -> None:
-    design = uniform_splines(np.linspace(0, 1, 60), 12)
-    choice = marginal_likelihood(GROWTH, seen(design, np.zeros(60)), 1.0, 2.0)
+def test_one_variable_and_two_have_equal_prior_odds():
+    design = inversion.uniform_splines(np.linspace(0, 1, 60), 12)
+    choice = learned_force.marginal_likelihood(GROWTH, seen(design, np.zeros(60)), 1.0, 2.0)
     single = replace(choice, log_evidence=0.0)
-    pairs = [
-        replace(single, domain=replace(BOTH, variables=names)) for names in (("growth", "speed"), ("growth", "time"))
-    ]
-    weights = variable_weights([single, *pairs], 1.0)
+    pairs = [replace(single, domain=replace(DOMAINS[1], variables=("growth", other))) for other in ("speed", "time")]
+    weights = learned_force.variable_weights([single, *pairs], 1.0)
     assert weights["growth"] == pytest.approx(0.5)
     assert weights["growth+speed"] == pytest.approx(0.25)
 
 
-def test_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters() -> None:
-    """Each length scale and amplitude by the closed form for a normal prior, weighted by its likelihood."""
-    draw = np.random.default_rng(11)
-    design = uniform_splines(draw.uniform(0, 1, 40), 12)
-    told = seen(design, design @ draw.standard_normal(12) + draw.standard_normal(40))
-    parts = []
-    for length in LENGTH_SCALES:
-        mix = GROWTH.prior_modes((length,), CONSTANT_AT_START)
-        for sd_N in 2 * RELATIVE_AMPLITUDES:
-            prior = np.eye(mix.shape[1]) / sd_N**2
-            covariance = mix @ np.linalg.inv(mix.T @ told.information @ mix + prior) @ mix.T
-            shrunk = np.linalg.slogdet(np.eye(mix.shape[1]) + sd_N**2 * mix.T @ told.information @ mix)[1]
-            parts.append((0.5 * float(told.score @ covariance @ told.score - shrunk), covariance))
-    logs = np.array([log for log, _ in parts])
-    weights = np.where(logs > logs.max() - NEGLIGIBLE_LOG_RATIO, np.exp(logs - logs.max()), 0.0)
-    weights /= weights.sum()
-    means = np.array([covariance @ told.score for _, covariance in parts])
-    mean = weights @ means
-    spread = np.tensordot(weights, np.array([covariance for _, covariance in parts]), 1)
-    spread += ((means - mean).T * weights) @ (means - mean)
-    posterior = next(
-        each for each in marginal_likelihood(GROWTH, told, 1.0, 2.0).posteriors if each.at_start == CONSTANT_AT_START
-    )
-    assert posterior.mean == pytest.approx(mean, abs=1e-9)
-    assert posterior.covariance == pytest.approx(spread, abs=1e-9)
-
-
-# The compiled variational equations against the same method in arrays, and against a closed form.
-
-
-def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium() -> None:
+def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     """ẍ = 1 − ω²x from rest: x = (1 − cos ωt)/ω²."""
     omega, time_s = 20.0, np.linspace(0, 0.3, 401)[None]
-    moved, sped = integrate_responses(
-        time_s, np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1)), SDIRK_GAMMA
-    )
+    pushed = np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1))
+    moved, sped = inversion.integrate_responses(time_s, *pushed, inversion.SDIRK_GAMMA)
     assert moved[0, :, 0] == pytest.approx((1 - np.cos(omega * time_s[0])) / omega**2, abs=1e-4 / omega**2)
     assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
 
 
-# Nonlinear fit of a force: its score against finite differences, and motions beyond the end of growth of the model.
-
-
-def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path: Path) -> None:
+def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
     tracks = slowed.tracks
-    domain = next(each for each in candidate_domains(tracks.motions) if each.variables == ("growth", "pressure"))
-    growth, pressure = (uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
+    domain = next(each for each in laws.candidate_domains(tracks.motions) if each.variables == ("growth", "pressure"))
+    growth, pressure = (inversion.uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
     force = -0.5 * np.outer(*steep).ravel()
-    settled = replace(
-        tracks, force=SmoothForce(domain, np.eye(domain.size)), amplitude=force, motions_include_force=True
-    )
+    surface = laws.SmoothForce(domain, np.eye(domain.size))
 
-    def at(point: ForcePoint, times: int) -> ForcePoint:
+    def at(point: inversion.ForcePoint, times: int) -> inversion.ForcePoint:
         for _ in range(times):
-            point = _with_updated_motions(slowed.fit, point)
+            point = inversion._with_updated_motions(slowed.fit, point)
         return point
 
-    settled = at(settled, 12)  # where a point far off the tracks is settled depends on where it begins
+    # Where a point far off the tracks is settled depends on where it begins.
+    settled = at(replace(tracks, force=surface, amplitude=force, motions_include_force=True), 12)
     slope = slowed.linearised(settled).grams[0, PRESSURE, -1]
     costs = []
     for step in (-1e-4, 1e-4):
@@ -220,15 +154,12 @@ def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pres
     assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.005)
 
 
-# Forces outside the catalogue, hidden by effect files of a user: their curves, and the simple laws identified.
-
-
 def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
     pairs = hidden_force(sheet((4,)), seed, name, size_N, folder)
     return missing_force(vt.fit(vt.base_model(), pairs, profile=False), learn=False)
 
 
-def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_condition(tmp_path: Path) -> None:
+def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_condition(tmp_path):
     patch = laws_of(tmp_path, "patch", -0.4, 91)
     best = patch.laws.iloc[0]
     assert best["law"] == "patch"
@@ -246,7 +177,7 @@ def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_conditio
 
 
 @pytest.mark.slow
-def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> None:
+def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path):
     best = laws_of(tmp_path, "ripple", -0.5, 92).laws.iloc[0]
     assert best["law"] == "periodic"
     assert float(best["words"].split("every ")[1].split(" mm")[0]) == pytest.approx(60, abs=1)
@@ -254,75 +185,64 @@ def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_friction_that_falls_with_speed_is_identified(tmp_path: Path) -> None:
+def test_a_friction_that_falls_with_speed_is_identified(tmp_path):
     found = laws_of(tmp_path, "stribeck", -1.5, 93)
     assert found.laws["law"].iloc[0] in ("falling_with_speed", "inverse_speed")
     assert found.laws["amplitude_N"].iloc[0] < 0
     assert found.depends_on["speed"] > 0.9
 
 
-def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path: Path) -> None:
+def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
     """With a much tighter integrator tolerance than usual, because a narrow force lies between its usual steps."""
     model = vt.base_model() + vt.effects.reservoir_depletion
     virtual = grown(sheet(payloads_g=(0.0, 20.0), replicates=1), 98, ["reservoir_depletion"])
     found = vt.fit(model, pairs_of(virtual), profile=False)
     own = align_trials(found).trial_effects
-    motions = motions_of(found, own)
+    motions = inversion.motions_of(found, own)
     shapes = {
         "bump": lambda m: np.exp(-0.5 * ((m.lead_position_m - 0.08) / 0.01) ** 2),
         "slow": lambda m: 1 / (0.3 + m.tail_velocity_m_s),
     }
     pushes = [np.column_stack([f(m) for f in shapes.values()]) / m.mass_kg[:, None] for m in motions]
-    answers = acceleration_sensitivities(found, own, motions, pushes)
+    answers = inversion.acceleration_sensitivities(found, own, motions, pushes)
     jobs = found.predictor.jobs(found.solution.state.theta, own)
     times = [item.time_s - job.release_s for item, job in zip(found.predictor.data, jobs, strict=True)]
-    with_force = model + own_effects([effect_file(tmp_path)])["hidden"]
+    with_force, trials = model + own_effects([effect_file(tmp_path)])["hidden"], [motion.trial for motion in motions]
     for k, name in enumerate(shapes):
-        kind = float(list(FORCES).index(name))
-        moved = [
-            simulate_many(
-                with_force,
-                [motion.trial for motion in motions],
-                times,
-                parameters=np.array([[*job.row, step, kind] for job in jobs]),
-                relative_tolerance=1e-7,
-            )
-            for step in (1e-3, -1e-3)
-        ]
-        for i, answer in enumerate(answers):
-            exact = (moved[0][i].observed_position_m - moved[1][i].observed_position_m) / 2e-3
+        moved = []
+        for step in (1e-3, -1e-3):
+            rows = np.array([[*job.row, step, float(list(FORCES).index(name))] for job in jobs])
+            moved.append(simulate_many(with_force, trials, times, parameters=rows, relative_tolerance=1e-7))
+        for answer, more, less in zip(answers, *moved, strict=True):
+            exact = (more.observed_position_m - less.observed_position_m) / 2e-3
             assert np.max(np.abs(answer[:, k] - exact)) < 2e-3 * np.max(np.abs(exact))
 
 
-# A learned force as a table in an effect file, and the variables that it may depend on.
-
 DOMAINS = [
-    Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
-    Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
-    Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
+    laws.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
+    laws.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
+    laws.Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
 ]
 
 
-def learned(domain: Domain, seed: int) -> LearnedForce:
+def learned(domain: laws.Domain, seed: int) -> learned_force.LearnedForce:
     coefficients = np.random.default_rng(seed).standard_normal(domain.size)
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4}
     table = pd.DataFrame([where | {"force_N": -0.1, "sigma_N": 0.01, "trials": 2, "condition": ""}])
-    surface, lengths = SmoothForce(domain, np.eye(domain.size)), (1.0,) * len(domain.variables)
-    best = ForcePosterior(ZERO_AT_START, 50.0, surface, lengths, coefficients, np.eye(domain.size) * 1e-4, 1.0)
-    return LearnedForce(best, (), {domain.name: 1.0}, (), 50.0, 0.99, table, "It depends.")
+    surface, lengths = laws.SmoothForce(domain, np.eye(domain.size)), (1.0,) * len(domain.variables)
+    known = coefficients, np.eye(domain.size) * 1e-4, 1.0
+    best = learned_force.ForcePosterior(laws.ZERO_AT_START, 50.0, surface, lengths, *known)
+    return learned_force.LearnedForce(best, (), {domain.name: 1.0}, (), 50.0, 0.99, table, "It depends.")
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)
-def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(domain: Domain, tmp_path: Path) -> None:
+def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(domain, tmp_path):
     force = learned(domain, 4)
     path = tmp_path / f"{table_name(force)}.py"
     path.write_text(table_text(force, "From 24 trials of a bench."), encoding="utf-8")
     effect = own_effects([path])[path.stem]
-    draw = np.random.default_rng(5)
-    at = [
-        draw.uniform(low - 0.1 * (high - low), high * 1.2, 40)
-        for low, high in zip(domain.low, domain.high, strict=True)
-    ]
+    draw, ends = np.random.default_rng(5), zip(domain.low, domain.high, strict=True)
+    at = [draw.uniform(low - 0.1 * (high - low), high * 1.2, 40) for low, high in ends]
     names = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
     state = SimpleNamespace(**{names[name]: value for name, value in zip(domain.variables, at, strict=True)})
     expected = domain.basis(at) @ force.best.mean
@@ -331,45 +251,43 @@ def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(dom
     assert effect.functions["tail_force"](state, None, 0.0) == pytest.approx(0.0 * expected)
 
 
-# Laws of force outside the catalogue, as effects: their files reproduce the laws, and the right one is proposed.
-
 LAWS = [
-    Law("constant"),
-    Law("position", peak=0.5),
-    Law("speed", peak=9.0, reference_area_m2=3e-4),
-    Law("speed_squared", peak=81.0),
-    Law("pressure", peak=3e4),
-    Law("time", peak=0.3),
-    Law("inverse_speed", scale=2.5, peak=1.7),
-    Law("falling_with_speed", n_shapes=1, scale=1.5),
-    Law("fading_in_time", n_shapes=1, scale=0.04),
-    Law("fading_along", n_shapes=1, scale=0.07),
-    Law("patch", n_shapes=2, low=0.08, high=0.11),
-    Law("position_squared", peak=0.25),
-    Law("beyond_a_place", n_shapes=1, scale=0.06, peak=0.1),
-    Law("speed_cubed", peak=729.0),
-    Law("beyond_a_speed", n_shapes=1, scale=1.2, peak=7.8),
-    Law("squared_beyond_a_speed", n_shapes=1, scale=1.2, peak=61.0),
-    Law("position", factor="speed", peak=4.0),
-    Law("patch", n_shapes=2, low=0.08, high=0.11, factor="pressure", peak=3e4),
-    Law("falling_with_speed", n_shapes=1, scale=1.5, factor="position"),
-    Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
-    Law("periodic", n_amplitudes=2, n_shapes=1, scale=0.03),
+    laws.Law("constant"),
+    laws.Law("position", peak=0.5),
+    laws.Law("speed", peak=9.0, reference_area_m2=3e-4),
+    laws.Law("speed_squared", peak=81.0),
+    laws.Law("pressure", peak=3e4),
+    laws.Law("time", peak=0.3),
+    laws.Law("inverse_speed", scale=2.5, peak=1.7),
+    laws.Law("falling_with_speed", n_shapes=1, scale=1.5),
+    laws.Law("fading_in_time", n_shapes=1, scale=0.04),
+    laws.Law("fading_along", n_shapes=1, scale=0.07),
+    laws.Law("patch", n_shapes=2, low=0.08, high=0.11),
+    laws.Law("position_squared", peak=0.25),
+    laws.Law("beyond_a_place", n_shapes=1, scale=0.06, peak=0.1),
+    laws.Law("speed_cubed", peak=729.0),
+    laws.Law("beyond_a_speed", n_shapes=1, scale=1.2, peak=7.8),
+    laws.Law("squared_beyond_a_speed", n_shapes=1, scale=1.2, peak=61.0),
+    laws.Law("position", factor="speed", peak=4.0),
+    laws.Law("patch", n_shapes=2, low=0.08, high=0.11, factor="pressure", peak=3e4),
+    laws.Law("falling_with_speed", n_shapes=1, scale=1.5, factor="position"),
+    laws.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
+    laws.Law("periodic", n_amplitudes=2, n_shapes=1, scale=0.03),
 ]
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
-def test_the_effect_file_of_a_law_reproduces_the_law(law: Law, tmp_path: Path) -> None:
+def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
     path = tmp_path / f"proposed_{law.name}.py"
-    seen = RankedLaw(law, ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1), 0.0)
-    path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
+    estimate = inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1)
+    path.write_text(effect_text(RankedLaw(law, estimate, 0.0), "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]
     assert effect.worked[0].expected != 0
 
 
 @pytest.mark.slow
-def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path: Path) -> None:
+def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path):
     pairs = hidden_force(sheet((4,)), 101, "growing", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     best = proposal.tied[0]
@@ -380,7 +298,7 @@ def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditio
 
 
 @pytest.mark.slow
-def test_nothing_is_proposed_where_nothing_is_missing() -> None:
+def test_nothing_is_proposed_where_nothing_is_missing():
     proposal = propose(vt.base_model(), pairs_of(grown(sheet((4,)), 102)), lambda _: None)
     assert not proposal.tied
     assert np.isfinite(proposal.rms_left_out_m)

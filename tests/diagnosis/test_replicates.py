@@ -1,33 +1,39 @@
-"""Replicates laid over each other, and the model against the measurement: errors worked out by hand."""
+"""Replicates laid over each other, the model against the measurement, and rows that belong to other recordings."""
 
-from __future__ import annotations
-
+import math
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, filmed, grown_position, small_campaign, vine_trial
+from lsoda_vine import B_TRUE, as_track, filmed, grown_position, small_campaign, vine_trial
 
 import vinetrack as vt
-from vinetrack.core.records import Floats, Trial
+from vinetrack.core.problems import remark
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.ladder import compare, position_errors, trajectory_table
-from vinetrack.diagnosis.replicates import align_replicates, replicates_of
-from vinetrack.inference.fit_data import ImpreciseRest
+from vinetrack.diagnosis.replicates import OddTrial, align_replicates, odd_trials, replicates_of, with_odd_trials
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.inference.fit_data import ImpreciseRest, prepare
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
 
 
 def trial_fit(
-    name: str, time_s: Floats, position_m: Floats, model_m: Floats, speed_m_s: Floats, release_s: float, origin_m: float
+    name: str, time_s: Floats, position_m: Floats, speed_m_s: float, release_s: float, origin_m: float
 ) -> TrialFit:
+    since_s = np.maximum(time_s - release_s, 0.0)
+    model_m = origin_m + speed_m_s * since_s
     off_m = position_m - model_m
     nothing = ("release_sigma_s", "origin_sigma_m", "pressure_deviation", "pressure_deviation_sigma",
                "damping_deviation", "damping_deviation_sigma")  # fmt: skip
     return TrialFit(
         trial=Trial(name=name, vine="v", condition="c"), time_s=time_s, lead_position_m=position_m,
-        predicted_position_m=model_m, predicted_velocity_m_s=speed_m_s, residual_m=off_m, whitened=off_m,
-        release_s=release_s, origin_m=origin_m, noise_m=1e-5, **dict.fromkeys(nothing, 0.0),
+        predicted_position_m=model_m, predicted_velocity_m_s=speed_m_s * (since_s > 1e-9), residual_m=off_m,
+        whitened=off_m, release_s=release_s, origin_m=origin_m, noise_m=1e-5, **dict.fromkeys(nothing, 0.0),
     )  # fmt: skip
 
 
@@ -39,29 +45,18 @@ def grown(
     since_s = np.maximum(time_s - clock_s - 0.0004, 0.0)
     noise = noise_m * np.random.default_rng(20000 + len(name)).standard_normal(time_s.size)
     position_m = 2.0 * speed * (since_s - 0.02 * (1 - np.exp(-since_s / 0.02))) + origin_m + noise
-    model_m = origin_m + 1.9 * np.maximum(time_s - clock_s, 0.0)
-    speed_m_s = np.where(time_s > clock_s, 1.9, 0.0)
-    return trial_fit(name, time_s, position_m, model_m, speed_m_s, clock_s, origin_m)
-
-
-def another_model(trial: TrialFit) -> TrialFit:
-    """The same measurement, put by another model 7 ms and 5 mm elsewhere and predicted to grow half as fast."""
-    model_m = trial.origin_m + 5e-3 + 0.9 * np.maximum(trial.time_s - trial.release_s - 7e-3, 0.0)
-    return replace(
-        trial,
-        predicted_position_m=model_m,
-        residual_m=trial.lead_position_m - model_m,
-        release_s=trial.release_s + 7e-3,
-        origin_m=trial.origin_m + 5e-3,
-    )
+    return trial_fit(name, time_s, position_m, 1.9, clock_s, origin_m)
 
 
 @pytest.mark.parametrize("rest", [30, 0])
 def test_the_floor_is_the_same_for_every_model(rest):
-    draw = np.random.default_rng(20000)
-    speeds = 1 + 0.02 * draw.standard_normal(4)
+    """Also for one that puts trials 7 ms and 5 mm elsewhere and predicts them to grow half as fast."""
+    speeds = 1 + 0.02 * np.random.default_rng(20000).standard_normal(4)
     trials = [grown("t" * (i + 1), speed=speed, noise_m=5e-5, rest=rest) for i, speed in enumerate(speeds)]
-    others = [another_model(trial) if i % 2 else trial for i, trial in enumerate(trials)]
+    others = list(trials)
+    for i in (1, 3):
+        seen = trials[i].name, trials[i].time_s, trials[i].lead_position_m
+        others[i] = trial_fit(*seen, 0.9, trials[i].release_s + 7e-3, trials[i].origin_m + 5e-3)
     one, other = (position_errors(each, replicates_of(each)) for each in (trials, others))
     assert one["replicate_floor_m"] == other["replicate_floor_m"] > 0
     assert one["replicate_floor_sigma_m"] == other["replicate_floor_sigma_m"]
@@ -69,18 +64,14 @@ def test_the_floor_is_the_same_for_every_model(rest):
 
 
 @pytest.mark.parametrize("rest", [30, 0])
-def test_equal_motions_with_clocks_and_origins_of_their_own_differ_by_nothing(rest):
+def test_equal_motions_with_clocks_and_origins_of_their_own_differ_by_nothing_nor_one_that_begins_in_motion(rest):
     trials = [grown("a", rest=rest), grown("b", rest=rest, clock_s=0.31234, origin_m=0.1)]
     # What is left is the curvature within half a frame beside the smoothed reference.
     assert align_replicates(trials).floor_m < 2e-5
-
-
-def test_a_track_that_begins_in_motion_is_laid_on_one_that_shows_its_rest():
-    one, whole = grown("a"), grown("b", clock_s=0.2)
+    whole = grown("b", clock_s=0.2)
     kept = whole.time_s > 0.2 + 0.015
-    arrays = ("time_s", "lead_position_m", "predicted_position_m", "residual_m")
-    late = replace(whole, **{name: getattr(whole, name)[kept] for name in arrays})
-    aligned = align_replicates([one, late])
+    late = trial_fit("b", whole.time_s[kept], whole.lead_position_m[kept], 1.9, whole.release_s, whole.origin_m)
+    aligned = align_replicates([grown("a"), late])
     assert aligned.floor_m < 2e-5
     assert aligned.release_s[1] - aligned.release_s[0] == pytest.approx(0.2, abs=5e-4)
 
@@ -90,85 +81,67 @@ def test_motions_of_different_speed_are_not_slid_to_where_they_agree(vague):
     # Two motions 14 % apart in speed over 0.26 m: with the release at its best they are off by 0.14 · 0.26 m / √24 =
     # 7 mm, less what the bend at the start makes up for. Without a rest the origin is free too: the little that they
     # bend is then all that is left, but it is no tenth of a millimetre.
-    trials = [grown("slow", speed=0.93, rest=0), grown("fast", speed=1.07, rest=0)]
-    if vague:
-        trials = [
-            replace(trial, imprecise_rest=ImpreciseRest(release_s=0.0, origin_m=0.0, sigma_m=3e-4)) for trial in trials
-        ]
-    aligned = align_replicates(trials)
+    rest = ImpreciseRest(release_s=0.0, origin_m=0.0, sigma_m=3e-4) if vague else None
+    trials = [grown(name, speed=speed, rest=0) for name, speed in (("slow", 0.93), ("fast", 1.07))]
+    aligned = align_replicates([replace(trial, imprecise_rest=rest) for trial in trials])
     both = aligned.present > 1
     assert np.count_nonzero(both) > 0.79 * 151
     assert aligned.floor_m > (5e-3 if vague else 1e-3)
 
 
 def test_its_error_is_that_of_a_standard_deviation_known_from_so_many_replicates():
-    draw = np.random.default_rng(20001)
-    aligned = [
-        align_replicates([grown(f"t{i}", speed=1 + 0.02 * draw.standard_normal()) for i in range(3)]) for _ in range(60)
-    ]
+    speeds = 1 + 0.02 * np.random.default_rng(20001).standard_normal((60, 3))
+    aligned = [align_replicates([grown(f"t{i}", speed=v) for i, v in enumerate(three)]) for three in speeds]
     floors_m = np.array([one.floor_m for one in aligned])
     # σ/√(2ν) with ν = 2 is half of σ; the scatter of a standard deviation of ν = 2 is 0.52 of its mean.
     assert floors_m.std() / floors_m.mean() == pytest.approx(0.52, abs=0.12)
     np.testing.assert_allclose([one.floor_sigma_m for one in aligned], floors_m / 2)
 
 
-# Model against measurement: errors worked out by hand, a floor of known scatter, and vines grown by scipy.
-
 SPEED_M_S = 2.0
 
 
-def by_hand(
-    name: str, misfit_m: np.ndarray | float = 0.0, rest: int = 20, release_s: float = 0.0, end_s: float = 0.1
-) -> TrialFit:
+def by_hand(name: str, misfit_m: np.ndarray | float, rest: int = 20, end_s: float = 0.1) -> TrialFit:
     """A trial that rests and then runs at 2 m/s in the model; its measurement is off by `misfit_m` once it moves."""
-    time_s = release_s + STEP_S * np.arange(-rest, round(end_s / STEP_S) + 1)
-    since_s = time_s - release_s
-    model_m = 0.3 + SPEED_M_S * np.maximum(since_s, 0)
-    residual_m = np.zeros(time_s.size)
-    residual_m[since_s > 1e-9] += misfit_m
-    speed_m_s = np.where(since_s > 0, SPEED_M_S, 0.0)
-    return trial_fit(name, time_s, model_m + residual_m, model_m, speed_m_s, release_s, 0.3)
+    time_s = STEP_S * np.arange(-rest, round(end_s / STEP_S) + 1)
+    position_m = 0.3 + SPEED_M_S * np.maximum(time_s, 0.0)
+    position_m[rest + 1 :] += misfit_m
+    return trial_fit(name, time_s, position_m, SPEED_M_S, 0.0, 0.3)
 
 
 def errors_of(*trials: TrialFit) -> dict[str, float]:
     return position_errors(trials, replicates_of(trials))
 
 
-def test_the_error_of_position_is_that_of_the_growth_and_trials_count_alike() -> None:
+def test_the_error_of_position_is_that_of_the_growth_trials_count_alike_and_one_alone_has_no_floor():
     # 100 moving frames off by 3 mm, and the frame of the release itself: √(100/101) · 3 mm.
     for rest in (10, 500):
         assert errors_of(by_hand("a", 3e-3, rest=rest))["rms_position_m"] == pytest.approx(3e-3 * np.sqrt(100 / 101))
     error = errors_of(by_hand("a", 1e-3, end_s=0.4), by_hand("b", 3e-3, end_s=0.04))["rms_position_m"]
     assert error == pytest.approx(np.sqrt((1e-6 * 400 / 401 + 9e-6 * 40 / 41) / 2))
-
-
-def test_one_trial_has_no_floor() -> None:
     assert np.isnan([errors_of(by_hand("a", 1e-3))[name] for name in ("replicate_floor_m", "ratio")]).all()
 
 
 @pytest.mark.parametrize("n_trials", [2, 3, 5])
-def test_the_floor_is_the_scatter_of_single_trials_for_any_number_of_them(n_trials: int) -> None:
-    draw = np.random.default_rng(11)
-    floors = [
-        errors_of(*(by_hand(f"t{i}", 1e-3 * draw.standard_normal(400), end_s=0.4) for i in range(n_trials)))
-        for _ in range(20)
-    ]
+def test_the_floor_is_the_scatter_of_single_trials_for_any_number_of_them(n_trials):
+    squares, draw = [], np.random.default_rng(11)
+    for _ in range(20):
+        trials = [by_hand(f"t{i}", 1e-3 * draw.standard_normal(400), end_s=0.4) for i in range(n_trials)]
+        squares.append(errors_of(*trials)["replicate_floor_m"] ** 2)
     # One of 400 degrees of freedom goes into each trial's release; 20 × 400 × (N − 1) draws leave 0.8 % or less.
-    found_m = np.sqrt(np.mean([floor["replicate_floor_m"] ** 2 for floor in floors]))
-    assert found_m == pytest.approx(1e-3, rel=0.025)
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1e-3, rel=0.025)
 
 
-def test_the_band_is_that_of_the_replicates() -> None:
+def test_the_band_is_that_of_the_replicates():
     trials = [by_hand("a", np.full(100, 1e-3)), by_hand("b", np.full(100, -1e-3))]
     table = trajectory_table(trials, replicates_of(trials))
     last = table[table["trial"] == "a"].iloc[-1]
-    assert last["model_position_m"] == pytest.approx(SPEED_M_S * 0.1)
-    assert last["replicates_mean_m"] == pytest.approx(SPEED_M_S * 0.1)
-    assert last["lead_position_m"] == pytest.approx(SPEED_M_S * 0.1 + 1e-3)
+    columns = ["model_position_m", "replicates_mean_m", "lead_position_m"]
+    assert last[columns].tolist() == pytest.approx([SPEED_M_S * 0.1, SPEED_M_S * 0.1, SPEED_M_S * 0.1 + 1e-3])
 
 
 @pytest.mark.slow
-def test_a_model_that_lacks_nothing_stands_at_the_floor() -> None:
+def test_a_model_that_lacks_nothing_stands_at_the_floor():
     """Two vines, four pressures, four replicates that scatter; the model is the one they were grown with."""
     pairs, _ = small_campaign(seed=11, replicates=4)
     true_model = vt.compare(vt.fit(vt.base_model(), pairs, profile=False))
@@ -182,20 +155,131 @@ def test_a_model_that_lacks_nothing_stands_at_the_floor() -> None:
     assert {(trial.pressure_deviation, trial.damping_deviation) for trial in true_model.trials} == {(0.0, 0.0)}
 
 
-def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model() -> None:
-    draw = np.random.default_rng(12)
-    trial = replace(vine_trial("a", 28.0, payload_kg=0.0356), vine="v", condition="c")
-    track, *_ = filmed(trial, draw)
+def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model():
+    trial = vine_trial("a", 28.0, payload_kg=0.0356, vine="v", condition="c")
+    track, *_ = filmed(trial, np.random.default_rng(12))
     found = vt.fit(vt.base_model().with_values({"eversion_damping.n": 0.4}), [(trial, track)], fixed=["n"])
     slow = replace(found, model=found.model.with_values({"eversion_damping.B": 12.0}))
 
     def final_m_s(B: float) -> float:
         time_s = np.linspace(0, 2, 200_001)
-        y = grown_position(trial, time_s, B)
-        place = int(
-            np.argmax(y >= 0.95 * min(trial.length_m, float(track.lead_position_m.max() - track.lead_position_m[0])))
-        )
+        y, reached_m = grown_position(trial, time_s, B), track.lead_position_m.max() - track.lead_position_m[0]
+        place = int(np.argmax(y >= 0.95 * min(trial.length_m, reached_m)))
         return float((y[place] - y[place - 1]) / (time_s[1] - time_s[0]))
 
     error = compare(slow, [(trial, track)]).table["rms_final_velocity_m_s"].iloc[0]
     assert error == pytest.approx(final_m_s(B_TRUE[24.0]) - final_m_s(12.0), rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    pairs, time = [], np.arange(0, 0.3, 0.001)
+    for k, kPa in enumerate((18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)):
+        more = {"vine": "12mm", "condition": f"12mm_{kPa}", "length_m": 0.3, "growth_angle_rad": np.pi / 2}
+        trial, draw = vine_trial(f"t{k}", kPa, 12.0, **more), np.random.default_rng(20000 + k)
+        position = grown_position(trial, time - 0.02, 1.83 * np.exp(0.02 * draw.normal()), 0.37)
+        seen = np.isfinite(position)
+        pairs.append((trial, as_track(time[seen], position[seen] + draw.normal(0, 1e-4, np.count_nonzero(seen)))))
+    return pairs
+
+
+def stated(pairs: list[tuple[Trial, Track]], **kPa: float) -> list[tuple[Trial, Track]]:
+    told = {name: {"pressure_Pa": 1e3 * value, "condition": f"12mm_{value}"} for name, value in kPa.items()}
+    return [(replace(trial, **told.get(trial.name, {})), track) for trial, track in pairs]
+
+
+def odd(pairs: list[tuple[Trial, Track]]) -> dict[str, float]:
+    return {trial.name: trial.implied_pressure_Pa for trial in odd_trials(prepare(pairs)[0])}
+
+
+@pytest.mark.parametrize(
+    ("trials", "told_kPa", "true_kPa"),
+    [
+        (12, {}, {}),
+        (12, {"t2": 12}, {"t2": 21}),
+        (12, {"t0": 40, "t11": 18}, {"t0": 18, "t11": 40}),
+        (12, {"t5": 2}, {"t5": 25}),
+        (12, {"t2": 12, "t3": 12}, {}),
+        (12, {"t2": 22.5}, {}),
+        (7, {"t2": 12}, {}),
+        (12, {"t0": 12, "t4": 10, "t6": 13, "t9": 15}, {}),
+    ],
+    ids=["all agree", "swapped digits", "exchanged rows", "could not move", "all replicates", "a tenth", "few", "many"],
+)
+def test_rows_of_other_recordings_are_named_with_the_pressure_that_was(campaign, trials, told_kPa, true_kPa):
+    """What all replicates share is no slip, a tenth is what trials differ by, few trials say nothing."""
+    expected = {name: pytest.approx(1e3 * value, rel=0.05) for name, value in true_kPa.items()}
+    assert odd(stated(campaign[:trials], **told_kPa)) == expected
+
+
+@pytest.mark.slow
+def test_a_diagnosis_without_a_cause_names_the_row(campaign):
+    result = diagnose(stated(campaign, t2=12), candidates=["tail_friction"], ladder=False, advice=False)
+    assert result.verdict == "unexplained"
+    assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
+
+
+@pytest.fixture(scope="module")
+def adequate(campaign):
+    return diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
+
+
+@pytest.mark.slow
+def test_an_odd_trial_of_an_adequate_campaign_is_a_note(adequate):
+    assert adequate.verdict == "adequate"
+    odd_ones = [OddTrial("t2", 12e3, 21e3), OddTrial("t5", 2e3, math.nan)]
+    outcome = with_odd_trials(adequate, odd_ones, lambda _: pytest.fail("there is nothing to ask"))
+    assert outcome.verdict == "adequate"
+    assert outcome.notes[-1] == remark("odd_trials", odd=odd_ones, count=12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("others_say", ["tail_friction", "air_drag", "nothing"])
+def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they_do_not(adequate, others_say):
+    ranking = [replace(row, in_answer_set=True) for row in adequate.rounds[0].ranking if row.effect == "tail_friction"]
+    last = replace(adequate.rounds[-1], verdict="missing", answer_set=("tail_friction",), ranking=tuple(ranking))
+    named = replace(adequate, rounds=(last,), effects=("tail_friction",), explanation="A friction is missing.")
+    others = {"tail_friction": named, "nothing": adequate}
+    others["air_drag"] = replace(named, rounds=(replace(last, answer_set=("air_drag",)),))
+    outcome = with_odd_trials(named, [OddTrial("t2", 12e3, 21e3)], lambda _: others[others_say])
+    said = (outcome.verdict, outcome.answer_set, outcome.effects)
+    if others_say == "tail_friction":
+        assert said == ("missing", ("tail_friction",), ("tail_friction",))
+        assert outcome.notes[-1].code == "odd_trials"
+        return
+    assert said == ("unexplained", (), ())
+    assert not any(candidate.in_answer_set for candidate in outcome.rounds[0].ranking)
+
+
+def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(adequate):
+    unexplained = replace(adequate, rounds=(replace(adequate.rounds[-1], verdict="unexplained"),))
+    without = Mock(side_effect=vt.FitError("there is nothing to fit"))
+    outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], without)
+    assert outcome.notes[-1].code == "odd_trials"
+
+
+def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(campaign):
+    data = []
+    for one in prepare(campaign)[0]:
+        pressure_Pa = 12e3 if one.trial.name == "t2" else one.trial.pressure_Pa
+        data.append(replace(one, trace=(one.time_s, np.full(one.time_s.size, pressure_Pa))))
+    (slip,) = odd_trials(data)
+    assert (slip.name, slip.stated_Pa) == ("t2", 12e3)
+    assert slip.implied_pressure_Pa == pytest.approx(21e3, rel=0.05)
+
+
+def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
+    """Normal scatter of 24 trials of six vines; the curves take a third of the degrees of freedom."""
+    given = {"middle_speed": lambda data: data.speed, "_force_N": lambda trial, _: trial.force_N}
+    given |= {"_stated_Pa": lambda _: math.nan, "_implied_pressure_Pa": lambda *_: math.nan, "CHANCE": 1e-2}
+    for name, value in given.items():
+        monkeypatch.setattr(f"vinetrack.diagnosis.replicates.{name}", value)
+    draw, campaigns_with_odd = np.random.default_rng(20050), 0
+    for _ in range(150):
+        log_speed = draw.uniform(0, 1.5, 24)
+        force_N = np.exp(0.37 * log_speed + 0.05 * draw.standard_normal(24))
+        named = [{"name": str(k), "vine": str(k % 6), "condition": str(k)} for k in range(24)]
+        trials = [SimpleNamespace(travel_ratio=2, force_N=force_N[k], **names) for k, names in enumerate(named)]
+        data = [SimpleNamespace(speed=math.exp(log_speed[k]), trial=trial) for k, trial in enumerate(trials)]
+        campaigns_with_odd += bool(odd_trials(data))
+    assert campaigns_with_odd <= 6

@@ -1,9 +1,8 @@
-"""A user's own effect: read, tried out, named before it runs, listed, simulated; and every way to be none."""
-
-from __future__ import annotations
+"""The contract of an effect's file, in the catalogue or a user's own: read, tried out, listed, simulated, refused."""
 
 import hashlib
 import importlib
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -11,15 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from by_hand import LOADED, followed
-from click.testing import Result
-from typer.testing import CliRunner
+from commanded import run
 
-from vinetrack.cli.main import app
+import vinetrack as vt
+import vinetrack.effects as effects
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import base_model, make_model
-from vinetrack.dynamics.simulate import simulate
-from vinetrack.effects import Effect, EffectError, air_drag, catalogue, load_effect
-from vinetrack.effects._catalogue import _is_independent_of_path, behaviour_faults, own_effects
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, State, air_drag, catalogue, find_effect, load_effect
+from vinetrack.effects._catalogue import _RIG, _STATE, _is_independent_of_path, behaviour_faults, own_effects
 
 BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
 
@@ -49,25 +46,24 @@ def written(folder: Path, text: str = BRUSH, name: str = "brush.py") -> Path:
     return path
 
 
-def test_it_is_simulated_like_any_other(tmp_path: Path) -> None:
+def test_it_is_simulated_like_any_other(tmp_path):
     brush = own_effects([written(tmp_path)])
-    model = make_model([*base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
+    model = vt.make_model([*vt.base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
     travel = followed(lambda _t, x, v: (LOADED.base(x, v) - 0.8 * max(x, 0.0) ** 0.5) / LOADED.m(x), 1.8 * LOADED.L)
     times = np.linspace(0, travel.end, 41)  # type: ignore[attr-defined]
-    got = simulate(model, LOADED.trial(), times).lead_position_m
+    got = vt.simulate(model, LOADED.trial(), times).lead_position_m
     np.testing.assert_allclose(got, travel(times) / 2, rtol=0, atol=1e-5 * LOADED.L)
 
 
 def copies(folder: Path, text: str) -> list[Effect]:
-    """The effect of this text at two places."""
     for name in "ab":
         (folder / name).mkdir()
     return [own_effects([written(folder / name, text)])["brush"] for name in "ab"]
 
 
-def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(tmp_path: Path) -> None:
+def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(tmp_path):
     one, other = copies(tmp_path, BRUSH)
-    assert kernel((base_model() + one).effects) is kernel((base_model() + other).effects)
+    assert kernel((vt.base_model() + one).effects) is kernel((vt.base_model() + other).effects)
     for effect, name in ((one, "a"), (other, "b")):
         assert effect.path == tmp_path / name / "brush.py"
         assert effect.functions["tail_force"].__code__.co_filename == str(effect.path)
@@ -76,16 +72,16 @@ def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(
 @pytest.mark.parametrize(
     "line", ["from pathlib import Path", "import brushes", "from .brushes import q", "PLACE = __file__"]
 )
-def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path: Path, line: str) -> None:
+def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path, line):
     """A table or a module beside a file may be another beside its copy."""
     assert _is_independent_of_path(BRUSH.encode())
     assert not _is_independent_of_path(f"{BRUSH}\n{line}\n".encode())
     if "brushes" not in line:
         one, other = copies(tmp_path, f"{BRUSH}\n{line}\n")
-        assert kernel((base_model() + one).effects) is not kernel((base_model() + other).effects)
+        assert kernel((vt.base_model() + one).effects) is not kernel((vt.base_model() + other).effects)
 
 
-def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path, monkeypatch):
     """The numbers of a module are constants of the compiled form: an old form would go on with the old ones."""
     monkeypatch.syspath_prepend(tmp_path)
     grips, table = tmp_path / "brush_grips.py", tmp_path / "brush_table.py"
@@ -130,7 +126,7 @@ def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeyp
         ('Parameter("q", "q", "N/√m", 0.8, bounds=(0.0, 10.0), meaning="grip of the bristles"),', "3,"),
     ],
 )
-def test_a_file_that_is_no_effect_is_refused_in_one_line_that_names_it(tmp_path: Path, old: str, new: str) -> None:
+def test_a_file_that_is_no_effect_is_refused_in_one_line_that_names_it(tmp_path, old, new):
     assert old in BRUSH
     path = written(tmp_path, BRUSH.replace(old, new))
     with pytest.raises(EffectError) as caught:
@@ -138,52 +134,42 @@ def test_a_file_that_is_no_effect_is_refused_in_one_line_that_names_it(tmp_path:
     assert str(caught.value).startswith(str(path))
 
 
-def test_capitals_missing_files_and_two_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_capitals_missing_files_and_two_of_one_name_are_refused(tmp_path):
     paths = [effect.path for effect in copies(tmp_path, BRUSH)]
     for refused in ([written(tmp_path, name="Brush.py")], [tmp_path / "brush.py"], paths):
         with pytest.raises(EffectError):
             own_effects(refused)
 
 
-@pytest.mark.parametrize("name", catalogue())
-def test_the_catalogue_passes_what_is_asked_of_a_users_own(name: str) -> None:
-    assert list(behaviour_faults(catalogue()[name])) == []
-
-
-def test_the_command_lists_it_and_draws_the_effects_of_the_catalogue(tmp_path: Path) -> None:
-    def run(*arguments: object) -> Result:
-        return CliRunner().invoke(app, ["effects", *map(str, arguments)], catch_exceptions=False)
-
+def test_the_command_lists_it_and_draws_the_effects_of_the_catalogue(tmp_path):
     (tmp_path / "in").mkdir()
     written(tmp_path)
     for folder, path in ((tmp_path, "brush.py"), (tmp_path / "in", "../brush.py")):
         (folder / "experiment.yaml").write_text(f"effects: [{path}]\n", encoding="utf-8")
-    done = run("--experiment", tmp_path)
+    done = run("effects", "--experiment", tmp_path)
     named = {line.split()[0] for line in done.stdout.splitlines()[1:] if not line.startswith("    ")}
     assert (done.exit_code, named) == (0, {*catalogue(), "brush"})
-    assert run("--experiment", tmp_path / "in").exit_code == 1  # it lies outside the experiment
-    assert run("air_drag", "--figure", tmp_path / "drag.png").exit_code == 0
+    assert run("effects", "--experiment", tmp_path / "in").exit_code == 1  # it lies outside the experiment
+    assert run("effects", "air_drag", "--figure", tmp_path / "drag.png").exit_code == 0
     assert (tmp_path / "drag.png").read_bytes().startswith(b"\x89PNG")
-    assert run("air_drag", "--figure", tmp_path / "drag.doc").exit_code == 1
-    assert run("--figure", tmp_path / "all.png").exit_code == 1
+    assert run("effects", "air_drag", "--figure", tmp_path / "drag.doc").exit_code == 1
+    assert run("effects", "--figure", tmp_path / "all.png").exit_code == 1
     assert not {"drag.doc", "all.png"} & {path.name for path in tmp_path.iterdir()}
 
 
-def test_effects_of_one_name_are_read_again_when_their_file_changes(tmp_path: Path) -> None:
+def test_effects_of_one_name_are_read_again_when_their_file_changes(tmp_path):
     first = load_effect(written(tmp_path))
     second = load_effect(written(tmp_path, BRUSH.replace("0.8, bounds", "0.9, bounds")))
     assert (first.parameters[0].default, second.parameters[0].default) == (0.8, 0.9)
 
 
 @pytest.fixture
-def effect_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def effect_file(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     return Path(shutil.copy(air_drag.path, tmp_path / "wake.py"))
 
 
-def test_it_is_named_with_its_hash_before_it_runs_and_remembered_until_it_changes(
-    effect_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_named_with_its_hash_before_it_runs_and_remembered_until_it_changes(effect_file, capsys):
     load_effect(effect_file)
     told = capsys.readouterr().err
     load_effect(effect_file)
@@ -196,7 +182,7 @@ def test_it_is_named_with_its_hash_before_it_runs_and_remembered_until_it_change
     assert str(effect_file) in capsys.readouterr().err
 
 
-def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
     assert load_effect(effect_file).name == "wake"  # a home that cannot be written stops nothing
     monkeypatch.setenv("VINETRACK_OWN_EFFECTS", "known")
@@ -204,3 +190,58 @@ def test_where_only_known_ones_may_run_a_new_one_is_not_run(effect_file: Path, m
     with pytest.raises(EffectError):
         load_effect(effect_file)
     assert not effect_file.with_suffix(".ran").exists()
+
+
+FOLDER = Path(effects.__file__).parent
+each_effect = pytest.mark.parametrize("effect", catalogue().values(), ids=catalogue())
+
+
+def test_the_folder_is_the_catalogue_with_the_base_first():
+    assert set(catalogue()) == {path.stem for path in FOLDER.glob("*.py") if not path.stem.startswith("_")}
+    assert tuple(catalogue())[:4] == BASE_EFFECTS
+
+
+@each_effect
+def test_a_file_names_describes_and_works_out_its_effect_and_bounds_its_parameters(effect):
+    assert effect.name == effect.path.stem
+    assert getattr(effects, effect.name) == effect == find_effect(effect.name)
+    assert all((effect.summary, effect.formula, "Source:" in effect.text))
+    assert {worked.hook for worked in effect.worked} == set(effect.functions)
+    assert all(worked.rel <= 1e-2 for worked in effect.worked)
+    assert list(behaviour_faults(effect)) == []  # what is asked of a user's own
+    assert set(effect.replaces) <= set(catalogue()) - {effect.name}
+    assert (effect.kind == "base") == (effect.name in BASE_EFFECTS)
+    if effect.kind == "measurement":
+        read_off = {"true_time", "trace_time", "observed_position", "row_delay", "gauge", "yield_gauge", "area"}
+        read_off |= {"film_gain", "averaged_over"}
+        # They turn, and add to, a weight and a mass that are there.
+        weight = {"growth_angle": {"tail_force"}, "payload_mass": {"tail_force", "added_mass"}}
+        assert set(effect.functions) <= read_off | weight.get(effect.name, set())
+    for parameter in effect.parameters:
+        assert effect.parameters.count(parameter) == 1
+        assert all((parameter.symbol, parameter.unit, parameter.meaning))
+        low, high = parameter.bounds
+        assert -math.inf < low < high < math.inf
+        assert low <= parameter.default <= high
+        assert parameter.shared in ("all", "vine", "day")
+        assert low <= parameter.plausible[0] < parameter.plausible[1] <= high
+
+
+@each_effect
+def test_hooks_take_arrays_as_they_take_numbers_and_are_finite_at_rest(effect):
+    sizes = [parameter.default for parameter in effect.parameters]
+    factors = np.array([0.5, 1.0, 1.7])
+    rows = State(*(np.asarray(value * factors) for value in _STATE))
+    rest = _STATE._replace(time=0.0, lead_position=0.0, lead_velocity=0.0, tail_position=0.0, tail_velocity=0.0)
+    for hook in effect.functions.values():
+        found = np.broadcast_to(np.asarray(hook(rows, _RIG, *sizes)), factors.shape)
+        singly = [float(hook(State(*(float(value * f) for value in _STATE)), _RIG, *sizes)) for f in factors]
+        np.testing.assert_allclose(found, singly, rtol=1e-13)
+        assert np.isfinite(float(hook(rest, _RIG, *sizes)))
+
+
+def test_effects_are_told_apart_by_name_and_file(tmp_path):
+    twin = tmp_path / "gravity.py"
+    twin.write_text((FOLDER / "gravity.py").read_text())
+    assert {load_effect(FOLDER / "gravity.py")} == {effects.gravity}
+    assert load_effect(twin) != effects.gravity

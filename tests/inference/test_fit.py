@@ -1,6 +1,4 @@
-"""The fit to trajectories, tested on vines simulated by SciPy, falling bodies and linear statistics."""
-
-from __future__ import annotations
+"""The fit to trajectories and what it is given: vines simulated by SciPy, falling bodies, rounded and uneven tracks."""
 
 import math
 from dataclasses import replace
@@ -8,25 +6,30 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from grown import grown, pairs_of
+from hidden_truth import sheet
 from lsoda_vine import B_TRUE, FPS, N_TRUE, NOISE_M, ar1, as_track, filmed, grown_position, small_campaign, vine_trial
+from vine_truth import Vine, record
 
 import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.diagnosis import score_test as hypotheses
+from vinetrack.diagnosis.ladder import candidates_of
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.replicates import first_that_counts
-from vinetrack.dynamics.simulate import SimulationError, simulate
-from vinetrack.inference import solving
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference import solving, trial_effects
 from vinetrack.inference.fit import fit_subset, predict_prepared
-from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.fit_summary import film_influence
+from vinetrack.inference.fit_data import prepare
+from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.inference.sensitivity import Predictor
-
-Campaign = tuple[Fit, list[tuple[Trial, Track]], list[dict[str, float]]]
+from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
+from vinetrack.inference.whitening import at_correlation, products, whiten
 
 
 @pytest.fixture(scope="module")
-def campaign() -> Campaign:
+def campaign():
     """Sixteen trials; B scatters by 3 %, P by 1 %, noise 0.1 mm with ρ = 0.4."""
     pairs, truth = small_campaign(seed=3, rho=0.4)
     return vt.fit(vt.base_model(), pairs), pairs, truth
@@ -42,7 +45,7 @@ def ball(seed: int, first_frame: int = 0, count: int = 120) -> tuple[Trial, Trac
     return trial, as_track(time_s, 0.02 + fallen + 2e-4 * draw.standard_normal(count))
 
 
-def test_the_numbers_of_a_campaign_are_estimated_within_their_errors(campaign: Campaign) -> None:
+def test_numbers_and_noise_of_a_campaign_are_estimated_within_their_errors(campaign):
     fit, pairs, truth = campaign
     known = {f"B[{t.vine}]": B_TRUE[round(t.diameter_m * 1e3, 3)] for t, _ in pairs} | {"n": N_TRUE}
     numbers = {name: fit[name if name == "n" else f"eversion_damping.{name}"] for name in known}
@@ -51,30 +54,24 @@ def test_the_numbers_of_a_campaign_are_estimated_within_their_errors(campaign: C
     assert numbers["n"].sigma < 0.02
     yields = [number for number in fit.numbers if number.symbol == "P_y"]
     assert [number.sigma < 200 and abs(number.value - 3000) < 600 for number in yields] == [True, True]
-    placed = [
-        [(t.release_s - true["release_s"]) / t.release_sigma_s, (t.origin_m - true["origin_m"]) / t.origin_sigma_m]
-        for t, true in zip(fit.trials, truth, strict=True)
-    ]
+    both = list(zip(fit.trials, truth, strict=True))
+    placed = [(trial.release_s - true["release_s"]) / trial.release_sigma_s for trial, true in both]
+    placed += [(trial.origin_m - true["origin_m"]) / trial.origin_sigma_m for trial, true in both]
     assert np.max(np.abs(placed)) < 4
     assert 0.6 < np.sqrt(np.mean(np.square(placed))) < 1.5
     deviations, true = [trial.damping_deviation for trial in fit.trials], [one["damping"] for one in truth]
     assert np.corrcoef(deviations, true)[0, 1] > 0.9
     assert fit.spreads["B"].value == pytest.approx(np.std(true, ddof=1), rel=0.35)
     assert fit.spreads["pressure"].value < 0.02
-
-
-def test_noise_and_its_correlation_are_estimated_and_whitened_away(campaign: Campaign) -> None:
-    fit = campaign[0]
     assert fit.noise_m == pytest.approx(NOISE_M, rel=0.05)
     assert fit.noise_correlation == pytest.approx(0.4, abs=0.03)
     assert fit.chi2_per_dof == pytest.approx(1.0, abs=0.1)
     white = [trial.whitened for trial in fit.trials]
-    neighbours = np.corrcoef(np.concatenate([w[:-1] for w in white]), np.concatenate([w[1:] for w in white]))[0, 1]
     assert np.concatenate(white).std() == pytest.approx(1.0, abs=0.03)
-    assert abs(neighbours) < 0.03
+    assert abs(np.corrcoef(np.concatenate([[w[:-1], w[1:]] for w in white], axis=1))[0, 1]) < 0.03
 
 
-def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign: Campaign) -> None:
+def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign):
     fit, pairs, _ = campaign
     trial = replace(pairs[2][0], name="left_out", pressure_Pa=19e3)
     track, release_s, origin_m = filmed(trial, np.random.default_rng(8))
@@ -87,7 +84,7 @@ def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign:
     assert found.rms_m < 4e-3
 
 
-def test_positions_without_any_noise_are_predicted_like_others(campaign: Campaign) -> None:
+def test_positions_without_any_noise_are_predicted_like_others(campaign):
     data = campaign[0].predictor.data[:2]
     exact = [replace(trial_data, noise_m=0.0) for trial_data in data]
     others = predict_prepared(campaign[0], data, from_rest=True)
@@ -96,36 +93,43 @@ def test_positions_without_any_noise_are_predicted_like_others(campaign: Campaig
         assert found.release_s == pytest.approx(other.release_s, abs=1e-4)
 
 
-def test_a_refit_stays_at_the_solution_or_comes_back_to_it(campaign: Campaign) -> None:
-    again = vt.refit(campaign[0])
-    assert again.log_likelihood == pytest.approx(campaign[0].log_likelihood, abs=0.05)
-    assert again.iterations <= 3
-    assert vt.refit(campaign[0], afresh=True).log_likelihood == pytest.approx(campaign[0].log_likelihood, abs=0.3)
-
-
-def test_a_fixed_parameter_stays_and_the_likelihood_falls(campaign: Campaign) -> None:
+def test_a_refit_stays_at_the_solution_or_comes_back_to_it_and_falls_off_where_a_parameter_is_held(campaign):
     fit = campaign[0]
+    again = vt.refit(fit)
+    assert again.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
+    assert again.iterations <= 3
+    assert vt.refit(fit, afresh=True).log_likelihood == pytest.approx(fit.log_likelihood, abs=0.3)
     held = vt.refit(fit, start={"eversion_damping.n": fit["n"].value + 3 * fit["n"].sigma}, fixed=("n",))
     assert [number.key for number in held.numbers if number.symbol == "n"] == []
     # Three standard errors away: −2 ln L rises by 9 where all is linear.
     assert 2 * (fit.log_likelihood - held.log_likelihood) == pytest.approx(9, rel=0.3)
 
 
-def test_one_B_for_all_vines_if_requested(campaign: Campaign) -> None:
+def test_one_B_for_all_vines_if_requested_and_two_yield_pressures_where_two_are_stated(campaign):
     shared = vt.fit(vt.base_model(), campaign[1][:8], shared={"B": "all"}, profile=False)
     assert [number.vine for number in shared.numbers if number.symbol == "B"] == [""]
     assert abs(shared["B"].value - B_TRUE[24.0]) < 3 * shared["B"].sigma
+    pairs, _ = small_campaign(seed=5, replicates=1)
+    four = [(replace(t, vine="v", yield_pressure_Pa=3e3 if k < 2 else 3.1e3), x) for k, (t, x) in enumerate(pairs[:4])]
+    fit = vt.fit(vt.base_model(), four, profile=False)
+    assert [n.vine for n in fit.numbers if n.symbol == "P_y"] == ["v, 3 kPa", "v, 3.1 kPa"]
 
 
-def test_a_parameter_at_its_bound_has_an_interval_by_profile() -> None:
+def test_a_parameter_at_its_bound_has_an_interval_by_profile_and_gains_no_likelihood_beyond_it(campaign):
     """No chamber depletes, and the model lets it do so at least isothermally."""
     pairs = [(replace(t, chamber_m3=3.7e-3), track) for t, track in small_campaign(seed=5, replicates=1)[0]]
     gamma = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs)["gamma"]
     assert gamma.bound == gamma.lower == 0.6
     assert (gamma.low, gamma.method) == (0.6, "profile")
+    # n is held too low, so that a drag is wanted; the fold's inertia acts the other way and stays at nothing.
+    low = {"eversion_damping.n": N_TRUE - 0.06}
+    plain = vt.fit(vt.base_model(), campaign[1], fixed=("n",), start=low, profile=False)
+    folded = vt.refit(plain, plain.model + vt.effects.fold_inertia)
+    assert folded["eta"].bound == 0.0
+    assert plain.log_likelihood - 2 < folded.log_likelihood < plain.log_likelihood + 0.1
 
 
-def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch):
     """Behind a lens, of which the profile knows nothing: it was three quarters as wide."""
     pairs = [(replace(t, position_systematic_m=1e-3), track) for t, track in small_campaign(seed=5, replicates=2)[0]]
     linear = vt.fit(vt.base_model(), pairs, profile=False)
@@ -137,21 +141,12 @@ def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch: 
     assert n.low < n.value < n.high
 
 
-def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campaign) -> None:
-    # n is held too low, so that a drag is wanted; the fold's inertia acts the other way and stays at nothing.
-    low = {"eversion_damping.n": N_TRUE - 0.06}
-    plain = vt.fit(vt.base_model(), campaign[1], fixed=("n",), start=low, profile=False)
-    folded = vt.refit(plain, plain.model + vt.effects.fold_inertia)
-    assert folded["eta"].bound == 0.0
-    assert plain.log_likelihood - 2 < folded.log_likelihood < plain.log_likelihood + 0.1
-
-
 @pytest.mark.parametrize(
     ("balls", "most"),
     [([ball(1), ball(2)], 0.005), ([ball(3, first_frame=25, count=90)], math.inf)],
     ids=["from rest", "in flight"],
 )
-def test_a_falling_ball_gives_g(balls: list[tuple[Trial, Track]], most: float) -> None:
+def test_a_falling_ball_gives_g(balls, most):
     fit = vt.fit(vt.make_model(["gravity"]), balls, free=("g",))
     g = fit["g"]
     assert abs(g.value - 9.80665) < 3 * g.sigma
@@ -159,14 +154,13 @@ def test_a_falling_ball_gives_g(balls: list[tuple[Trial, Track]], most: float) -
     assert fit.trials[0].release_s == pytest.approx(0.0513, abs=4 * fit.trials[0].release_sigma_s)
 
 
-def test_a_parameter_without_influence_has_no_error() -> None:
-    pairs, _ = small_campaign(seed=5, replicates=1)
-    level = [(replace(trial, growth_angle_rad=math.pi / 2), track) for trial, track in pairs[:4]]
-    fit = vt.fit(vt.base_model(), level, free=("g",))
-    assert math.isinf(fit["g"].sigma)
+def test_a_parameter_without_influence_has_no_error():
+    pairs = small_campaign(seed=5, replicates=1)[0][:4]
+    level = [(replace(trial, growth_angle_rad=math.pi / 2), track) for trial, track in pairs]
+    assert math.isinf(vt.fit(vt.base_model(), level, free=("g",))["g"].sigma)
 
 
-def test_missing_frames_begin_a_new_stretch_and_change_little(campaign: Campaign) -> None:
+def test_missing_frames_begin_a_new_stretch_and_points_flagged_unusable_are_not_used(campaign):
     fit, pairs, _ = campaign
     kept = [np.arange(track.time_s.size) % 50 != 37 for _, track in pairs]
     holed = [(t, as_track(x.time_s[k], x.lead_position_m[k])) for (t, x), k in zip(pairs, kept, strict=True)]
@@ -174,40 +168,32 @@ def test_missing_frames_begin_a_new_stretch_and_change_little(campaign: Campaign
     first = again.predictor.data[0].first
     assert np.count_nonzero(first) == 1 + np.count_nonzero(np.diff(again.trials[0].time_s) > 1.5 / FPS)
     assert abs(again["n"].value - fit["n"].value) < fit["n"].sigma
-
-
-def test_points_flagged_unusable_are_not_used(campaign: Campaign) -> None:
-    fit, pairs, _ = campaign
     spoilt = []
-    for trial, track in pairs:
+    for trial, track in campaign[1]:
         bad = np.arange(track.time_s.size) == track.time_s.size // 2
-        position = np.where(bad, 5.0, track.lead_position_m)
-        spoilt.append((trial, replace(track, lead_position_m=position, flag=np.where(bad, "rejected", track.flag))))
+        position, flag = np.where(bad, 5.0, track.lead_position_m), np.where(bad, "rejected", track.flag)
+        spoilt.append((trial, replace(track, lead_position_m=position, flag=flag)))
     again = vt.fit(vt.base_model(), spoilt, profile=False)
     assert abs(again["n"].value - fit["n"].value) < 0.3 * fit["n"].sigma
 
 
-def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept() -> None:
-    trial = vine_trial("end", 22)
-    time_s = np.arange(400) / FPS
+def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept():
+    trial, time_s = vine_trial("end", 22), np.arange(400) / FPS
     position = grown_position(trial, time_s - 0.02, B_TRUE[24.0])
-    over = np.flatnonzero(np.isnan(position))[:12]
-    position[over] = trial.length_m
-    time_s, position = time_s[: over[-1] + 1], position[: over[-1] + 1]
-    draw = np.random.default_rng(0)
-    track = as_track(time_s, position + NOISE_M * draw.standard_normal(time_s.size))
+    until = np.flatnonzero(np.isnan(position))[12]
+    position = np.nan_to_num(position[:until], nan=trial.length_m)
+    track = as_track(time_s[:until], position + NOISE_M * np.random.default_rng(0).standard_normal(until))
     used = vt.fit(vt.base_model(), [(trial, track)], fixed=("B", "n"), profile=False).trials[0]
     travel = used.lead_position_m - used.lead_position_m[:15].mean()
     assert not np.any((travel > 0.951 * trial.length_m) & (travel < 0.99 * trial.length_m))
     assert np.count_nonzero(travel > 0.99 * trial.length_m) >= 5
 
 
-def test_a_measured_pressure_replaces_the_set_pressure() -> None:
-    draw = np.random.default_rng(2)
-    pairs = []
+def test_a_measured_pressure_replaces_the_set_pressure():
+    pairs, draw = [], np.random.default_rng(2)
     for P in (14, 20, 28, 36):
         trial = replace(vine_trial(f"t{P}", P), vine="v")
-        track, _, _ = filmed(trial, draw, pressure=1.1)
+        track = filmed(trial, draw, pressure=1.1)[0]
         pairs.append((trial, replace(track, pressure_Pa=np.full(track.time_s.size, 1.1e3 * P))))
     fit = vt.fit(vt.base_model(), pairs)
     assert "pressure" not in fit.spreads
@@ -215,42 +201,30 @@ def test_a_measured_pressure_replaces_the_set_pressure() -> None:
     assert fit["B"].value == pytest.approx(B_TRUE[24.0], rel=0.1)
 
 
-def test_too_few_trials_for_a_between_trial_standard_deviation_have_the_usual_one() -> None:
+def test_too_few_trials_for_a_between_trial_standard_deviation_have_the_usual_one():
     trial = replace(vine_trial("one", 22), vine="v")
     fit = vt.fit(vt.base_model(), [(trial, filmed(trial, np.random.default_rng(4))[0])], fixed=("n",))
     assert not fit.spreads["B"].estimated
     assert fit["B"].sigma / fit["B"].value > 0.03
 
 
-def test_trials_without_usable_motion_are_left_out_and_named(campaign: Campaign) -> None:
+def test_trials_without_usable_motion_are_left_out_and_named(campaign):
     """One that never moves, one that moves below its yield pressure, one with three usable points in motion of four."""
-    pairs = campaign[1]
-    still = as_track(np.arange(200) / FPS, NOISE_M * ar1(200, 0.0, np.random.default_rng(1)))
+    pairs, at_rest = campaign[1], 1e-5 * np.random.default_rng(2).standard_normal(40)
+    tracks = {name: np.concatenate([at_rest, 2e-3 * np.arange(1, n + 1)]) for name, n in (("few", 3), ("enough", 4))}
+    tracks["still"] = NOISE_M * ar1(200, 0.0, np.random.default_rng(1))
     below = replace(pairs[0][0], name="below", pressure_Pa=1.5e3, pressure_sigma_Pa=15.0)
-    at_rest = 1e-5 * np.random.default_rng(2).standard_normal(40)
-    few, enough = (np.concatenate([at_rest, 2e-3 * np.arange(1, moving + 1)]) for moving in (3, 4))
-    odd = [(vine_trial("still", 20), still), (below, pairs[0][1])]
-    for name, y in (("few", few), ("enough", enough)):
-        odd.append((vine_trial(name, 20), as_track(np.arange(y.size) / FPS, y)))
-    fit = vt.fit(vt.base_model(), [*pairs, *odd], profile=False)
+    odd = [(vine_trial(name, 20), as_track(np.arange(y.size) / FPS, y)) for name, y in tracks.items()]
+    fit = vt.fit(vt.base_model(), [*pairs, *odd, (below, pairs[0][1])], profile=False)
     assert set(fit.left_out) == {"still", "below", "few"}
     with pytest.raises(vt.FitError):
-        vt.fit(vt.base_model(), odd[:1])
+        vt.fit(vt.base_model(), odd[2:])
 
 
-def test_two_yield_pressures_stated_for_one_vine_are_two_parameters() -> None:
-    pairs, _ = small_campaign(seed=5, replicates=1)
-    four = [(replace(t, vine="v", yield_pressure_Pa=3e3 if k < 2 else 3.1e3), x) for k, (t, x) in enumerate(pairs[:4])]
-    fit = vt.fit(vt.base_model(), four, profile=False)
-    assert [n.vine for n in fit.numbers if n.symbol == "P_y"] == ["v, 3 kPa", "v, 3.1 kPa"]
-
-
-def test_watch_is_called_with_every_step_and_may_end_the_fit() -> None:
-    pairs, _ = small_campaign(seed=31)
-    pairs = [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
+def test_watch_is_called_with_every_step_and_may_end_the_fit():
+    pairs = [(replace(trial, position_systematic_m=0.0), track) for trial, track in small_campaign(seed=31)[0]]
     watch = Mock()
-    found = vt.fit(vt.base_model(), pairs, watch=watch)
-    last = watch.call_args.args[0]
+    found, last = vt.fit(vt.base_model(), pairs, watch=watch), watch.call_args.args[0]
     assert last.iteration == found.iterations
     assert last.values == pytest.approx({number.name: number.value for number in found.numbers}, rel=1e-6)
     assert last.predicted_decrease < 1e-2
@@ -273,7 +247,7 @@ def slow_campaign() -> list[tuple[Trial, Track]]:
     truth = vt.base_model().with_values({"eversion_damping.B": 6.0, "eversion_damping.n": N_SLOW})
     for k, (height_Pa, rise_s) in enumerate(((12e3, 0.3), (16e3, 0.3), (20e3, 0.5))):
         pressure_Pa = height_Pa * -np.expm1(-time_s / rise_s)
-        y = simulate(truth, SLOW, time_s, trace=(time_s, pressure_Pa)).lead_position_m
+        y = vt.simulate(truth, SLOW, time_s, trace=(time_s, pressure_Pa)).lead_position_m
         noise_m = 1e-4 * np.random.default_rng(40 + k).standard_normal(time_s.size)
         stated = replace(SLOW, name=f"slow{k}", yield_pressure_Pa=P_Y_TRUE - 2.5e3)
         pairs.append((stated, as_track(time_s, y + noise_m, pressure_Pa)))
@@ -293,7 +267,7 @@ def test_the_yield_pressure_is_estimated_instead_of_a_release():
         assert 0.1 < begins < 0.25
 
 
-def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch: pytest.MonkeyPatch):
+def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch):
     whole, calls = Predictor.linearise, []
 
     def breaks_later(self: Predictor, theta: Floats, own: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
@@ -308,32 +282,19 @@ def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypa
     assert np.isfinite(fit["n"].value)
 
 
-# A model in which nothing moves, or nothing has mass, is refused, and so is a parameter that it does not have.
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"growth_angle_rad": math.pi / 2}, {"growth_angle_rad": math.pi}, {"payload_kg": 0.0}],
-    ids=["sideways", "up", "weightless"],
-)
-def test_gravity_moves_no_such_ball(change: dict[str, float]) -> None:
+def test_what_nothing_moves_or_has_no_mass_and_unknown_parameters_are_refused():
     trial, track = ball(20400)
-    with pytest.raises(FitError):
-        vt.fit(vt.make_model(["gravity"]), [(replace(trial, **change), track)])
-
-
-def test_pressures_below_those_of_the_yield_and_unknown_parameters_are_refused() -> None:
+    for change in ({"growth_angle_rad": math.pi / 2}, {"growth_angle_rad": math.pi}, {"payload_kg": 0.0}):
+        with pytest.raises(vt.FitError):
+            vt.fit(vt.make_model(["gravity"]), [(replace(trial, **change), track)])
     pairs, _ = small_campaign(seed=8, replicates=1)
-    with pytest.raises(FitError):
-        vt.fit(vt.base_model(), [(replace(t, yield_pressure_Pa=1.5 * t.pressure_Pa), track) for t, track in pairs])
-    with pytest.raises(FitError):
-        vt.fit(vt.base_model(), pairs, fixed=("b",))
+    below = [(replace(trial, yield_pressure_Pa=1.5 * trial.pressure_Pa), track) for trial, track in pairs]
+    for given, fixed in ((below, ()), (pairs, ("b",))):
+        with pytest.raises(vt.FitError):
+            vt.fit(vt.base_model(), given, fixed=fixed)
 
 
-# Fits to a subset of the trials, started from the fit of all, compared with fits from scratch.
-
-
-def test_leaving_out_a_condition_agrees_with_a_fit_from_scratch(campaign: Campaign) -> None:
+def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campaign):
     whole, pairs, _ = campaign
     rest = [pair for pair in pairs if pair[0].condition != pairs[0][0].condition]
     warm = fit_subset(whole, [trial.name for trial, _ in rest])
@@ -343,23 +304,20 @@ def test_leaving_out_a_condition_agrees_with_a_fit_from_scratch(campaign: Campai
         assert one.name == other.name
         assert abs(one.value - other.value) < 0.1 * other.sigma
         assert one.sigma == pytest.approx(other.sigma, rel=0.05)
-
-
-def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(campaign: Campaign) -> None:
-    whole, pairs, _ = campaign
+    # The parameters of a vine that is left out are dropped.
     stays = pairs[0][0].vine
     alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
     assert {number.vine for number in alone.numbers} == {"", stays}
-    with pytest.raises(FitError):
+    with pytest.raises(vt.FitError):
         vt.predict(alone, [next(pair for pair in pairs if pair[0].vine != stays)])
     for keep in (["elsewhere"], [False] * len(whole.trials), [True, False]):
-        with pytest.raises(FitError):
+        with pytest.raises(vt.FitError):
             fit_subset(whole, keep)
 
 
-def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(campaign: Campaign) -> None:
+def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(campaign):
     whole, pairs, _ = campaign
-    names = [trial.name for trial in whole.trials][:9]
+    names = [trial.name for trial in whole.trials[:9]]
     held = fit_subset(whole, names, hold_spreads=True, hold_noise=True)
     assert [held.spreads[k].value for k in ("pressure", "B")] == [whole.spreads[k].value for k in ("pressure", "B")]
     assert held.noise_correlation == whole.noise_correlation
@@ -368,7 +326,7 @@ def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(cam
     assert part.noise_correlation == 0.3
 
 
-def test_yield_pressures_without_error_are_no_parameters(campaign: Campaign) -> None:
+def test_yield_pressures_without_error_are_no_parameters(campaign):
     exact = [(replace(trial, yield_pressure_sigma_Pa=0.0), track) for trial, track in campaign[1][:12]]
     found = vt.fit(vt.base_model(), exact, profile=False)
     part = fit_subset(found, [trial.name for trial, _ in exact[:9]])
@@ -378,22 +336,184 @@ def test_yield_pressures_without_error_are_no_parameters(campaign: Campaign) -> 
 
 
 @pytest.mark.slow
-def test_film_influence_agrees_with_refits_with_heavier_film() -> None:
+def test_film_influence_agrees_with_refits_with_heavier_film():
     pairs = small_campaign(11, damping=5e-3, pressure=1e-3)[0]
     fit = vt.fit(vt.base_model(), pairs, profile=False)
     squares = np.zeros(len(fit.numbers))
     for vine in dict.fromkeys(trial.vine for trial, _ in pairs):
-        factors = [1 + FILM_ERROR * (trial.vine == vine) for trial, _ in pairs]
-        heavier = [
-            (replace(trial, film_density_kg_m3=factor * trial.film_density_kg_m3), track)
-            for (trial, track), factor in zip(pairs, factors, strict=True)
-        ]
+        densities = [trial.film_density_kg_m3 * (1 + FILM_ERROR * (trial.vine == vine)) for trial, _ in pairs]
+        heavier = [(replace(t, film_density_kg_m3=d), x) for (t, x), d in zip(pairs, densities, strict=True)]
         other = vt.fit(vt.base_model(), heavier, profile=False)
         squares += np.square([b.value - a.value for a, b in zip(fit.numbers, other.numbers, strict=True)])
-    keys = [number.key for number in fit.numbers]
-    moved, by_refit = film_influence(fit), np.sqrt(squares)
-    of_law = [k for k, key in enumerate(keys) if key.startswith("eversion_damping")]
+    moved, by_refit = vt.film_influence(fit), np.sqrt(squares)
+    of_law = [k for k, number in enumerate(fit.numbers) if number.key.startswith("eversion_damping")]
     assert moved[of_law] == pytest.approx(by_refit[of_law], rel=0.2)
-    n = keys.index("eversion_damping.n")
+    n = fit.numbers.index(fit["n"])
     assert moved[n] > fit.numbers[n].sigma
-    assert not film_influence(vt.refit(fit, fit.model + "film_mass")).any()
+    assert not vt.film_influence(vt.refit(fit, fit.model + "film_mass")).any()
+
+
+STEP_M = 2e-3
+
+
+def rounded(seed: int, step_m: float = STEP_M):
+    pairs, truth = small_campaign(seed)
+    return [(t, replace(x, lead_position_m=np.round(x.lead_position_m / step_m) * step_m)) for t, x in pairs], truth
+
+
+def test_a_rest_counts_as_one_point_where_rounding_hides_its_noise():
+    data, _ = prepare(rounded(1)[0])
+    assert len(data) > 12
+    for each in data:
+        assert each.n_rest == 0
+        assert each.imprecise_rest.sigma_m == pytest.approx(STEP_M / np.sqrt(12))
+        assert each.noise_m >= 0.999 * STEP_M / np.sqrt(12)
+    assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
+
+
+def test_where_the_lens_is_unknown_smooth_errors_are_a_part_of_the_longest_travel():
+    pairs, _ = small_campaign(1)
+    longest_m = max(np.ptp(track.lead_position_m) for _, track in pairs)
+    stated = [(replace(pairs[0][0], position_systematic_m=2.5e-4), pairs[0][1]), *pairs[1:]]
+    first, *others = prepare(stated)[0]
+    assert first.position_systematic_m == 2.5e-4
+    assert [each.position_systematic_m for each in others] == pytest.approx([4e-4 * longest_m] * len(others))
+
+
+@pytest.mark.slow
+def test_origins_of_rounded_tracks_have_the_stated_errors():
+    """Taken for independent values, twenty equal ones at rest gave origins that were off by five standard errors."""
+    errors = []
+    for seed in (2, 3):
+        pairs, truth = rounded(seed)
+        fit = vt.fit(vt.base_model(), pairs, profile=False)
+        known = {trial.name: each for (trial, _), each in zip(pairs, truth, strict=True)}
+        errors += [(t.origin_m - known[t.name]["origin_m"]) / t.origin_sigma_m for t in fit.trials]
+        assert abs(fit["n"].value - N_TRUE) < 3 * fit["n"].sigma
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
+
+
+def test_weighted_products_are_those_of_columns_divided_by_their_noise():
+    draw = np.random.default_rng(20000)
+    first = np.isin(np.arange(60), [0, 25])
+    columns, relative_sd = draw.standard_normal((60, 3)), np.exp(draw.uniform(-1, 1, 60))
+    weighted, white = products(columns, first, relative_sd), whiten(columns, first, 0.4, relative_sd)
+    np.testing.assert_array_equal(weighted, products(columns / relative_sd[:, None], first))
+    np.testing.assert_allclose(at_correlation(weighted[None], 0.4)[0], white.T @ white, rtol=1e-12)
+
+
+def test_trials_are_weighted_where_noise_grows_with_speed():
+    """Sixteen fast vines filmed with 0.06 mm of noise and a blur of as many µs."""
+    pairs, true_sd, vine = [], [], Vine(2, 10.0)
+    known = {"diameter_m": vine.diameter_m, "thickness_m": 1e-4, "pressure_Pa": 3e4, "yield_pressure_Pa": 1e3}
+    for i in range(16):
+        draw = np.random.default_rng(20100 + i)
+        made = record(vine, draw, noise_m=6e-5)
+        blurred = 6e-5 * made.lead_velocity_m_s
+        positions = made.track.lead_position_m + blurred * draw.standard_normal(blurred.size)
+        pairs.append((Trial(name=f"t{i}", **known), replace(made.track, lead_position_m=positions)))
+        true_sd.append(np.hypot(6e-5, blurred))
+    data, left_out = prepare(pairs)
+    assert not left_out
+    for item, true in zip(data, true_sd, strict=True):
+        assert np.mean(np.log(item.relative_sd)) == pytest.approx(0.0, abs=1e-12)
+        # Thirty moving frames a trial, differences as good as 185 points in all: 5 % is its standard error.
+        assert item.blur_s == pytest.approx(6e-5, rel=0.15)
+        ratio = np.log(item.noise_m * item.relative_sd / true)
+        assert np.sqrt(np.mean(ratio**2)) < 0.4
+        assert item.mean_noise_m == pytest.approx(np.sqrt(np.mean(true**2)), rel=0.3)
+    assert all(trial_data.relative_sd is None for trial_data in prepare(pairs, weighted=False)[0])
+
+
+@pytest.mark.slow
+def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials():
+    # A payload that rubs and a pressure that is lower move one trial in exactly the same way. The jump at the end of
+    # growth, different for the two as their steps have different signs, once passed for knowledge of μ_p to 1e-4.
+    bare = [replace(trial, growth_angle_rad=math.pi / 2) for trial in sheet() if trial.vine == sheet()[0].vine]
+    trials = [replace(t, name=f"{t.name}_{load:g}", payload_kg=load) for t in bare for load in (0.0, 0.03)]
+    care = {"damping_scatter": 2e-3, "pressure_scatter": 5e-3, "noise_m": 2e-5, "frames_after_end": 4}
+    virtual = grown(trials, 20_411, ["payload_friction"], {"payload_friction.mu_p": 0.3}, **care)
+    fit = vt.fit(vt.base_model(), pairs_of(virtual), profile=False)
+    candidates = candidates_of(fit.model, ["payload_friction"], None)
+    questions = misfit_tests(fit, hypotheses.testable(candidates, fit.predictor.data)[0], FALSE_ALARM_LEVEL_FIRST_ROUND)
+    size, sigma = (float(values[0]) for values in (questions.scores.size, questions.scores.plain_sigma))
+    # μ_p m g acts like a fall of the pressure by 2 μ_p m g / A, and half of the trials have the payload.
+    alike = [2 * 0.03 * 9.81 / (math.pi / 4 * trial.diameter_m**2 * trial.pressure_Pa) for trial in bare]
+    by_scatter = 5e-3 * math.sqrt(4 / len(trials)) / float(np.mean(alike))
+    assert 0.5 * by_scatter < sigma < 3 * by_scatter
+    assert size == pytest.approx(0.3, abs=3 * sigma)
+
+
+@pytest.fixture(scope="module")
+def only_in_motion():
+    """Eight trials, grown by scipy and let go 10 ms before the first frame that is kept."""
+    pairs = [(trial, track, track.time_s > 0.03) for trial, track in small_campaign(seed=7, replicates=1)[0]]
+    return vt.fit(vt.base_model(), [(t, as_track(x.time_s[seen], x.lead_position_m[seen])) for t, x, seen in pairs])
+
+
+def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion):
+    assert only_in_motion.converged
+    assert abs(only_in_motion["n"].value - N_TRUE) < 3 * only_in_motion["n"].sigma
+    assert only_in_motion["n"].sigma < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("early_frames", [5, 20, 45])
+def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion, early_frames):
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    own = solution.state.trial_effects.copy()
+    own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
+    elsewhere = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms(), warm=True)
+    found = vt.refit(replace(only_in_motion, solution=elsewhere))
+    assert found.solution.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
+    assert np.isfinite(found["n"].sigma)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho):
+    draw = np.random.default_rng(5)
+    time_s, grid_s = np.linspace(0.0, 0.3, 41), 0.4 * np.linspace(0, 1, 60) ** 1.5
+    curves, position_m, relative = draw.standard_normal((5, 60)), draw.standard_normal(41), draw.uniform(1, 3, 41)
+    first, releases_s = np.isin(np.arange(41), [0, 17]), np.array([-0.2, 0.0, 0.013, 0.25])
+    products = products_at_releases(time_s, position_m, first, relative, releases_s, grid_s, curves, rho)
+    for release_s, product in zip(releases_s, products, strict=True):
+        columns = np.array([np.interp(np.maximum(time_s - release_s, 0.0), grid_s, curve) for curve in curves]).T
+        columns[:, -1] = position_m - columns[:, -1]
+        white = whiten(columns, first, rho, relative)
+        assert np.allclose(product, white.T @ white, rtol=1e-12, atol=1e-12)
+
+
+def test_a_jump_is_remembered_by_later_searches(only_in_motion, monkeypatch):
+    """A search one step later forgot the jump: 3 of 400 trials cycled eight times, in 40 steps of all trials."""
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    residuals = residuals_in(predictor.linearise(solution.state.theta, solution.state.trial_effects))
+    there = solution.state.trial_effects.copy()
+    there[:, 0] -= 0.004
+    elsewhere = replace(solution.state, trial_effects=there)
+    monkeypatch.setattr(trial_effects.ReleaseSearch, "_confirmed", lambda *given: given[-1])
+    search = trial_effects.ReleaseSearch(predictor, solution.problem)
+    for begins, likelier in ((solution.state, elsewhere), (elsewhere, None), (solution.state, None)):
+        monkeypatch.setattr(trial_effects.ReleaseSearch, "_by_linear_model", lambda *_, at=likelier: at)
+        search.likelier(begins, residuals)
+    assert search.returned.all()
+
+
+def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motion):
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    start = replace(solution.state, theta=solution.state.theta + 0.3 * (np.arange(solution.state.theta.size) == 0))
+    led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, goal=solution.log_likelihood() - 1)
+    assert led.converged
+    assert led.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
+    given_up = solve(predictor, solution.problem, start, FixedTerms(), warm=True, goal=1e9)
+    assert not given_up.converged
+    assert given_up.iterations < led.iterations
+
+
+def test_a_search_converges_if_the_model_is_close_to_the_tracks(only_in_motion):
+    """And one whose trajectories overflow costs infinitely much, without a warning."""
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4, search=True)
+    assert found.converged
+    far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
+    assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
+    assert not np.isfinite(products(np.full((5, 2), 1e200), np.arange(5) == 0)).all()

@@ -1,31 +1,17 @@
 """The statistics of the fit and its steps, compared with dense matrices, textbook results and exact minima."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from scipy.linalg import toeplitz
+from scipy.linalg import block_diag, toeplitz
 from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
+from vinetrack.inference import marginal_likelihood as marginal
 from vinetrack.inference.fit_result import _deviate
-from vinetrack.inference.marginal_likelihood import (
-    FitState,
-    MixedProblem,
-    at_prior_means,
-    bounded_solve,
-    deviance,
-    estimate_between_trial_sd,
-    estimate_noise,
-    levenberg_marquardt_step,
-    marginal,
-    trial_deviation_sd,
-    without_deviations,
-)
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
 from vinetrack.inference.position_errors import degrees_of_freedom, precision
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
@@ -37,33 +23,24 @@ def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
     return np.asarray(sigma**2 * toeplitz(rho ** np.arange(count)))
 
 
-def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> MixedProblem:
-    return MixedProblem(
-        index=np.tile(np.arange(keys), (n_trials, 1)),
-        has_deviation=np.tile([False, True], (n_trials, 1)),
-        gauge_error=np.zeros(n_trials),
-        release_origin_mean=np.zeros((n_trials, 2)),
-        release_origin_precision=np.full((n_trials, 2), flat_sd**-2),
-        prior_mean=np.zeros(keys),
-        prior_precision=np.zeros(keys),
-        lower=np.full(keys, -np.inf),
-        upper=np.full(keys, np.inf),
-        free=np.ones(keys, dtype=bool),
-        points=np.full(n_trials, float(count)),
-        stretches=np.ones(n_trials),
-        random=np.zeros(keys, dtype=bool),
-    )
-
-
-def state_of(n_trials: int, keys: int, spread: float, rho: float = RHO, sigma: float = SIGMA) -> FitState:
+def given(
+    n_trials: int, count: int, keys: int, spread: float = 1e-5, *, rho: float = RHO, sigma: float = SIGMA, **more
+) -> tuple[marginal.MixedProblem, marginal.FitState]:
+    """A problem whose releases and origins are free, only B deviates and nothing has bounds or priors; its state."""
+    own = {"has_deviation": np.tile([False, True], (n_trials, 1)), "gauge_error": np.zeros(n_trials)}
+    own |= {"index": np.tile(np.arange(keys), (n_trials, 1)), "release_origin_mean": np.zeros((n_trials, 2))}
+    own |= {"points": np.full(n_trials, float(count)), "stretches": np.ones(n_trials)}
+    own |= {"release_origin_precision": np.full((n_trials, 2), 1e-6)}
+    shared = {name: np.zeros(keys) for name in ("prior_mean", "prior_precision")} | {"free": np.ones(keys, bool)}
+    shared |= {"lower": np.full(keys, -np.inf), "upper": np.full(keys, np.inf), "random": np.zeros(keys, bool)}
     variance = np.full(n_trials, sigma**2 * (1 - rho**2))
-    return FitState(np.zeros(keys), np.zeros((n_trials, 4)), (1e-5, spread), rho, variance)
+    state = marginal.FitState(np.zeros(keys), np.zeros((n_trials, 4)), (1e-5, spread), rho, variance)
+    return marginal.MixedProblem(**(own | shared | more)), state
 
 
 def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarray]:
     """Random columns; the pressure deviation is silent, the deviation of B moves what the first key moves."""
-    draw = np.random.default_rng(seed)
-    out = []
+    draw, out = np.random.default_rng(seed), []
     for _ in range(n_trials):
         shared = draw.standard_normal((count, keys))
         own = np.column_stack([draw.standard_normal(count), np.ones(count), np.zeros(count), shared[:, 0]])
@@ -72,31 +49,26 @@ def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarr
 
 
 def crossed(columns: list[np.ndarray]) -> np.ndarray:
-    """Cross products of the columns of trials, each in one stretch."""
     return all_products(columns, [np.arange(len(columns[0])) == 0] * len(columns))
 
 
-def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
-    columns = np.random.default_rng(0).standard_normal((30, 4))
-    first = np.zeros(30, dtype=bool)
-    first[[0, 17]] = True
+def test_cross_products_agree_with_the_dense_inverse_covariance():
+    columns, first = np.random.default_rng(0).standard_normal((30, 4)), np.isin(np.arange(30), [0, 17])
     white = at_correlation(products(columns, first)[None], RHO)[0]
-    dense = np.zeros((30, 30))
-    for part in (slice(0, 17), slice(17, 30)):
-        dense[part, part] = covariance(part.stop - part.start, RHO, 1.0)
+    dense = block_diag(covariance(17, RHO, 1.0), covariance(13, RHO, 1.0))
     assert white / (1 - RHO**2) == pytest.approx(columns.T @ np.linalg.solve(dense, columns))
 
 
 @pytest.mark.parametrize(("flat_sd", "moved"), [(50.0, 0.0), (0.5, 2.0)])
-def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd: float, moved: float) -> None:
+def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd, moved):
     """Also where the data have moved release and origin far from their priors."""
     n_trials, count, keys, spread = 3, 12, 2, 0.7
     columns = columns_of(n_trials, count, keys, seed=2)
     effects = np.tile([moved, -moved, 0.0, 0.0], (n_trials, 1))
-    frame = frame_of(n_trials, count, keys, flat_sd)
-    state = replace(state_of(n_trials, keys, spread), trial_effects=effects)
-    part = marginal(crossed(columns), frame, state)
-    found = deviance(part, frame, state, state.spread, restricted=False)
+    frame, state = given(n_trials, count, keys, spread, release_origin_precision=np.full((n_trials, 2), flat_sd**-2))
+    state = replace(state, trial_effects=effects)
+    part = marginal.marginal(crossed(columns), frame, state)
+    found = marginal.deviance(part, frame, state, state.spread, restricted=False)
     # The same by brute force: shared numbers by least squares, then the density of what is left.
     noise = covariance(count, RHO, SIGMA)
     for c in columns:
@@ -105,25 +77,24 @@ def test_the_marginal_likelihood_agrees_with_the_dense_gaussian(flat_sd: float, 
     square = sum(c[:, 4:6].T @ np.linalg.solve(v, c[:, 4:6]) for c, v in zip(columns, dense, strict=True))
     slope = sum(c[:, 4:6].T @ np.linalg.solve(v, c[:, 6]) for c, v in zip(columns, dense, strict=True))
     best = np.linalg.solve(square, slope)
-    direct = -2 * sum(
-        multivariate_normal(np.zeros(count), v).logpdf(c[:, 6] - c[:, 4:6] @ best)
-        for c, v in zip(columns, dense, strict=True)
-    )
+    left = [(c[:, 6] - c[:, 4:6] @ best, v) for c, v in zip(columns, dense, strict=True)]
+    direct = -2 * sum(multivariate_normal(np.zeros(count), v).logpdf(residual) for residual, v in left)
     assert found == pytest.approx(direct, rel=1e-8)
 
 
-def test_residuals_at_zero_deviations_are_restored() -> None:
+def test_residuals_at_zero_deviations_are_restored():
     columns = columns_of(3, 15, 2, seed=8)
-    state = replace(state_of(3, 2, 0.5), trial_effects=np.random.default_rng(9).standard_normal((3, 4)))
+    frame, state = given(3, 15, 2, 0.5, release_origin_precision=np.zeros((3, 2)))
+    state = replace(state, trial_effects=np.random.default_rng(9).standard_normal((3, 4)))
     whole = [c.copy() for c in columns]
     for column, effects in zip(whole, state.trial_effects, strict=True):
         column[:, -1] += column[:, 2:4] @ effects[2:]
     white = at_correlation(crossed(columns), RHO)
-    frame = replace(frame_of(3, 15, 2), release_origin_precision=np.zeros((3, 2)))
-    assert at_prior_means(white, frame, state, -1) == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
+    restored = marginal.at_prior_means(white, frame, state, -1)
+    assert restored == pytest.approx(at_correlation(crossed(whole), RHO), rel=1e-9)
 
 
-def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -> None:
+def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions():
     """Squares of 1e12 times the noise, of which that of the noise is left: held against exact fractions.
 
     With the inverse of I + S Z S written out, 30 trials of 16 µm were credited with 250 in ln L.
@@ -146,31 +117,22 @@ def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -
         for j in range(i + 1, 4):
             part = whole[j][i] / pivot[i]
             whole[j] = [a - part * b for a, b in zip(whole[j], pivot, strict=True)]
-    left, log_det = without_deviations(np.array(block, dtype=float)[None], np.array([roots], dtype=float))
+    left, log_det = marginal.without_deviations(np.array(block, dtype=float)[None], np.array([roots], dtype=float))
     exact = np.array([[float(value) for value in row[2:]] for row in whole[2:]])
     assert np.triu(left[0]) == pytest.approx(np.triu(exact), rel=1e-3)
     assert log_det == pytest.approx(math.log(determinant), rel=1e-9)
 
 
-def test_collinear_parameters_are_left_to_least_squares() -> None:
-    draw = np.random.default_rng(10)
-    rows, seen = draw.standard_normal((30, 4)), draw.standard_normal(30)
-    twice = np.column_stack([rows, rows[:, 1]])
-    step, _ = bounded_solve(twice.T @ twice, twice.T @ seen, frame_of(1, 5, 5), np.zeros(5))
-    assert twice @ step == pytest.approx(rows @ np.linalg.lstsq(rows, seen, rcond=None)[0], abs=1e-9)
-    assert step[1] == pytest.approx(step[4])
-
-
-def test_the_restricted_likelihood_adds_the_information() -> None:
+def test_the_restricted_likelihood_adds_the_information():
     columns = columns_of(4, 20, 2, seed=3)
-    frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
-    part = marginal(crossed(columns), frame, state)
-    more = deviance(part, frame, state, state.spread) - deviance(part, frame, state, state.spread, restricted=False)
-    covariance_of_numbers = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
-    assert more == pytest.approx(-np.linalg.slogdet(covariance_of_numbers.covariance)[1], rel=1e-8)
+    frame, state = given(4, 20, 2, 0.5)
+    part = marginal.marginal(crossed(columns), frame, state)
+    restricted, plain = (marginal.deviance(part, frame, state, state.spread, restricted=how) for how in (True, False))
+    known = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
+    assert restricted - plain == pytest.approx(-np.linalg.slogdet(known.covariance)[1], rel=1e-8)
 
 
-def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
+def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance():
     """So are the error of the common level, which is that of a mean of trials, and its degrees of freedom."""
     n_trials, count, draw = 12, 25, np.random.default_rng(4)
     levels = 2.0 + 0.05 * draw.standard_normal(n_trials)
@@ -178,8 +140,9 @@ def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() 
     columns = [np.column_stack([own, level + 0.01 * draw.standard_normal(count)]) for level in levels]
     means = np.array([c[:, -1].mean() for c in columns])
     cross_products = crossed(columns)
-    frame, state = frame_of(n_trials, count, 1), state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
-    found = estimate_between_trial_sd(marginal(cross_products, frame, state), frame, state, (False, True))
+    frame, state = given(n_trials, count, 1, 0.3, rho=0.0, sigma=0.01)
+    part = marginal.marginal(cross_products, frame, state)
+    found = marginal.estimate_between_trial_sd(part, frame, state, (False, True))
     solution = Solution(replace(state, spread=found), frame, cross_products, (), (False, True), True, 1)
     assert found[1] == pytest.approx(math.sqrt(means.var(ddof=1) - 0.01**2 / 25), rel=2e-3)
     assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
@@ -187,7 +150,7 @@ def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() 
 
 
 @pytest.mark.parametrize("start", [(0.04, 1e-3), (0.04, 0.1), (1e-3, 0.1), (1e-5, 1e-5)])
-def test_two_between_trial_standard_deviations_are_found_from_any_start(start: tuple[float, float]) -> None:
+def test_two_between_trial_standard_deviations_are_found_from_any_start(start):
     # Pressure and B move a trial alike but for a tenth, so that one can stand for the other.
     n_trials, count, draw = 24, 40, np.random.default_rng(31)
     slope, bend = np.linspace(0, 1, count), np.linspace(-1, 1, count) ** 2
@@ -196,71 +159,69 @@ def test_two_between_trial_standard_deviations_are_found_from_any_start(start: t
         own = np.column_stack([0 * slope, 0 * slope, slope + 0.1 * bend, -0.4 * slope])
         seen = own[:, 2:] @ deviations + 1e-4 * draw.standard_normal(count)
         columns.append(np.column_stack([own, slope, seen]))
-    frame = replace(frame_of(n_trials, count, 1), has_deviation=np.ones((n_trials, 2), dtype=bool))
-    state = replace(state_of(n_trials, 1, 0.0, rho=0.0, sigma=1e-4), spread=start)
-    part = marginal(crossed(columns), frame, state)
-    pressure, damping = estimate_between_trial_sd(part, frame, state, (True, True))
+    frame, state = given(n_trials, count, 1, rho=0.0, sigma=1e-4, has_deviation=np.ones((n_trials, 2), bool))
+    state = replace(state, spread=start)
+    part = marginal.marginal(crossed(columns), frame, state)
+    pressure, damping = marginal.estimate_between_trial_sd(part, frame, state, (True, True))
     assert pressure == pytest.approx(0.004, rel=0.4)
     assert damping == pytest.approx(0.02, rel=0.4)
 
 
-def test_noise_is_estimated_without_the_bias_of_fitted_parameters() -> None:
-    draw = np.random.default_rng(7)
+def test_noise_is_estimated_without_the_bias_of_fitted_parameters():
+    columns, draw = [], np.random.default_rng(7)
     n_trials, count, rho = 300, 30, 0.4
-    columns = []
+    flat = np.column_stack([np.linspace(-1, 1, count), np.ones(count)])
     for _ in range(n_trials):
-        line = np.linspace(-1, 1, count)
         noise = np.linalg.cholesky(covariance(count, rho, 1.0)) @ draw.standard_normal(count)
-        flat = np.column_stack([line, np.ones(count)])
         noise -= flat @ np.linalg.lstsq(flat, noise, rcond=None)[0]
         columns.append(np.column_stack([flat, np.zeros((count, 2)), noise]))
     cross_products = crossed(columns)
-    frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
-    found, variance = estimate_noise(cross_products, frame, state)
+    frame, state = given(n_trials, count, 0, rho=0.0, sigma=1.0)
+    found, variance = marginal.estimate_noise(cross_products, frame, state)
     # 9000 points: ρ to 0.01, σ² to 2 %. Without counting the line ρ would come out 0.06 too small.
     assert found == pytest.approx(rho, abs=0.03)
     assert variance.mean() == pytest.approx(1 - rho**2, rel=0.05)
 
 
 @pytest.mark.parametrize(("louder", "lowest", "highest"), [(1.0, 0.0, 0.5), (5.0, 0.8, 1.2)])
-def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_differences(
-    louder: float, lowest: float, highest: float
-) -> None:
+def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_differences(louder, lowest, highest):
     """Of twelve points σ² scatters by 41 % of itself; what half of the trials have 25 times over is no chance."""
     draw = np.random.default_rng(20670)
     n_trials, count = 40, 12
     sd = np.where(np.arange(n_trials) % 2, louder, 1.0)
     columns = [np.column_stack([np.zeros((count, 4)), s * draw.standard_normal(count)]) for s in sd]
     cross_products = crossed(columns)
-    frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
-    _, variance = estimate_noise(cross_products, frame, state, rho=0.0)
+    frame, state = given(n_trials, count, 0, rho=0.0, sigma=1.0)
+    _, variance = marginal.estimate_noise(cross_products, frame, state, rho=0.0)
     alone = np.array([np.mean(block[:, -1] ** 2) for block in columns])
     assert lowest < np.std(np.log(variance)) / np.std(np.log(alone)) < highest
     assert np.mean(variance) == pytest.approx(np.mean(alone), rel=0.1)
 
 
-def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge() -> None:
-    frame = replace(frame_of(3, 25, 1), gauge_error=np.array([0.0, 4e-3, 0.0]))
-    assert trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(
-        np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]])
-    )
+def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge():
+    frame, _ = given(3, 25, 1, gauge_error=np.array([0.0, 4e-3, 0.0]))
+    expected = [[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]]
+    assert marginal.trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(np.array(expected))
 
 
-def test_collinear_parameters_are_detected() -> None:
+def test_collinear_parameters_are_detected_and_left_to_least_squares():
     columns = columns_of(4, 25, 3, seed=10)
     for c in columns:
         c[:, 6] = 2 * c[:, 5]
-    solution = Solution(
-        state_of(4, 3, 0.1), frame_of(4, 25, 3), crossed(columns), (), (False, True),
-        True, 1,
-    )  # fmt: skip
-    found = precision(solution)
+    frame, state = given(4, 25, 3, 0.1)
+    found = precision(Solution(state, frame, crossed(columns), (), (False, True), True, 1))
     assert found.collinear.tolist() == [False, True, True]
     assert np.isinf(found.covariance[1, 1])
     assert np.isfinite(found.covariance[0, 0])
+    draw = np.random.default_rng(10)
+    rows, seen = draw.standard_normal((30, 4)), draw.standard_normal(30)
+    twice = np.column_stack([rows, rows[:, 1]])
+    step, _ = marginal.bounded_solve(twice.T @ twice, twice.T @ seen, given(1, 5, 5)[0], np.zeros(5))
+    assert twice @ step == pytest.approx(rows @ np.linalg.lstsq(rows, seen, rcond=None)[0], abs=1e-9)
+    assert step[1] == pytest.approx(step[4])
 
 
-def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None:
+def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate():
     # χ² with two degrees of freedom exceeds 5.9915 in 5 % of cases, a single number 1.96 standard errors as often.
     assert _deviate(np.array([math.sqrt(5.991465), 0.0]), np.eye(2)) == pytest.approx(1.959964, abs=1e-4)
     assert _deviate(np.zeros(2), np.eye(2)) == pytest.approx(0.0, abs=1e-9)
@@ -268,19 +229,16 @@ def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None
     assert _deviate(np.array([40.0, 0.0]), np.eye(2)) == pytest.approx(39.9, abs=0.15)
 
 
-# Steps of the fit, compared with exact minima within bounds.
-
-
 @pytest.mark.parametrize("seed", range(40))
-def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed: int) -> None:
+def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed):
     draw = np.random.default_rng(seed)
     columns = draw.standard_normal((12, 6)) + 2 * draw.standard_normal((12, 1))
     square, slope, free = columns.T @ columns, columns.T @ draw.standard_normal(12) * 10, np.ones(6, bool)
     free[seed % 6] = False
     # At their bounds from the start, near them, and free of them.
     theta = np.clip(draw.uniform(-2, 3, 6), -1, 2)
-    problem = replace(frame_of(1, 5, 6), lower=np.full(6, -1.0), upper=np.full(6, 2.0), free=free)
-    step, _ = bounded_solve(square, slope, problem, theta)
+    problem, _ = given(1, 5, 6, lower=np.full(6, -1.0), upper=np.full(6, 2.0), free=free)
+    step, _ = marginal.bounded_solve(square, slope, problem, theta)
     target = np.linalg.lstsq(columns.T, slope, rcond=None)[0]
     exact = lsq_linear(columns[:, free], target, (-1 - theta[free], 2 - theta[free]), tol=1e-14, method="bvls").x
     best = exact @ (2 * slope[free] - square[np.ix_(free, free)] @ exact)
@@ -290,15 +248,12 @@ def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed: int) -> None:
 
 @pytest.mark.parametrize("damping", [0.0, 0.1, 100.0])
 @pytest.mark.parametrize("bound", [np.inf, 0.02])
-def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping: float, bound: float) -> None:
-    n_trials, count, keys = 4, 20, 2
-    columns = columns_of(n_trials, count, keys, seed=8)
+def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping, bound):
+    columns, starts = columns_of(4, 20, 2, seed=8), np.arange(20) == 0
     for each in columns:
         each[:, -1] += each[:, 5]
-    frame = replace(frame_of(n_trials, count, keys), lower=np.full(keys, -bound), upper=np.full(keys, bound))
-    state = state_of(n_trials, keys, 0.5)
-    starts = np.arange(count) == 0
-    step, own, predicted = levenberg_marquardt_step(all_products(columns, [starts] * n_trials), frame, state, damping)
+    frame, state = given(4, 20, 2, 0.5, lower=np.full(2, -bound), upper=np.full(2, bound))
+    step, own, predicted = marginal.levenberg_marquardt_step(crossed(columns), frame, state, damping)
 
     def cost(theta: np.ndarray, effects: np.ndarray) -> float:
         left = [c[:, -1] - c[:, 4:6] @ theta - c[:, :4] @ u for c, u in zip(columns, effects, strict=True)]
@@ -306,18 +261,18 @@ def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping: fl
         prior = np.array([1e-3, 1e-3, 1e5, 2.0]) ** 2
         return sum(float(w @ w) for w in white) / float(state.variance[0]) + float(np.sum(prior * effects**2))
 
-    lowered = cost(np.zeros(keys), np.zeros((n_trials, 4))) - cost(step, own)
+    lowered = cost(np.zeros(2), np.zeros((4, 4))) - cost(step, own)
     assert predicted == pytest.approx(lowered, rel=1e-6)
 
 
-def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence() -> None:
+def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence():
     columns = columns_of(4, 20, 2, seed=8)
     for each in columns:
         each[:, -1] += each[:, 5]
-    frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
+    frame, state = given(4, 20, 2, 0.5)
     cross_products = crossed(columns)
-    assert levenberg_marquardt_step(cross_products, frame, state, 1e6)[2] < CONVERGED_DECREASE
+    assert marginal.levenberg_marquardt_step(cross_products, frame, state, 1e6)[2] < CONVERGED_DECREASE
     (step, _, decrease), damping = _next_step(cross_products, frame, state, 1e6, CONVERGED_DECREASE)
     assert decrease > CONVERGED_DECREASE
     assert damping == 0
-    assert step == pytest.approx(levenberg_marquardt_step(cross_products, frame, state, 0.0)[0])
+    assert step == pytest.approx(marginal.levenberg_marquardt_step(cross_products, frame, state, 0.0)[0])

@@ -1,14 +1,22 @@
-"""Prose stands in one room: every code has its sentence, and nothing outside cuts a sentence up to learn from it."""
-
-from __future__ import annotations
+"""Prose stands in one room, a sentence for every code; one stored text of each kind shows a change of words."""
 
 import ast
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pytest
+from hand_diagnosis import diagnosis
+
 import vinetrack
+from vinetrack.core.problems import remark
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
+from vinetrack.diagnosis.result import VERDICTS, Diagnosis
 from vinetrack.narrative import SENTENCES
-from vinetrack.narrative.diagnosis_text import REMARKS
+from vinetrack.narrative.diagnosis_text import REMARKS, further_lines
+from vinetrack.narrative.verdict_text import summary_facts, verdict_meaning, verdict_sentence
 
 PACKAGE = Path(vinetrack.__file__).parent
 FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
@@ -30,7 +38,6 @@ def is_told(node: ast.AST) -> bool:
 
 
 def cuts_prose(node: ast.AST) -> bool:
-    """Whether it looks for constant words in a sentence."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CUTS:
         constant = bool(node.args) and isinstance(node.args[0], ast.Constant)
         return constant and is_told(node.func.value)
@@ -39,7 +46,7 @@ def cuts_prose(node: ast.AST) -> bool:
     return False
 
 
-def test_no_module_outside_the_room_of_prose_parses_it() -> None:
+def test_no_module_outside_the_room_of_prose_parses_it():
     cut = [
         (str(path.relative_to(PACKAGE)), ast.unparse(node)[:90])
         for path in FILES
@@ -49,8 +56,60 @@ def test_no_module_outside_the_room_of_prose_parses_it() -> None:
     assert cut == []
 
 
-def test_every_code_has_a_sentence_and_every_sentence_a_code() -> None:
+def test_every_code_has_a_sentence_and_every_sentence_a_code():
     makers = ("inference", "diagnosis", "planning", "pipeline")
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name in makers)
     assert set(re.findall(r'\b[Rr]emark\(\s*["\'](\w+)["\']', source)) <= SENTENCES.keys() | REMARKS.keys()
     assert [code for code in (*SENTENCES, *REMARKS) if not re.search(rf"""["']{code}["']""", source)] == []
+
+
+def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPower:
+    sizes = tuple(float(size) for size in at_half * np.linspace(0.5, 1.5, len(PROBABILITIES)))
+    return EffectPower(name, "physical", f"{name}.size", symbol, "1", 0.0, 0.0, largest, sizes, {"inlet_loss": 0.26})
+
+
+POWER = Power(
+    n_trials=6,
+    threshold=4.0,
+    false_alarms={"scores of all candidates": 0.003, "any smooth force": 0.0012},
+    effects=(effect("fold_inertia", "η", 0.7, 1.0), effect("air_drag", "C_D", 150.0, 3.0)),
+    not_testable={"payload_drag": remark("column_blank", column="payload_g")},
+    numbers=(NumberWidth("n", "", 0.37, 0.0075), NumberWidth("B", "tube", 6.4, 0.034)),
+    inputs=(PowerInput("frame rate", "1069 /s", "sheet"),),
+    model=("gravity", "eversion_damping"),
+)
+
+
+def verdicts() -> str:
+    told = [Diagnosis.from_json(diagnosis(verdict)) for verdict in VERDICTS]
+    parts = []
+    for said in told:
+        facts = [f"{fact.question}: {fact.answer} ({fact.note})" for fact in summary_facts(said, None)]
+        parts.append("\n".join([verdict_sentence(said), verdict_meaning(said), *facts, "", str(said)]))
+    return "\n\n----\n".join(parts)
+
+
+def power() -> str:
+    wary = replace(POWER, effects=(), wary=remark("excess_counted_as_noise"))
+    return f"{POWER}\n\n----\n{wary}"
+
+
+def plan() -> str:
+    none = FurtherTrials(POWER["fold_inertia"], 0.5, 0.9, 0.2)
+    enough, never = replace(none, before=0.95), replace(none, unlimited=0.4, n_conditions=12)
+    trials = [{"replicates": 2, "pressure_kPa": 30.0, "payload_g": 20.0, "diameter_mm": 24.0, "thickness_um": 200.0,
+               "length_mm": 280.0, "chamber_l": 3.7, "inlet_mm": 5.7, "growth_angle_deg": math.nan,
+               "new_vine": False, "changed": ["inlet_mm"]}]  # fmt: skip
+    pair = "air_drag | inlet_loss"
+    facts = {"trials": trials, "if_true": {pair: {"air_drag": 10.0, "inlet_loss": 4.3}}, "least_sigma": 3.0}
+    facts |= {"simulated": {pair: (4.0, 0.5)}, "unresolved": [], "measurement": remark("")}
+    made = [remark(code, **facts) for code in ("trials_to_make", "no_trials_separate")]
+    first = remark("measure_first", faults=["length_scale", "time_base"], measurement=remark(""))
+    further = [line for one in (none, enough, never) for line in further_lines(one)]
+    return "\n".join([*further, *map(str, [*made, first])])
+
+
+@pytest.mark.parametrize("make", [verdicts, power, plan])
+def test_the_text_is_the_stored_one(make):
+    stored = Path(__file__).with_name(f"{make.__name__}.txt")
+    assert make() + "\n" == stored.read_text(encoding="utf-8"), f"if it is meant to be so, store it in {stored.name}"
