@@ -6,7 +6,6 @@ import gc
 import os
 from collections.abc import Generator
 from itertools import count
-from pathlib import Path
 
 import pytest
 
@@ -34,7 +33,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _folder_of_memories(tmp_path_factory: pytest.TempPathFactory):
+def _folder_of_memories(tmp_path_factory):
     """A folder for what programs remember of their user, for fixtures that live longer than a test too."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("state")
@@ -43,6 +42,6 @@ def _folder_of_memories(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(autouse=True)
-def _no_memory_of_the_user(_folder_of_memories: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_memory_of_the_user(_folder_of_memories, monkeypatch):
     """Each test, and the processes that it starts, meet own effects for the first time."""
     monkeypatch.setenv("XDG_STATE_HOME", str(_folder_of_memories / str(next(FOLDERS))))

@@ -114,7 +114,7 @@ def constants(path: Path) -> int:
     return count
 
 
-def test_every_room_stays_within_its_budget() -> None:
+def test_every_room_stays_within_its_budget():
     size = {name: [0, 0, 0] for name in BUDGETS}
     for path in FILES:
         if room(path) != "__init__" and not is_effect(path):
@@ -126,7 +126,7 @@ def test_every_room_stays_within_its_budget() -> None:
     assert not over, "rooms over their budget of lines, files, constants: take something out"
 
 
-def test_a_file_uses_its_own_floor_and_those_below_and_nothing_but_itself_uses_the_laboratory() -> None:
+def test_a_file_uses_its_own_floor_and_those_below_and_nothing_but_itself_uses_the_laboratory():
     rooms = {path: rooms_used(path) - {room(path)} for path in FILES}
     top = len(FLOORS)  # where the package's own __init__.py stands
     above = [(path, one) for path, used in rooms.items() for one in used if FLOORS[one] > FLOORS.get(room(path), top)]
@@ -134,7 +134,7 @@ def test_a_file_uses_its_own_floor_and_those_below_and_nothing_but_itself_uses_t
     assert not [path for path, used in rooms.items() if "laboratory" in used]
 
 
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_no_modules_import_each_other_in_a_circle():
     """At import; what a function imports when it is called does not count."""
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in FILES}
     users: dict[str, set[str]] = {}
@@ -147,20 +147,20 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert not users
 
 
-def test_a_room_that_does_not_compute_starts_without_heavy_libraries() -> None:
+def test_a_room_that_does_not_compute_starts_without_heavy_libraries():
     quick = [path for path in FILES if room(path) not in HEAVY_AT_IMPORT]
     late = [(path, name) for path in quick for name in imports(path, True) if name.split(".")[0] in HEAVY]
     assert not late
 
 
 @pytest.mark.parametrize("module", ["vinetrack.cli.main", "vinetrack.pipeline.workflow"])
-def test_the_command_line_and_the_workflow_load_no_heavy_library(module: str) -> None:
+def test_the_command_line_and_the_workflow_load_no_heavy_library(module):
     code = f"import sys, {module}; print(*sorted(set(sys.modules) & {HEAVY!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 
 
-def test_importing_a_file_does_no_work() -> None:
+def test_importing_a_file_does_no_work():
     """Loops, reading and writing at the top of a file would run in every process that imports it."""
     forbidden = []
     for path in FILES:
@@ -174,7 +174,7 @@ def test_importing_a_file_does_no_work() -> None:
     assert not forbidden
 
 
-def test_the_page_on_the_architecture_lists_the_rooms_from_the_bottom_to_the_top() -> None:
+def test_the_page_on_the_architecture_lists_the_rooms_from_the_bottom_to_the_top():
     table = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").partition("## Data flow")[0]
     rows = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.splitlines() if line.startswith("| `")]
     listed = [name for row in rows for name in row]
@@ -182,19 +182,19 @@ def test_the_page_on_the_architecture_lists_the_rooms_from_the_bottom_to_the_top
     assert listed == sorted(listed, key=FLOORS.__getitem__)
 
 
-def test_a_snakefile_has_rules_only() -> None:
+def test_a_snakefile_has_rules_only():
     text = (PACKAGE / "pipeline" / "Snakefile").read_text(encoding="utf-8")
     assert not [line for line in text.splitlines() if line.startswith(("def ", "class ", "    def "))]
 
 
-def test_no_two_modules_and_no_two_test_files_share_a_name() -> None:
+def test_no_two_modules_and_no_two_test_files_share_a_name():
     """Pytest imports test files by their name alone: the second of two would not be run. It knows each conftest.py."""
     for paths in (FILES, (ROOT / "tests").rglob("*.py")):
         names = Counter(path.stem for path in paths if path.stem != "conftest" and not path.stem.startswith("__"))
         assert not [name for name, times in names.items() if times > 1]
 
 
-def test_a_benchmark_finds_what_it_imports() -> None:
+def test_a_benchmark_finds_what_it_imports():
     missing = []
     for path in sorted((ROOT / "benchmarks").rglob("*.py")):
         for node in ast.walk(parsed(path)):
@@ -209,7 +209,7 @@ def test_a_benchmark_finds_what_it_imports() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(vinetrack._HOMES))
-def test_a_name_of_the_python_interface_is_documented(name: str) -> None:
+def test_a_name_of_the_python_interface_is_documented(name):
     """Arguments with their meaning, what is returned (numpydoc), and an example."""
     thing = getattr(vinetrack, name)
     text = thing.__doc__ or ""
@@ -222,7 +222,7 @@ def test_a_name_of_the_python_interface_is_documented(name: str) -> None:
         assert not arguments or "Returns\n" in text
 
 
-def test_a_module_takes_no_private_name_of_another_room() -> None:
+def test_a_module_takes_no_private_name_of_another_room():
     private = []
     for path in FILES:
         for node in ast.walk(parsed(path)):
@@ -233,7 +233,7 @@ def test_a_module_takes_no_private_name_of_another_room() -> None:
     assert not private
 
 
-def test_every_deliberate_fault_still_finds_the_text_that_it_alters() -> None:
+def test_every_deliberate_fault_still_finds_the_text_that_it_alters():
     command = [sys.executable, str(ROOT / "benchmarks" / "mutations.py"), "--list"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -32,7 +32,7 @@ def links(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_links_lead_somewhere_pictures_are_small_and_nothing_names_the_machine(page: Path) -> None:
+def test_links_lead_somewhere_pictures_are_small_and_nothing_names_the_machine(page):
     assert [link for link in links(page) if not (page.parent / link).exists()] == []
     assert re.findall(r"(?<![\w.])/(?:tmp|home|root|work|Users)\b", page.read_text(encoding="utf-8")) == []
     for path in (page.parent / name for name in links(page) if name.endswith((".png", ".webp"))):
@@ -42,7 +42,7 @@ def test_links_lead_somewhere_pictures_are_small_and_nothing_names_the_machine(p
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_commands_on_the_page_exist_with_their_options(page: Path) -> None:
+def test_commands_on_the_page_exist_with_their_options(page):
     text = page.read_text(encoding="utf-8")
     lines = [line.strip().removeprefix("$ ") for line in text.splitlines() if line.startswith("    ")]
     for line in lines:
@@ -60,14 +60,14 @@ def test_commands_on_the_page_exist_with_their_options(page: Path) -> None:
         assert asked - {"--help"} <= known, line
 
 
-def test_every_page_of_the_docs_is_reached_from_the_readme_and_is_in_the_navigation_once() -> None:
+def test_every_page_of_the_docs_is_reached_from_the_readme_and_is_in_the_navigation_once():
     names = [page.name for page in PAGES[1:]]
     assert set(names) <= {Path(link).name for link in links(PAGES[0])}
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
     assert sorted(re.findall(r"[\w-]+\.md\b", navigation)) == sorted(names)
 
 
-def test_the_readme_is_short_and_shows_a_result_and_every_command_a_person_gives() -> None:
+def test_the_readme_is_short_and_shows_a_result_and_every_command_a_person_gives():
     text = PAGES[0].read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 120
     assert "![" in text.split("\n## ")[0]
@@ -76,14 +76,14 @@ def test_the_readme_is_short_and_shows_a_result_and_every_command_a_person_gives
             assert f"`{name}" in text, name
 
 
-def test_the_citation_and_the_changelog_name_the_version_of_the_package() -> None:
+def test_the_citation_and_the_changelog_name_the_version_of_the_package():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     released = re.findall(r"^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert re.findall(r"^version: (.+)$", citation, re.MULTILINE) == [vinetrack.__version__]
     assert released[:1] == [vinetrack.__version__]
 
 
-def test_the_reference_holds_all_that_the_package_offers() -> None:
+def test_the_reference_holds_all_that_the_package_offers():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     offered = set(vinetrack.__all__) - {"__version__", "effects", "FitError"}
     assert not {name for name in offered if f".{name}\n" not in text}
@@ -98,7 +98,7 @@ QUICK = [
 
 
 @pytest.mark.parametrize("shown", QUICK, ids=lambda shown: " ".join(shown.arguments[:4]))
-def test_a_command_prints_what_stands_below_it(shown: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_prints_what_stands_below_it(shown, tmp_path, monkeypatch):
     """To 2 %: another processor may round a draw to the other side."""
     monkeypatch.chdir(tmp_path)
     now = printed(shown)
@@ -107,7 +107,7 @@ def test_a_command_prints_what_stands_below_it(shown: Shown, tmp_path: Path, mon
     assert [float(number) for number in NUMBER.findall(now)] == pytest.approx(expected, rel=0.02, abs=2e-4)
 
 
-def test_the_python_on_the_page_runs() -> None:
+def test_the_python_on_the_page_runs():
     code = re.search(r"```python\n(.*?)```", DESIGN, re.DOTALL)
     assert code is not None
     known: dict[str, object] = {}
@@ -116,7 +116,7 @@ def test_the_python_on_the_page_runs() -> None:
 
 
 # docs/own_effect.md: its effect and settings work as they stand there.
-def test_its_effect_is_printed_as_shown_and_goes_through_every_stage_into_the_provenance(tmp_path: Path) -> None:
+def test_its_effect_is_printed_as_shown_and_goes_through_every_stage_into_the_provenance(tmp_path):
     experiment, results = tmp_path / "mine", tmp_path / "results"
     experiment.mkdir()
     write_effect(experiment)
@@ -144,7 +144,7 @@ FITTED = ("vinetrack.interface.loaded", "vinetrack.inference.fit", "vinetrack.in
 
 
 @pytest.mark.parametrize("name", [pytest.param(m, marks=[pytest.mark.slow] * (m in FITTED)) for m in MODULES])
-def test_the_examples_of_a_module_say_what_happens(name: str) -> None:
+def test_the_examples_of_a_module_say_what_happens(name):
     said: list[str] = []
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
     for test in doctest.DocTestFinder().find(importlib.import_module(name), name):

@@ -99,7 +99,7 @@ def read_rows(path: Path) -> dict[str, dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+def campaign(tmp_path_factory):
     """The results folder of a run over an experiment whose path has blanks, and what Snakemake printed."""
     workdir = tmp_path_factory.mktemp("a folder")
     write_campaign(workdir / "my vines (1)")
@@ -109,7 +109,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess
 
 
 @through_snakemake
-def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign: tuple) -> None:
+def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign):
     results, done = campaign
     assert done.stdout.strip().splitlines()[-1] == f"Report: results/{results.name}/report.html"
     assert (results / "report.html").is_file()
@@ -138,7 +138,7 @@ def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign: 
 
 
 @through_snakemake
-def test_speeds_and_the_damping_law_are_those_the_tracks_were_written_with(campaign: tuple) -> None:
+def test_speeds_and_the_damping_law_are_those_the_tracks_were_written_with(campaign):
     rows = read_rows(campaign[0] / "trials.csv")
     good = [f"d{diameter}_{i}" for diameter in B for i in range(len(PRESSURES_KPA))]
     assert list(rows) == [*good, "torn", "aside"]
@@ -154,7 +154,7 @@ def test_speeds_and_the_damping_law_are_those_the_tracks_were_written_with(campa
 
 
 @through_snakemake
-def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path: Path) -> None:
+def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path):
     write_track(tmp_path / "vines" / "a.csv", 12, 20, 1)
     done = snakemake(tmp_path, "--cores", "1", "--config", "experiment=vinse")
     assert done.returncode == 1
@@ -172,7 +172,7 @@ def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_one_trial_gives_everything_but_a_law_says_why_and_gives_the_same_bytes_again(tmp_path: Path) -> None:
+def test_one_trial_gives_everything_but_a_law_says_why_and_gives_the_same_bytes_again(tmp_path):
     folder, first, second = (tmp_path / name for name in ("one", "first", "second"))
     write_track(folder / "a.csv", 12, 20, 7)
     (folder / "trials.csv").write_text(SHEET + "007,a.csv,12,100,300,20,3,90\n")
@@ -189,7 +189,7 @@ def test_one_trial_gives_everything_but_a_law_says_why_and_gives_the_same_bytes_
 
 
 @pytest.mark.slow
-def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_path: Path) -> None:
+def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_path):
     folder, results = tmp_path / "v", tmp_path / "results"
     write_track(folder / "a.csv", 12, 20, 7)
     rows = [f"{name},a.csv,12,100,300,{kPa},3,0\n" for name, kPa in zip("abcd", (20, 20, 9999, 9999), strict=True)]
@@ -210,7 +210,7 @@ def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_pa
         assert said in " ".join(refused.output.split())
 
 
-def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reasons(tmp_path: Path) -> None:
+def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reasons(tmp_path):
     folder = tmp_path / "all broken"
     folder.mkdir()
     (folder / "a.csv").write_text("time_s,position_m\n1,1\n")
@@ -228,7 +228,7 @@ def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reas
 
 # A workflow that is killed goes on with the same command.
 @through_snakemake
-def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None:
+def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path):
     write_campaign(tmp_path / "vines")
     results = tmp_path / "results" / "vines"
     command = [

@@ -85,7 +85,7 @@ def add_bad_ones(videos: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+def filmed(tmp_path_factory):
     workdir = tmp_path_factory.mktemp("filmed")
     truth = film_all(workdir / "vines", GOOD, WARPED)
     add_bad_ones(workdir / "vines" / "videos")
@@ -121,7 +121,7 @@ def spread_px(found: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_a_good_recording_is_right_within_a_third_of_a_pixel(filmed: Filmed, name: str) -> None:
+def test_a_good_recording_is_right_within_a_third_of_a_pixel(filmed, name):
     assert filmed.rows[name]["status"] in ("ok", "warning")
     found = errors_px(filmed.results, name, filmed.truth[name])
     assert spread_px(found) < 0.35
@@ -135,7 +135,7 @@ def test_a_good_recording_is_right_within_a_third_of_a_pixel(filmed: Filmed, nam
     assert 0 < float(filmed.rows[name]["scale_rel_sigma"]) < 1e-3
 
 
-def test_a_recording_that_cannot_be_read_fails_and_one_without_its_end_gives_what_is_there(filmed: Filmed) -> None:
+def test_a_recording_that_cannot_be_read_fails_and_one_without_its_end_gives_what_is_there(filmed):
     page = (filmed.results / "report.html").read_text(encoding="utf-8")
     for name in ("beheaded", "letter", "gone"):
         assert filmed.rows[name]["status"] == "failed"
@@ -148,7 +148,7 @@ def test_a_recording_that_cannot_be_read_fails_and_one_without_its_end_gives_wha
     assert spread_px(errors_px(filmed.results, "part", whole)) < 0.35
 
 
-def test_the_report_shows_strips_calibration_and_a_clip_of_every_condition(filmed: Filmed) -> None:
+def test_the_report_shows_strips_calibration_and_a_clip_of_every_condition(filmed):
     page = (filmed.results / "report.html").read_text(encoding="utf-8")
     for name in (*GOOD, "part"):
         assert f'aria-label="Strip of {name} with its tracked edge"' in page
@@ -163,7 +163,7 @@ def test_the_report_shows_strips_calibration_and_a_clip_of_every_condition(filme
     assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
 
 
-def test_check_says_of_the_same_folder_what_is_wrong(filmed: Filmed) -> None:
+def test_check_says_of_the_same_folder_what_is_wrong(filmed):
     done = run("check", filmed.results.parents[1] / "vines")
     assert done.exit_code == 1
     lines = [line for line in done.output.splitlines() if line.startswith(("error", "warning"))]
@@ -173,7 +173,7 @@ def test_check_says_of_the_same_folder_what_is_wrong(filmed: Filmed) -> None:
     assert [line.split(":")[0] for line in lines] == ["error"] * 3 + ["warning"]
 
 
-def test_a_scale_that_is_given_serves_as_well(tmp_path: Path) -> None:
+def test_a_scale_that_is_given_serves_as_well(tmp_path):
     """Through a camera without distortion or tilt, for scales that know of neither."""
     folder = tmp_path / "vine"
     truth = film_all(folder, {"p36": 36}, PLAIN)["p36"]
@@ -197,7 +197,7 @@ REAL = os.environ.get("VINETRACK_REAL_DATA", "")
 
 @pytest.mark.real
 @pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
-def test_a_falling_ball_gives_g_through_the_whole_chain(tmp_path: Path) -> None:
+def test_a_falling_ball_gives_g_through_the_whole_chain(tmp_path):
     folder = tmp_path / "fall"
     folder.mkdir()
     shutil.copy(Path(REAL) / "freefall_1000fps" / "freefall.mp4", folder)

@@ -21,7 +21,7 @@ MAKE = shutil.which("make")
 
 
 @pytest.mark.skipif(MAKE is None, reason="needs make")
-def test_an_installation_that_is_up_to_date_is_left_alone(tmp_path: Path) -> None:
+def test_an_installation_that_is_up_to_date_is_left_alone(tmp_path):
     for name in ("Makefile", "requirements.lock", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path)
     (tmp_path / ".venv").mkdir()
@@ -33,7 +33,7 @@ def test_an_installation_that_is_up_to_date_is_left_alone(tmp_path: Path) -> Non
     assert subprocess.run(asked, cwd=tmp_path, env={"PATH": "/usr/bin:/bin"}, check=False).returncode == 1
 
 
-def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_no_path() -> None:
+def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_no_path():
     def locked(lock: str) -> set[str]:
         return set(re.findall(r"^([a-z0-9][a-z0-9._-]*)==", lock, flags=re.MULTILINE))
 
@@ -47,13 +47,13 @@ def test_everything_the_project_asks_for_is_locked_with_hashes_and_no_index_and_
     assert not re.search(r"https?://|file:|^--|^-[a-z]|/", lock + docs, flags=re.MULTILINE)
 
 
-def test_continuous_integration_is_a_sound_script() -> None:
+def test_continuous_integration_is_a_sound_script():
     script = ROOT / ".ci" / "run"
     assert script.stat().st_mode & 0o111
     subprocess.run(["bash", "-n", str(script)], check=True)
 
 
-def test_files_extras_targets_and_the_oldest_python_that_jobs_name_are_there() -> None:
+def test_files_extras_targets_and_the_oldest_python_that_jobs_name_are_there():
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8"))["jobs"]
     assert PROJECT["requires-python"] == f">={jobs['tests']['strategy']['matrix']['python'][0]}"
     run = "\n".join(step["run"] for job in jobs.values() for step in job["steps"] if "run" in step)
@@ -67,7 +67,7 @@ def test_files_extras_targets_and_the_oldest_python_that_jobs_name_are_there() -
 
 
 @pytest.mark.parametrize("profile", ["default", "slurm"])
-def test_profiles_hold_options_that_snakemake_knows_and_rules_that_are_there(profile: str) -> None:
+def test_profiles_hold_options_that_snakemake_knows_and_rules_that_are_there(profile):
     from snakemake.cli import get_argument_parser
 
     if profile == "slurm":

@@ -42,7 +42,7 @@ NO_FILES = dict.fromkeys(("pipe", "zero"), "a pipe or a device") | {"folder": "a
 
 
 @pytest.fixture
-def vines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def vines(tmp_path, monkeypatch):
     """An experiment of one sound track and of everything that is none."""
     folder = tmp_path / "vines"
     write_track(folder / "good.csv", 12, 20.0, 1)
@@ -58,7 +58,7 @@ def vines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_what_is_no_file_is_named_and_not_watched_and_fails_alone(vines: Path, tmp_path: Path) -> None:
+def test_what_is_no_file_is_named_and_not_watched_and_fails_alone(vines, tmp_path):
     for name, words in NO_FILES.items():
         (problem,) = [problem for problem in check_experiment(vines) if problem.trial == name]
         assert words in problem.reason
@@ -74,9 +74,7 @@ def test_what_is_no_file_is_named_and_not_watched_and_fails_alone(vines: Path, t
     assert all(words in rows[name]["reason"] for name, words in NO_FILES.items())
 
 
-def test_provenance_says_what_could_not_be_read_and_a_full_disk_is_said_as_such(
-    vines: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_provenance_says_what_could_not_be_read_and_a_full_disk_is_said_as_such(vines, tmp_path, monkeypatch):
     with monkeypatch.context() as shut:
         shut.setattr(Path, "open", Mock(side_effect=PermissionError(errno.EACCES, "permission denied", "shut")))
         inputs = describe_run(vines, [vines / "shut", vines / "pipe"], {}, ())["inputs"]
@@ -152,7 +150,7 @@ def _check_all(root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(tmp_path: Path) -> None:
+def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(tmp_path):
     for place, kind in product(PLACES, KINDS):
         _experiment(tmp_path / kind / place, place, kind)
     # In a process that is ended where it waits for a pipe.
@@ -172,9 +170,7 @@ def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(tmp_path: Pa
 
 
 @pytest.mark.parametrize("place", ["track of a vine", "picture of a recording", "pressure trace", "effect"])
-def test_what_a_link_out_of_the_folder_leads_to_is_as_good_as_the_file(
-    tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_link_out_of_the_folder_leads_to_is_as_good_as_the_file(tmp_path, place, monkeypatch):
     """Recordings lie on another disk than their sheet: `check` says of links what it says of the files."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     answers = []
@@ -198,7 +194,7 @@ def test_what_a_link_out_of_the_folder_leads_to_is_as_good_as_the_file(
 
 
 @pytest.mark.parametrize("name", ["trials.csv", "experiment.yaml", "corrections.csv", "good.csv"])
-def test_a_link_whose_disk_is_not_there_is_said_and_not_taken_for_a_file_left_out(tmp_path: Path, name: str) -> None:
+def test_a_link_whose_disk_is_not_there_is_said_and_not_taken_for_a_file_left_out(tmp_path, name):
     """Settings on a disk that is not connected would otherwise be the defaults."""
     _experiment(tmp_path / "vines", "track of a vine", "")
     path = tmp_path / "vines" / name
@@ -235,7 +231,7 @@ BOMB = b"a0: &a0 [1]\n" + b"".join(b"a%d: &a%d [*a%d, *a%d]\n" % (i, i, i - 1, i
 @example(name="experiment.yaml", content=b"ambient_pressure_kPa: 1" + b"0" * 5000)
 @example(name="trials.csv", content=b'trial,track\n"' + b"x" * 200_000 + b'",1')
 @example(name="a.trk", content=b"<object>" * 20_000)
-def test_random_bytes_raise_nothing_but_our_errors(name: str, content: bytes) -> None:
+def test_random_bytes_raise_nothing_but_our_errors(name, content):
     with tempfile.TemporaryDirectory() as scratch:  # hypothesis reuses pytest's own folder across examples
         folder = two_vines(Path(scratch))
         (folder / "a.csv").unlink()
@@ -250,7 +246,7 @@ def test_random_bytes_raise_nothing_but_our_errors(name: str, content: bytes) ->
 
 @REPEATABLE
 @given(st.floats(allow_nan=False, allow_infinity=False))
-def test_every_float_is_read_back(value: float) -> None:
+def test_every_float_is_read_back(value):
     text = repr(value)
     assert parse_number(text) == value
     assert parse_table(f"x;y\n{text.replace('.', ',')};0,5\n").numbers("x")[0] == value
@@ -259,7 +255,7 @@ def test_every_float_is_read_back(value: float) -> None:
 @pytest.mark.slow
 @REPEATABLE
 @given(st.text(alphabet=st.sampled_from("ab./\\: C~\x00\n\u2028é"), max_size=14) | st.text(max_size=20))
-def test_no_path_escapes(relative: str) -> None:
+def test_no_path_escapes(relative):
     root = Path("/srv/experiment")
     try:
         path = safe_join(root, relative)
@@ -273,13 +269,13 @@ def test_no_path_escapes(relative: str) -> None:
 # Experiments that `check` lets through reach the end of their run, however odd their motion and their clips.
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [21402, 21403, 31114, 31207])
-def test_a_drawn_experiment_meets_no_fault_of_the_program(tmp_path: Path, seed: int) -> None:
+def test_a_drawn_experiment_meets_no_fault_of_the_program(tmp_path, seed):
     write_experiment(tmp_path / "drawn", seed)
     assert not is_let_through(tmp_path / "drawn") or run_through(tmp_path / "drawn", tmp_path / "out", False) == []
 
 
 @pytest.mark.slow
-def test_a_single_trial_of_a_falling_ball_reaches_the_end_and_gives_g(tmp_path: Path) -> None:
+def test_a_single_trial_of_a_falling_ball_reaches_the_end_and_gives_g(tmp_path):
     folder = tmp_path / "ball"
     folder.mkdir()
     time_s = np.arange(120) / 240
@@ -312,7 +308,7 @@ BAD_CLIPS = {
 
 
 @pytest.mark.parametrize("name", BAD_CLIPS)
-def test_a_bad_clip_is_refused_in_a_sentence(tmp_path: Path, name: str) -> None:
+def test_a_bad_clip_is_refused_in_a_sentence(tmp_path, name):
     """Warnings are errors in tests: nothing is computed from an empty stretch on the way."""
     frames = np.clip(BAD_CLIPS[name], 0, 255).astype(np.uint8)
     path = write_video(tmp_path / "a.mkv", frames, "ffv1", "gray", playback_fps=30)

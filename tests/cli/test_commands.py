@@ -41,7 +41,7 @@ def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3\n") -> Path:
     return folder
 
 
-def test_a_page_ends_without_waiting_for_its_thread() -> None:
+def test_a_page_ends_without_waiting_for_its_thread():
     program = (
         "import atexit, sys, threading, time; atexit.register(print, 'waited')\n"
         "threading.Thread(target=time.sleep, args=(60,), daemon=True, name='vinetrack-fit').start()\n"
@@ -51,7 +51,7 @@ def test_a_page_ends_without_waiting_for_its_thread() -> None:
     assert (done.returncode, done.stdout) == (0, f"vinetrack {vinetrack.__version__}\n")
 
 
-def test_check_names_file_trial_and_column_and_says_what_two_hundred_trials_share_once(tmp_path: Path) -> None:
+def test_check_names_file_trial_and_column_and_says_what_two_hundred_trials_share_once(tmp_path):
     assert run("check", experiment(tmp_path / "sound")).exit_code == 0
     rows = "".join(f"t{i},a.csv,12,100,300,9999,3\n" for i in range(200))
     done = run("check", experiment(tmp_path / "v", rows))
@@ -60,13 +60,13 @@ def test_check_names_file_trial_and_column_and_says_what_two_hundred_trials_shar
     assert len(done.output.splitlines()) == 2
 
 
-def test_effects_lists_every_effect_with_its_formula_and_units() -> None:
+def test_effects_lists_every_effect_with_its_formula_and_units():
     output = run("effects").output
     assert all(effect.name in output and effect.formula in output for effect in catalogue().values())
     assert "N·(s/m)ⁿ" in output
 
 
-def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path) -> None:
+def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):
     folder = experiment(tmp_path / "v")
     without_input, no_json, out_of_bounds = "{}", "seed=3", '{"damping": {"resamples": 3}}'
     for settings, status in ((without_input, 1), (no_json, 2), (out_of_bounds, 1)):
@@ -77,7 +77,7 @@ def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path) -> None:
         assert run(*command, "nowhere").exit_code == 1
 
 
-def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path, monkeypatch):
     folder, log = experiment(tmp_path / "v"), tmp_path / "logs" / "a.log"
     monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen")))
     succeed("trials", folder, tmp_path / "r", "--log", log)
@@ -97,9 +97,7 @@ LADDER = (
 
 
 @pytest.mark.slow
-def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path, monkeypatch):
     trials = sheet()[6:]  # one vine at three pressures, twice each
     values = {**damping_values(trials), "reservoir_depletion.gamma": 1.2}
     scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005}
@@ -157,7 +155,7 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(
 
 # `vinetrack propose`: from a verdict of `unexplained` to an effect file that `vinetrack add` takes.
 @pytest.mark.slow
-def test_a_law_is_written_beside_the_experiment_and_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_law_is_written_beside_the_experiment_and_added(tmp_path, monkeypatch):
     """Vines that feel a force that grows with time, and one candidate, which is not it."""
     values = {"hidden.a": -0.3, "hidden.kind": float(list(FORCES).index("growing"))}
     virtual = grown(sheet_command((4,), replicates=1), 103, own=[effect_file(tmp_path)], values=values)
@@ -211,7 +209,7 @@ COMMANDS = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["films", "tracks"])
-def test_commands_answer_for_every_kind_of_results(kind: str, tmp_path: Path) -> None:
+def test_commands_answer_for_every_kind_of_results(kind, tmp_path):
     settings = SETTINGS + FEW_CANDIDATES + "model: [pressure_drive, gravity, eversion_damping, yield_pressure, leak]\n"
     experiment = make_experiment(tmp_path / "vines", SMALL, settings)
     sheet = pd.read_csv(experiment / "trials.csv")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -30,7 +29,7 @@ def row(output: str, begins: str) -> list[str]:
     return [cell.strip() for cell in line.split("  ") if cell.strip()]
 
 
-def test_the_fast_vine_in_a_table_with_units_in_files_and_from_python(tmp_path: Path) -> None:
+def test_the_fast_vine_in_a_table_with_units_in_files_and_from_python(tmp_path):
     files = [tmp_path / name for name in ("a.png", "a.csv", "a.json")]
     output = succeed("predict", *FAST, *FEW, "--figure", files[0], "--csv", files[1], "--json", files[2])
     assert "25 mm × 100 µm × 400 mm at 62 kPa, no payload, growing straight down" in output
@@ -54,7 +53,7 @@ def test_the_fast_vine_in_a_table_with_units_in_files_and_from_python(tmp_path: 
     assert math.isnan(prediction["hoop stress PD/2t"].y_over_L)
 
 
-def test_numbers_that_are_given_have_no_error_unless_one_is_given() -> None:
+def test_numbers_that_are_given_have_no_error_unless_one_is_given():
     output = run("predict", *FAST, "--B", 3.3, "--n", 0.37, *FEW).output
     assert row(output, "n ")[2] == "–"
     output = run("predict", *FAST, "--B", 3.3, "--B-error", 10, "--n", 0.37, "--n-error", 0.02, *FEW).output
@@ -62,7 +61,7 @@ def test_numbers_that_are_given_have_no_error_unless_one_is_given() -> None:
     assert "B is given to 10 %" in output
 
 
-def test_a_sheet_is_a_row_a_condition(tmp_path: Path) -> None:
+def test_a_sheet_is_a_row_a_condition(tmp_path):
     (tmp_path / "trials.csv").write_text(SHEET + "a,24,200,280,14,3,0\nb,24,200,280,14,3,0\nc,24,200,280,28,3,35.6\n")
     output = run("predict", tmp_path, *FEW, "--figure", tmp_path / "a.svg").output
     assert row(output, "24mm-200um-280mm_14kPa_0g")[1] == "0.95"
@@ -72,7 +71,7 @@ def test_a_sheet_is_a_row_a_condition(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_fit_is_believed_with_its_numbers_and_an_effect_of_an_experiments_own_comes_with_it(tmp_path: Path) -> None:
+def test_a_fit_is_believed_with_its_numbers_and_an_effect_of_an_experiments_own_comes_with_it(tmp_path):
     """The fit of two vines grown by scipy, seed 31."""
     results, experiment = tmp_path / "results", tmp_path / "mine"
     content = summary_of(vt.fit(vt.base_model(), small_campaign(seed=31)[0])).to_json()
@@ -100,7 +99,7 @@ INJECTOR = ("--diameter-mm", 2.5, "--length-mm", 12.5, "--pressure-kPa", 48, "--
 FASTEST = ("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60)
 
 
-def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path: Path) -> None:
+def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path):
     assert read_range("diameter_mm", "5:25") == (0.005, 0.025)
     output = succeed("design", *FASTEST, "--figure", tmp_path / "a.svg")
     film, diameter, length, pressure, hoop, *_ = row(output, "100")
@@ -108,7 +107,7 @@ def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path: Path) -
     assert (tmp_path / "a.svg").read_text().startswith("<?xml")
 
 
-def test_the_answers_of_both_designs_are_numbers_in_json(tmp_path: Path) -> None:
+def test_the_answers_of_both_designs_are_numbers_in_json(tmp_path):
     said = run("design", "reservoir", *INJECTOR, "--json", tmp_path / "r.json", "--figure", tmp_path / "a.png").output
     assert "sweeps 0.0614 mL" in said
     assert (tmp_path / "a.png").exists()
@@ -144,7 +143,7 @@ MISSING_OR_WRONG = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", MISSING_OR_WRONG)
-def test_what_is_missing_or_wrong_is_refused_with_an_exit_code(arguments: tuple[object, ...]) -> None:
+def test_what_is_missing_or_wrong_is_refused_with_an_exit_code(arguments):
     done = run(*arguments)
     assert done.exit_code == (2 if "loose" in arguments else 1)
     assert "Traceback" not in done.output

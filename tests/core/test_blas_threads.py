@@ -14,7 +14,7 @@ def threads() -> set[int]:
     return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
 
 
-def test_threads_are_limited_within_a_function_only() -> None:
+def test_threads_are_limited_within_a_function_only():
     np.ones((2, 2)) @ np.ones((2, 2))
 
     @in_one_blas_thread

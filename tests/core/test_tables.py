@@ -42,14 +42,14 @@ def table_of(tmp_path: Path, data: bytes) -> tables.Table:
         PLAIN.rstrip("\n").encode(),
     ],
 )
-def test_every_dialect_reads_to_the_same_rows(tmp_path: Path, data: bytes) -> None:
+def test_every_dialect_reads_to_the_same_rows(tmp_path, data):
     table = table_of(tmp_path, data)
     assert table.columns == ("trial", "pressure_kPa")
     assert table.rows == ROWS
     np.testing.assert_array_equal(table.numbers("pressure_kPa"), [28.5, 14.0])
 
 
-def test_cells_and_lines_stay_where_they_are(tmp_path: Path) -> None:
+def test_cells_and_lines_stay_where_they_are(tmp_path):
     """Lines of the file are counted; what is missing is blank, and what is beyond is kept."""
     assert table_of(tmp_path, "trial,Größe\na,µ\n".encode("cp1252")).rows == ({"trial": "a", "Größe": "µ"},)
     assert parse_table('a,b\n\n1,2\n,\n"x\ny",3\n4,5\n').lines == (3, 5, 7)
@@ -66,12 +66,12 @@ def test_cells_and_lines_stay_where_they_are(tmp_path: Path) -> None:
     [b"PK\x03\x04\x00\x00trials.xlsx", b"", b"\n \n", b",,\n", b"x,y,x\n1,2,3\n", b'a,b\n1,"2\n3,4\n'],
     ids=["binary", "empty", "blank", "commas", "named twice", "quote not closed"],
 )
-def test_what_is_no_table_is_refused(tmp_path: Path, data: bytes) -> None:
+def test_what_is_no_table_is_refused(tmp_path, data):
     with pytest.raises(TableError):
         table_of(tmp_path, data)
 
 
-def test_a_recording_named_as_a_table_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_named_as_a_table_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "MAX_TABLE_BYTES", 10)
     with pytest.raises(TableError):
         table_of(tmp_path, PLAIN.encode())
@@ -81,7 +81,7 @@ NO_NUMBERS = ("nan", "inf", "-Infinity", "1e400", "1_000", "12 kPa", "١٢", "²
 NO_NUMBERS += ("--1", "e5", ".", "−5", "1e", "=1", "", "  ", "\t")
 
 
-def test_numbers_and_what_is_none() -> None:
+def test_numbers_and_what_is_none():
     texts = ("0", "-1.5", "+2", ".5", "5.", "1e3", "2,5E-1", " 7 ")
     assert [parse_number(text) for text in texts] == [0.0, -1.5, 2.0, 0.5, 5.0, 1000.0, 0.25, 7.0]
     for text in NO_NUMBERS:
@@ -89,7 +89,7 @@ def test_numbers_and_what_is_none() -> None:
             parse_number(text)
 
 
-def test_thousands_and_decimals_are_not_guessed() -> None:
+def test_thousands_and_decimals_are_not_guessed():
     """1,069 fps read as 1.069 would be wrong by a factor of a thousand, in silence."""
     with pytest.raises(TableError, match=r"write 1\.0690 or 1069"):
         parse_number("1,069")
@@ -105,7 +105,7 @@ def test_thousands_and_decimals_are_not_guessed() -> None:
         table.numbers("c")
 
 
-def test_paths_inside(tmp_path: Path) -> None:
+def test_paths_inside(tmp_path):
     """A link inside the folder may point out of it."""
     for relative in ("videos/a.mp4", r"videos\a.mp4", "./videos//a.mp4", "x/../videos/a.mp4", " videos/a.mp4 "):
         assert safe_join(Path("exp"), relative) == Path("exp/videos/a.mp4")
@@ -121,7 +121,7 @@ OUTSIDE = ("", ".", "..", "../a", "a/../../b", r"..\a", "/etc/passwd", r"\\serve
 NO_NAMES = ("", ".", "..", "../x", "a/b", r"a\b", ".hidden", "a b", "é", "a\n")
 
 
-def test_paths_outside_and_names_of_results_that_leave_their_folder_are_refused() -> None:
+def test_paths_outside_and_names_of_results_that_leave_their_folder_are_refused():
     for relative in (*OUTSIDE, "a\x00b", "a\nb"):
         with pytest.raises(TableError):
             safe_join(Path("exp"), relative)
@@ -130,7 +130,7 @@ def test_paths_outside_and_names_of_results_that_leave_their_folder_are_refused(
             result_file(Path("results/x/tracks"), name, ".csv")
 
 
-def test_csv_is_read_back_to_the_same_values(tmp_path: Path) -> None:
+def test_csv_is_read_back_to_the_same_values(tmp_path):
     frame = pd.DataFrame(
         {"trial": ["a", None], "x_m": [0.1 + 0.2, np.nan], "n": [1, 2], "flag": ["", "lost;gap"], "ok": [True, False]}
     )
@@ -140,7 +140,7 @@ def test_csv_is_read_back_to_the_same_values(tmp_path: Path) -> None:
     assert lines[1:] == [f"a,{0.1 + 0.2!r},1,,True", ",NaN,2,lost;gap,False", ""]
 
 
-def test_json_has_null_for_nan_and_plain_types(tmp_path: Path) -> None:
+def test_json_has_null_for_nan_and_plain_types(tmp_path):
     content = {"n": np.float64("nan"), "a": np.array([1.0, np.inf]), "i": np.int64(3)}
     content |= {"p": Path("a/b"), "t": (1, None), "s": {"b", "a"}}
     tables.write_json(tmp_path / "x.json", content)
@@ -148,7 +148,7 @@ def test_json_has_null_for_nan_and_plain_types(tmp_path: Path) -> None:
     assert read == {"n": None, "a": [1.0, None], "i": 3, "p": "a/b", "t": [1, None], "s": ["a", "b"]}
 
 
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "figure.png"
     tables.write_text(path, "old")
     with pytest.raises(RuntimeError), tables.replacing(path) as temporary:  # noqa: PT012
@@ -190,11 +190,11 @@ LISTED = "model:\n  - gravity   # 9.81\n  # found in May\n  - air_drag\n  - leak
         ("# nothing yet\n", "model", ["a"], "# nothing yet\nmodel: [a]\n"),
     ],
 )
-def test_a_key_is_set_and_comments_stay(before: str, key: str, value: object, after: str) -> None:
+def test_a_key_is_set_and_comments_stay(before, key, value, after):
     assert with_value(before, key, value) == after
 
 
-def test_a_block_is_cleared_and_what_cannot_be_set_without_harm_is_refused() -> None:
+def test_a_block_is_cleared_and_what_cannot_be_set_without_harm_is_refused():
     after = with_value(COMMENTED, "calibration", None)
     assert parse_yaml(after, "").content == {"capture_fps": 1000, "calibration": None}
     assert "# the last line" in after
@@ -202,7 +202,7 @@ def test_a_block_is_cleared_and_what_cannot_be_set_without_harm_is_refused() -> 
         with_value("a: &x {p: 1}\nb: *x\n", "b", {"p": 2})
 
 
-def test_line_ends_and_the_mark_at_the_beginning_stay_and_a_broken_file_is_left_as_it_is(tmp_path: Path) -> None:
+def test_line_ends_and_the_mark_at_the_beginning_stay_and_a_broken_file_is_left_as_it_is(tmp_path):
     path = tmp_path / "experiment.yaml"
     path.write_bytes(b"\xef\xbb\xbfchamber_l: 2\r\nmodel: [gravity]\r\n")
     save_model(tmp_path, ["gravity", "air_drag"])
@@ -223,9 +223,7 @@ comments = st.sampled_from(["", "  # why", " # [a, b]"])
 @pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(old=words, new=words, comment=comments, block=st.booleans(), behind=st.booleans(), indent=st.integers(0, 3))
-def test_whatever_stood_there_only_the_list_changes(
-    old: list[str], new: list[str], comment: str, block: bool, behind: bool, indent: int
-) -> None:
+def test_whatever_stood_there_only_the_list_changes(old, new, comment, block, behind, indent):
     pad = " " * indent
     listed = "".join(f"\n{pad}- {word}{comment}" for word in old) if block else f" [{', '.join(old)}]{comment}"
     text = f"# head\nfirst: 1  # one\nmodel:{listed}\n" + ("last: {a: [1, 2]}  # two\n" if behind else "")

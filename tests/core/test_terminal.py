@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 from typing import Any
 
-import pytest
-
 from vinetrack.core.terminal import progress, severity_first, waiting
 from vinetrack.core.threads import njit
 from vinetrack.pipeline.stages import COMPILING, compilation_told
@@ -17,7 +15,7 @@ class Screen(io.StringIO):
         return True
 
 
-def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colour_is_for_terminals_that_want_it(monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
     assert severity_first("error: a", Screen()) == "\x1b[31;1merror\x1b[0m: a"
@@ -27,7 +25,7 @@ def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -
         assert ("\x1b" in severity_first("error: a", Screen())) == wanted
 
 
-def test_nothing_is_shown_where_nobody_looks(capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_shown_where_nobody_looks(capfd):
     assert list(progress(["a", "b"], "trials")) == ["a", "b"]
     with progress(2, "steps", unit="step") as bar, waiting("fitting"):
         bar.advance()
@@ -37,7 +35,7 @@ def test_nothing_is_shown_where_nobody_looks(capfd: pytest.CaptureFixture[str]) 
     assert capfd.readouterr() == ("", "")
 
 
-def test_compilation_is_told_once_and_code_is_compiled_where_no_folder_can_be_written(monkeypatch) -> None:
+def test_compilation_is_told_once_and_code_is_compiled_where_no_folder_can_be_written(monkeypatch):
     import numba
 
     def unwritable(cache: bool = False, **flags: Any) -> Any:

@@ -1,7 +1,5 @@
 """Units, exact by definition and read from the ending of a name; numbers as people read them."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from vinetrack.core.units import UNITS, convert, interval, number, split_unit, with_error, with_interval
 
 
-def test_inches_pounds_and_psi_are_exact_by_definition() -> None:
+def test_inches_pounds_and_psi_are_exact_by_definition():
     assert convert(1, "in", "mm") == 25.4
     assert convert(1, "ft", "in") == pytest.approx(12, rel=1e-15)
     assert convert(1, "lb", "oz") == pytest.approx(16, rel=1e-15)
@@ -18,7 +16,7 @@ def test_inches_pounds_and_psi_are_exact_by_definition() -> None:
     assert convert(180, "deg", "rad") == math.pi
 
 
-def test_a_number_goes_to_si_as_division_rounds_it_and_back() -> None:
+def test_a_number_goes_to_si_as_division_rounds_it_and_back():
     """28.7 · 0.001 is 0.028700000000000003; the double next to 0.0287 is wanted."""
     assert UNITS["mm"].to_si(28.7) == 28.7 / 1000
     assert UNITS["um"].to_si(207) == 207 / 1e6
@@ -27,7 +25,7 @@ def test_a_number_goes_to_si_as_division_rounds_it_and_back() -> None:
         assert unit.from_si(unit.to_si(0.37)) == pytest.approx(0.37, rel=1e-15)
 
 
-def test_the_longest_ending_that_is_a_unit_is_the_unit() -> None:
+def test_the_longest_ending_that_is_a_unit_is_the_unit():
     for name, parts in (("film_density_g_cm3", ("film_density", "g_cm3")), ("thickness_um", ("thickness", "um"))):
         assert split_unit(name) == parts
     for name in ("mm_per_px", "kPa"):
@@ -46,11 +44,11 @@ def test_the_longest_ending_that_is_a_unit_is_the_unit() -> None:
         (2.5, math.nan, "2.50"),
     ],
 )
-def test_a_value_ends_where_its_error_does(value: float, sigma: float, text: str) -> None:
+def test_a_value_ends_where_its_error_does(value, sigma, text):
     assert with_error(value, sigma) == text
 
 
-def test_a_number_has_three_digits_and_an_interval_shows_both_ends_to_the_same() -> None:
+def test_a_number_has_three_digits_and_an_interval_shows_both_ends_to_the_same():
     values = (0.37, 1069.0, 0.0, -2.345, 1.5e-7, math.nan, None)
     assert [number(value) for value in values] == ["0.370", "1069", "0", "-2.35", "1.50e-07", "–", "–"]
     assert interval([0.36512, 0.37449]) == "0.3651 to 0.3745"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +18,7 @@ from vinetrack.diagnosis.likelihood_ratio import Difference, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.inference.fit import fit, refit
-from vinetrack.inference.fit_result import EXPONENT, Fit, Number
+from vinetrack.inference.fit_result import EXPONENT, Number
 from vinetrack.laboratory.tracks import damping_values
 
 B = "eversion_damping.B"
@@ -50,7 +50,7 @@ def diagnosed(pairs: Pairs, candidates: Sequence[str] = PHYSICS) -> tuple[Diagno
 
 
 @pytest.fixture(scope="module")
-def trials() -> list[Trial]:
+def trials():
     return sheet((2, 4), replicates=3)
 
 
@@ -68,9 +68,7 @@ def misread(trials: Sequence[Trial], gains: Sequence[float], seed: int) -> tuple
     [(lambda i: 1 - 0.0015 * i, 7, "P", -0.0015, 0.001), (lambda i: 0.96 if i >= 10 else 1, 8, "step", -0.0408, 0.02)],
     ids=["a supply that empties", "a regulator set anew"],
 )
-def test_what_changes_in_the_course_of_a_campaign_is_named_with_its_size(
-    trials: list[Trial], gain: Callable[[int], float], seed: int, key: str, size: float, most: float
-) -> None:
+def test_what_changes_in_the_course_of_a_campaign_is_named_with_its_size(trials, gain, seed, key, size, most):
     """While pressures rise; a step with the trial from which on it holds."""
     result, sizes = misread(trials, [gain(i) for i in range(len(trials))], seed)
     assert result.verdict in (ARTEFACT, AMBIGUOUS)
@@ -82,7 +80,7 @@ def test_what_changes_in_the_course_of_a_campaign_is_named_with_its_size(
 
 
 @pytest.mark.slow
-def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials: list[Trial]) -> None:
+def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials):
     known = [replace(trial, day=str(1 + 3 * i // len(trials))) for i, trial in enumerate(trials)]
     result, sizes = misread(known, [{"1": 1.0, "2": 1.05, "3": 0.96}[trial.day] for trial in known], seed=10)
     assert result.verdict in (ARTEFACT, AMBIGUOUS)
@@ -92,7 +90,7 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials: list[Trial
 
 
 @pytest.mark.slow
-def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> None:
+def test_the_best_of_many_places_is_no_more_than_chance(trials):
     """Where nothing differs, a change may begin anywhere: what is worth as much as one chance in a thousand is rare."""
     pairs = made(trials, [1.0] * len(trials), seed=9)
     among = {difference.name: difference for difference in differences(fit(vt.base_model(), pairs, profile=False))}
@@ -103,7 +101,7 @@ def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> 
 
 
 @pytest.mark.slow
-def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_model(trials: list[Trial]) -> None:
+def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_model(trials):
     """It decides nothing where the sheet states no order; but B and n hold it, and a reader must know."""
     pairs = made(trials, [1 + 0.01 * seen for seen in uses(trials)], seed=11)
     unstated = [(replace(trial, order=np.nan), track) for trial, track in pairs]
@@ -116,7 +114,7 @@ def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_m
 
 
 @pytest.mark.slow
-def test_another_tube_for_high_pressures_is_named(trials: list[Trial]) -> None:
+def test_another_tube_for_high_pressures_is_named(trials):
     other = [trial.pressure_Pa >= (38e3 if trial.diameter_m > 0.02 else 50e3) for trial in trials]
     pairs = made(trials, [1.1 if each else 1.0 for each in other], seed=3)
     known = [(replace(t, specimen="ab"[each]), track) for (t, track), each in zip(pairs, other, strict=True)]
@@ -126,7 +124,7 @@ def test_another_tube_for_high_pressures_is_named(trials: list[Trial]) -> None:
 
 
 @pytest.mark.slow
-def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
+def test_exponents_that_differ_by_vine_are_named(trials):
     pairs: Pairs = []
     for vine, exponent in zip(dict.fromkeys(trial.vine for trial in trials), (0.40, 0.46), strict=True):
         of_vine, values = [trial for trial in trials if trial.vine == vine], {"eversion_damping.n": exponent}
@@ -138,7 +136,7 @@ def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
 
 
 @pytest.mark.slow
-def test_depletion_keeps_its_name_in_random_order(trials: list[Trial]) -> None:
+def test_depletion_keeps_its_name_in_random_order(trials):
     pairs = pairs_of(grown(trials, 5, ["reservoir_depletion"]))
     order = np.random.default_rng(5).permutation(len(trials))
     ordered = [(replace(t, order=1.0 + float(i)), track) for i, (t, track) in zip(order, pairs, strict=True)]
@@ -149,12 +147,12 @@ def test_depletion_keeps_its_name_in_random_order(trials: list[Trial]) -> None:
 
 
 @pytest.fixture(scope="module")
-def questioned(trials: list[Trial]) -> Fit:
+def questioned(trials):
     """B rises by 2 % with every use of a tube, pressures in rising order."""
     return fit(vt.base_model(), made(trials, [1 + 0.02 * seen for seen in uses(trials)], seed=1), profile=False)
 
 
-def test_the_linear_estimate_is_what_the_refit_gains(questioned: Fit) -> None:
+def test_the_linear_estimate_is_what_the_refit_gains(questioned):
     drift = next(one for one in differences(questioned) if one.name == "order_drift")
     after = refit(questioned, between=drift.terms)
     assert 2 * (after.log_likelihood - questioned.log_likelihood) == pytest.approx(drift.gain, rel=0.1)
@@ -163,9 +161,7 @@ def test_the_linear_estimate_is_what_the_refit_gains(questioned: Fit) -> None:
     assert drift.p < 1e-6
 
 
-def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(
-    questioned: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(questioned, monkeypatch):
     by_vine = Difference("n_by_vine", shared={EXPONENT: "vine"}, gain=5.0)
     (plain,) = between_fits(questioned, [by_vine], 0.0, str)
     robust = robust_ratio(plain.fit, (EXPONENT,))
@@ -177,7 +173,7 @@ def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(
     assert wider.inflation == pytest.approx(9.0)  # the same for significance, evidence and answer set
 
 
-def test_only_differences_that_follow_the_conditions_are_confounded(trials: list[Trial]) -> None:
+def test_only_differences_that_follow_the_conditions_are_confounded(trials):
     rising = np.arange(len(trials), dtype=float)[:, None]
     assert confounded(rising, trials)
     assert not confounded(rising[np.random.default_rng(0).permutation(len(trials))], trials)
@@ -193,6 +189,6 @@ def test_only_differences_that_follow_the_conditions_are_confounded(trials: list
         (("physical",), MISSING),
     ],
 )
-def test_a_verdict_says_whether_any_physics_may_be_missing(kinds: tuple[str, ...], verdict: str) -> None:
+def test_a_verdict_says_whether_any_physics_may_be_missing(kinds, verdict):
     rivals: list[Any] = [SimpleNamespace(effects=(SimpleNamespace(kind=kind),)) for kind in kinds]
     assert verdict_of(rivals) == verdict

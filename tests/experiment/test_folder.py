@@ -19,11 +19,11 @@ from vinetrack.pipeline.effects_stage import model_problems
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return two_vines(tmp_path)
 
 
-def test_a_row_becomes_a_trial_in_si_units(folder: Path) -> None:
+def test_a_row_becomes_a_trial_in_si_units(folder):
     def known(trial: Trial) -> dict[str, object]:
         return {name: value for name, value in vars(trial).items() if value == value}  # NaN equals nothing
 
@@ -50,7 +50,7 @@ def test_a_row_becomes_a_trial_in_si_units(folder: Path) -> None:
     assert known(one(folder, **cells).trials[0]) == known(expected)
 
 
-def test_shared_settings_fill_blank_cells_and_a_cell_overrides_them(folder: Path) -> None:
+def test_shared_settings_fill_blank_cells_and_a_cell_overrides_them(folder):
     sheet = "trial,track,thickness_um,length_mm,pressure_kPa\na,a.csv,200,280,28\nb,b.csv,,280,\n"
     shared = "diameter_mm: 24\nthickness_um: 150\npressure_kPa: 14\nyield_pressure_kPa: 3\nambient_pressure_kPa: 84\n"
     a, b = read_experiment(write(folder, sheet, shared + "mass_loss: as_printed\ntail_slack: free\n")).trials
@@ -60,7 +60,7 @@ def test_shared_settings_fill_blank_cells_and_a_cell_overrides_them(folder: Path
     assert (a.ambient_pressure_Pa, a.mass_loss, a.tail_slack) == (84e3, "as_printed", "free")
 
 
-def test_a_fault_of_one_row_fails_that_trial_alone_unless_strict(folder: Path) -> None:
+def test_a_fault_of_one_row_fails_that_trial_alone_unless_strict(folder):
     write(folder, GOOD.replace("b,b.csv,24", "b,b.csv,0.024"))
     experiment = read_experiment(folder)
     assert [trial.name for trial in experiment.trials] == ["a"]
@@ -73,7 +73,7 @@ def test_a_fault_of_one_row_fails_that_trial_alone_unless_strict(folder: Path) -
     assert list(read_experiment(folder, strict=False).failed) == ["b"]
 
 
-def test_a_trial_put_aside_is_listed_and_not_judged(folder: Path) -> None:
+def test_a_trial_put_aside_is_listed_and_not_judged(folder):
     sheet = f"{HEADER},use\na,a.csv,24,200,280,28,3,35.6,yes\nb,b.csv,,,,oops,,,no\n"
     experiment = read_experiment(write(folder, sheet), strict=True)
     assert [trial.name for trial in experiment.trials] == ["a"]
@@ -105,7 +105,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize(("column", "cell"), [(column, cell) for column, cells in FAULTS.items() for cell in cells])
-def test_a_broken_cell_is_named_with_file_line_trial_and_column(folder: Path, column: str, cell: str) -> None:
+def test_a_broken_cell_is_named_with_file_line_trial_and_column(folder, column, cell):
     experiment = one(folder, **{column: cell})
     (problem,) = experiment.problems
     assert (problem.severity, problem.file, problem.line) == ("error", "trials.csv", 2)
@@ -118,7 +118,7 @@ def test_a_broken_cell_is_named_with_file_line_trial_and_column(folder: Path, co
     assert list(experiment.failed) == [problem.trial]
 
 
-def test_a_legal_oddity_is_a_warning(folder: Path) -> None:
+def test_a_legal_oddity_is_a_warning(folder):
     for cells in (
         {"pressure_kPa": "2.5"},  # looks like psi
         {"pressure_kPa": "0.28", "yield_pressure_kPa": "0.03"},  # bar
@@ -138,7 +138,7 @@ def test_a_legal_oddity_is_a_warning(folder: Path) -> None:
     assert one(folder, yield_pressure_kPa="0", yield_pressure_sigma_kPa="2").problems == ()
 
 
-def test_a_video_needs_its_rate_of_capture_but_dng_frames_carry_their_own(folder: Path) -> None:
+def test_a_video_needs_its_rate_of_capture_but_dng_frames_carry_their_own(folder):
     sheet = GOOD.replace("track", "video").replace("trial,", "capture_fps,trial,").replace("\na", "\n1069,a")
     experiment = read_experiment(write(folder, sheet.replace("\nb", "\n,b")))
     assert [trial.capture_fps for trial in experiment.trials] == [1069]
@@ -149,7 +149,7 @@ def test_a_video_needs_its_rate_of_capture_but_dng_frames_carry_their_own(folder
     assert (experiment.trials[0].video, experiment.problems) == (folder / "frames", ())
 
 
-def test_a_rate_of_playback_is_suspected(folder: Path) -> None:
+def test_a_rate_of_playback_is_suspected(folder):
     """30 fps is legal, but nobody films a vine at it."""
     for file, settings, cell in (("experiment.yaml", "capture_fps: 30\n", ""), ("trials.csv", "", "30")):
         experiment = one(folder, settings, track=None, video="a.mp4", capture_fps=cell)
@@ -157,7 +157,7 @@ def test_a_rate_of_playback_is_suspected(folder: Path) -> None:
         assert [(problem.severity, problem.file) for problem in experiment.problems] == [("warning", file)]
 
 
-def test_a_falling_ball_needs_a_diameter_only(folder: Path) -> None:
+def test_a_falling_ball_needs_a_diameter_only(folder):
     experiment = read_experiment(write(folder, "trial,track,diameter_mm,travel_ratio\nball,a.csv,10,1\n"))
     (trial,) = experiment.trials
     assert (trial.vine, trial.condition) == ("10mm", "10mm_0kPa_0g")
@@ -166,7 +166,7 @@ def test_a_falling_ball_needs_a_diameter_only(folder: Path) -> None:
     assert experiment.problems == ()
 
 
-def test_a_blank_pressure_comes_from_the_track_or_the_trace_or_fails_the_trial(folder: Path) -> None:
+def test_a_blank_pressure_comes_from_the_track_or_the_trace_or_fails_the_trial(folder):
     lines = [line + f",{27.94 - i / 10}" for i, line in enumerate(TRACK.splitlines()[1:])]
     (folder / "b.csv").write_text("time_s,position_m,pressure_kPa\n" + "\n".join(lines))
     (folder / "p.csv").write_text("time_s,pressure_kPa\n0,13.96\n0.1,13\n")
@@ -180,13 +180,13 @@ def test_a_blank_pressure_comes_from_the_track_or_the_trace_or_fails_the_trial(f
         assert list(one(folder, pressure_kPa="", pressure_trace="p.csv").failed) == ["a"], trace
 
 
-def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_stated(folder: Path) -> None:
+def test_the_smooth_error_of_positions_from_elsewhere_is_unknown_unless_it_is_stated(folder):
     for setting, expected_m in (("", math.nan), ("_systematic_mm: 0.25", 2.5e-4), ("_systematic_mm: 0", 0)):
         trial = one(folder, f"position{setting}\n" if setting else "").trials[0]
         assert trial.position_systematic_m == pytest.approx(expected_m, nan_ok=True)
 
 
-def test_check_names_the_trial_whose_track_is_wrong(folder: Path) -> None:
+def test_check_names_the_trial_whose_track_is_wrong(folder):
     path = folder / "b.csv"
     path.unlink()
     one_moment, two_points = "time_s,position_m\n" + "1,1\n" * 6, "time_s,position_m\n0,0\n1,1\n"
@@ -207,7 +207,7 @@ def filmed(folder: Path, videos: dict[str, str], files: Iterable[str], settings:
     return write(folder, f"{HEADER.replace('track', 'video')},use\n{''.join(rows)}", settings)
 
 
-def test_check_looks_at_videos_and_calls_who_can_open_them(folder: Path) -> None:
+def test_check_looks_at_videos_and_calls_who_can_open_them(folder):
     filmed(folder, {name: f"{name}.mp4" for name in "abc"}, ["a.mp4"], "capture_fps: 1000\n")
     (folder / "b.mp4").write_bytes(b"")
     opened: list[str] = []
@@ -226,14 +226,14 @@ def test_check_looks_at_videos_and_calls_who_can_open_them(folder: Path) -> None
     ]
 
 
-def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder: Path) -> None:
+def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder):
     videos = {"a": "d12_24kPa_1.mp4", "b": "d12_24kP_2.mp4", "c": "other.avi"}
     filmed(folder, videos, ("d12_24kPa_1.mp4", "d12_24kPa_2.MP4", "notes.txt"), "capture_fps: 1000\n")
     remedies = {problem.trial: problem.remedy for problem in check_experiment(folder) if problem.trial}
     assert remedies == {"b": "did you mean d12_24kPa_2.MP4?", "c": "check the path and its upper and lower case"}
 
 
-def test_a_recording_that_no_row_names_is_named(folder: Path) -> None:
+def test_a_recording_that_no_row_names_is_named(folder):
     files = ["a.mp4", "left.mov", "day 2/extra.avi", "calibration/board.mp4", "target.mp4"]
     files += [f"burst/{i}.png" for i in range(5)]
     target = "calibration: {kind: checkerboard, image: target.mp4, squares: [5, 5], square_mm: 5}\n"
@@ -246,7 +246,7 @@ def test_a_recording_that_no_row_names_is_named(folder: Path) -> None:
     assert check_experiment(folder) == []
 
 
-def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(folder: Path) -> None:
+def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(folder):
     filmed(folder, {"a": "a.mp4", "b": "b.mp4"}, ("a.mp4", "b.mp4"), "capture_fps: 60\n")
 
     def slow(_experiment: Experiment, trials: list[Trial]) -> list[Problem]:
@@ -257,7 +257,7 @@ def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(fol
     assert format_problems(found) == ["error: experiment.yaml, trial a and 1 more: capture_fps is the rate of playback"]
 
 
-def test_a_missing_column_stops_the_experiment_with_one_problem(folder: Path) -> None:
+def test_a_missing_column_stops_the_experiment_with_one_problem(folder):
     for column in ("trial", "diameter_mm", "thickness_um", "length_mm", "yield_pressure_kPa"):
         cells = [line.split(",") for line in GOOD.splitlines()]
         drop = cells[0].index(column)
@@ -265,7 +265,7 @@ def test_a_missing_column_stops_the_experiment_with_one_problem(folder: Path) ->
         assert [problem.code for problem in stopped(folder) if problem.column == column] == ["missing"]
 
 
-def test_files_of_the_settings_are_there_and_inside(folder: Path) -> None:
+def test_files_of_the_settings_are_there_and_inside(folder):
     target = "calibration: {kind: checkerboard, image: %s, squares: [5, 5], square_mm: 5}\n"
     (problem,) = check_experiment(write(folder, GOOD, target % "c.png"))
     assert (problem.file, problem.column, problem.code) == ("experiment.yaml", "calibration.image", "no_file")
@@ -274,7 +274,7 @@ def test_files_of_the_settings_are_there_and_inside(folder: Path) -> None:
         assert (problem.file, stopped(folder)) == ("experiment.yaml", (problem,))
 
 
-def test_all_problems_of_sheet_and_settings_come_at_once(folder: Path) -> None:
+def test_all_problems_of_sheet_and_settings_come_at_once(folder):
     write(folder, GOOD.replace(",28,", ",28000,").replace("\nb,", "\na,"), "strikt: true\ntail_slack: none\n")
     assert {(problem.file, problem.column, problem.line) for problem in stopped(folder)} == {
         ("experiment.yaml", "strikt", 1),
@@ -284,12 +284,12 @@ def test_all_problems_of_sheet_and_settings_come_at_once(folder: Path) -> None:
     }
 
 
-def test_broken_settings_bring_no_false_alarms_about_the_sheet(folder: Path) -> None:
+def test_broken_settings_bring_no_false_alarms_about_the_sheet(folder):
     write(folder, "trial,track,pressure_kPa\na,a.csv,\n", "diameter_mm: 24\nlength_mm: [\n")
     assert {problem.file for problem in stopped(folder)} == {"experiment.yaml"}
 
 
-def test_names_in_the_settings_are_looked_up(folder: Path) -> None:
+def test_names_in_the_settings_are_looked_up(folder):
     base = "pressure_drive, gravity, eversion_damping, yield_pressure"
     for settings, columns in (
         (f"model: [{base}, air_drag]\n", []),

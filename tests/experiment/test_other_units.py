@@ -1,20 +1,16 @@
 """Columns in other units are converted, and said so."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from hand_sheet import one
 
 from vinetrack.core.units import convert, other_units, split_unit
 from vinetrack.experiment.folder import ExperimentError
-from vinetrack.experiment.schema import COLUMNS, Column
+from vinetrack.experiment.schema import COLUMNS
 
 PSI = 6894.757293168361
 
 
-def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path: Path) -> None:
+def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path):
     own = {"diameter_in": "1", "pressure_psi": "4", "payload_oz": "2", "diameter_mm": None, "pressure_kPa": None}
     read = one(tmp_path, "yield_pressure_psi: 0.435\n", yield_pressure_kPa=None, payload_g=None, **own)
     (trial,) = read.trials
@@ -28,7 +24,7 @@ def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path: Path
     assert (said["yield_pressure_psi"].file, said["yield_pressure_psi"].line) == ("experiment.yaml", 1)
 
 
-def test_the_bounds_hold_after_conversion_and_of_two_units_that_with_a_value_counts(tmp_path: Path) -> None:
+def test_the_bounds_hold_after_conversion_and_of_two_units_that_with_a_value_counts(tmp_path):
     assert "diameter_mm '635' is above 300 mm" in one(tmp_path, diameter_mm=None, diameter_in="25").failed["a"]
     read = one(tmp_path, diameter_in="2")
     assert read.trials[0].diameter_m == 24 / 1000
@@ -48,7 +44,7 @@ NUMBERS = [column for column in COLUMNS.values() if column.kind == "number" and 
 
 @pytest.mark.parametrize("column", NUMBERS, ids=lambda column: column.name)
 @pytest.mark.parametrize("place", ["sheet", "settings"])
-def test_every_unit_of_every_column_is_read(tmp_path: Path, column: Column, place: str) -> None:
+def test_every_unit_of_every_column_is_read(tmp_path, column, place):
     usual = {"diameter_mm": 24, "thickness_um": 200, "length_mm": 280, "pressure_kPa": 28, "yield_pressure_kPa": 3}
     in_own_unit = {**usual, "film_density_kg_m3": 1100}.get(column.name, 12)
     for name, unit in other_units(column.name).items():
@@ -59,7 +55,7 @@ def test_every_unit_of_every_column_is_read(tmp_path: Path, column: Column, plac
         assert column.of_trial(trial) == pytest.approx(in_own_unit, rel=1e-12)
 
 
-def test_keys_of_groups_and_ranges_are_converted(tmp_path: Path) -> None:
+def test_keys_of_groups_and_ranges_are_converted(tmp_path):
     text = "limits: {pressure_psi: '1:5', diameter_in: [1, 2], hoop_stress_kPa: 7000}\nambient_pressure_bar: 1\n"
     settings = one(tmp_path, text + "axis: {from_px: [1, 2], to_px: [9, 90], width_cm: 2}\n").settings
     assert settings.limits.pressure_kPa == pytest.approx((6.894757, 34.473786))

@@ -29,12 +29,12 @@ def draft_problems(tmp_path: Path, text: str) -> tuple[Problem, ...]:
     return caught.value.problems
 
 
-def test_settings_cover_exactly_the_columns_of_the_sheet() -> None:
+def test_settings_cover_exactly_the_columns_of_the_sheet():
     assert set(SHARED) == set(COLUMNS) - {"trial", "video", "track", "order", "axis", "frames_used", "point_mass"}
     assert set(SHARED) <= set(ExperimentSettings.model_fields)
 
 
-def test_every_kind_of_calibration(tmp_path: Path) -> None:
+def test_every_kind_of_calibration(tmp_path):
     for text in (
         "{kind: mm_per_px, mm_per_px: 0.37}",
         "{kind: two_points, from_px: [1, 2], to_px: [3, 4], length_mm: 100}",
@@ -49,7 +49,7 @@ def test_every_kind_of_calibration(tmp_path: Path) -> None:
     assert read(tmp_path, "steady: 1:20\n").steady == (1.0, 20.0)  # no number in base sixty
 
 
-def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path: Path) -> None:
+def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path):
     text = "{pressure_kPa: 7:40, payload_g: [0, 50], diameter_mm: [24, 12], chamber_l: 3.7, growth_angle_deg: 0:180}"
     limits = read(tmp_path, f"limits: {text}\n").limits
     assert (limits.pressure_kPa, limits.payload_g) == ((7.0, 40.0), (0.0, 50.0))
@@ -58,7 +58,7 @@ def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path: Path) ->
     assert (limits.thickness_um, limits.trials, limits.hoop_stress_MPa) == (None, 4, 7.8)
 
 
-def test_what_is_no_mapping_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_mapping_is_refused(tmp_path):
     for text in ("- a\n- b\n", "just text\n", "3\n", "payload_g: [1, 2\nuse: yes\n"):
         (problem,) = draft_problems(tmp_path, text)
         assert problem.file == "experiment.yaml"
@@ -94,7 +94,7 @@ NOT_ALLOWED = {
 
 
 @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in NOT_ALLOWED.items() for value in values])
-def test_a_value_that_is_not_allowed_is_named_with_its_key(tmp_path: Path, key: str, value: str) -> None:
+def test_a_value_that_is_not_allowed_is_named_with_its_key(tmp_path, key, value):
     (problem,) = draft_problems(tmp_path, f"# first line\n{key}: {value}\n")
     assert problem.line == 2
     assert problem.column.startswith(key)
@@ -107,7 +107,7 @@ def _keys(model: type[BaseModel]) -> dict[str, Any]:
     }
 
 
-def test_the_shipped_config_holds_every_key_at_its_default() -> None:
+def test_the_shipped_config_holds_every_key_at_its_default():
     assert run_settings(read_yaml(CONFIG).content) == RunSettings()
     content = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
     shipped = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in content.items()}
@@ -115,7 +115,7 @@ def test_the_shipped_config_holds_every_key_at_its_default() -> None:
     assert run_settings({"experiment": 2024}).experiment == "2024"
 
 
-def test_a_wrong_run_setting_is_named() -> None:
+def test_a_wrong_run_setting_is_named():
     for column, values in {
         "experimant": {"experimant": "x"},
         "damping.sead": {"damping": {"sead": 1}},
@@ -130,13 +130,13 @@ def test_a_wrong_run_setting_is_named() -> None:
         assert [problem.column for problem in caught.value.problems] == [column]
 
 
-def test_every_key_of_both_files_is_listed_once() -> None:
+def test_every_key_of_both_files_is_listed_once():
     names = [entry["name"] for part in ("experiment", "columns") for entry in reference_content()[part]]
     assert {name for name in names if names.count(name) > 1} == {"axis"}  # of all trials, and of one
     assert set(ExperimentSettings.model_fields) <= set(names)
     assert set(RunSettings.model_fields) <= {entry.name for entry in setting_entries(RunSettings)}
 
 
-def test_the_page_of_the_docs_is_current() -> None:
+def test_the_page_of_the_docs_is_current():
     page = Path(__file__).parents[2] / "docs" / "settings.md"
     assert page.read_text(encoding="utf-8") == reference_page(), "vinetrack settings --page docs/settings.md"

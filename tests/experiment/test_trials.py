@@ -28,7 +28,7 @@ def corrected(folder: Path, text: str) -> Path:
     return folder
 
 
-def test_corrections_reach_their_trial_and_are_written_as_they_are_read(tmp_path: Path) -> None:
+def test_corrections_reach_their_trial_and_are_written_as_they_are_read(tmp_path):
     corrected(tmp_path, "trial,frame,action,edge_px\na,12,move,310.5\na,3,drop,\na,40,confirm,\n")
     trial = folder.read_experiment(tmp_path).trial("a")
     assert [(one.frame, one.action) for one in trial.corrections] == [(3, "drop"), (12, "move"), (40, "confirm")]
@@ -40,7 +40,7 @@ def test_corrections_reach_their_trial_and_are_written_as_they_are_read(tmp_path
     assert folder.corrections_text(found) == folder.corrections_text(given)
 
 
-def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path) -> None:
+def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path):
     for line in ("a,3,remove,", "a,3.5,drop,", "a,-1,drop,", "a,3,move,", "a,three,drop,", "a,3,drop,\na,3,confirm,"):
         corrected(tmp_path, f"trial,frame,action,edge_px\n{line}\n")
         with pytest.raises(ExperimentError) as stopped:
@@ -76,19 +76,19 @@ def test_every_column_says_whether_it_defines_a_condition() -> None:
     assert not shown & (ALWAYS_COMPARED | OF_A_REPLICATE)
 
 
-def test_trials_that_differ_in_a_setting_are_two_conditions() -> None:
+def test_trials_that_differ_in_a_setting_are_two_conditions():
     for name, column in COLUMNS.items():
         if name not in OF_A_REPLICATE:
             value = OTHER_VALUES[name] if name in OTHER_VALUES else column.to_si(7.0)
             assert len(conditions(column.field, value)) == 2, name
 
 
-def test_trials_that_differ_in_how_they_were_recorded_are_replicates() -> None:
+def test_trials_that_differ_in_how_they_were_recorded_are_replicates():
     numbers = [column for name, column in COLUMNS.items() if name in OF_A_REPLICATE and column.kind == "number"]
     assert {len(conditions(column.field, column.to_si(7.0))) for column in numbers} == {1}
 
 
-def test_the_name_of_a_condition_shows_what_differs() -> None:
+def test_the_name_of_a_condition_shows_what_differs():
     base = "24mm-200um-280mm_28kPa_0g"
     for field, value, parts in (
         ("growth_angle_rad", 1.5707963267948966, {"0deg", "90deg"}),
@@ -105,7 +105,7 @@ def test_the_name_of_a_condition_shows_what_differs() -> None:
     assert [trial.condition for trial in named] == [base, "12mm-100um-280mm_28kPa_0g"]
 
 
-def test_frames_and_axis_of_one_trial_alone(tmp_path: Path) -> None:
+def test_frames_and_axis_of_one_trial_alone(tmp_path):
     (trial,) = one(tmp_path, frames_used="5:15", axis="161,40:151.5,799:20").trials
     assert trial.axis == PictureAxis((161.0, 40.0), (151.5, 799.0), pytest.approx(0.02))
     track = load_track(trial)
@@ -117,7 +117,7 @@ REAL = os.environ.get("VINETRACK_REAL_DATA", "")
 
 
 @pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
-def test_either_of_two_point_masses_of_a_real_project() -> None:
+def test_either_of_two_point_masses_of_a_real_project():
     path = Path(REAL) / "falling_cups" / "cups.trk"
     with pytest.raises(TrackError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
         read_track(path, point_mass="cup")
@@ -138,7 +138,7 @@ def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10
     return write(folder, f"{HEADER}{columns}\n" + "\n".join(lines) + "\n")
 
 
-def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path: Path) -> None:
+def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path):
     cells = tuple(f",tube {i % 2},monday,{10 - i}" for i in range(10))
     trials = folder.read_experiment(written(tmp_path, ",specimen,day,order", cells)).trials
     ranks, stated = folder.trial_order(trials)
@@ -150,7 +150,7 @@ def test_the_order_is_that_of_the_sheet_or_else_of_its_rows(tmp_path: Path) -> N
     assert folder.order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
 
 
-def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(tmp_path: Path) -> None:
+def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(tmp_path):
     for column, cells, codes in (
         ("", ("",) * 10, ["confounded"]),  # the rows are in order of pressure
         ("order", tuple(f",{i + 1}" for i in range(10)), ["confounded"]),
@@ -165,7 +165,7 @@ def test_check_warns_of_an_order_or_a_specimen_that_follows_the_pressure(tmp_pat
 VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
 
 
-def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path: Path) -> None:
+def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path):
     header, a, b = GOOD.splitlines()
     more = a.replace("a,a", "c,a"), b.replace("b,b.csv,24", "d,b.csv,30")
     sheet = f"{header},use\n{a},\n{b},\n{more[0]},\n{more[1]},no\n"
@@ -173,7 +173,7 @@ def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path: Path) -
     assert [trial.name for trial in trials] == ["a", "b"]
 
 
-def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_path: Path) -> None:
+def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_path):
     folder = write(two_vines(tmp_path), GOOD, "chamber_l: 2\nmodel: [pressure_drive, gravity, leak]\n")
     planned = planned_sheet(folder)
     assert planned.trials[0].chamber_m3 == pytest.approx(2e-3)
@@ -188,7 +188,7 @@ def test_settings_are_those_of_the_experiment_and_faults_are_named_as_there(tmp_
     assert any("--travel-ratio" in str(problem) for problem in caught.value.problems)
 
 
-def test_a_sheet_needs_no_recordings_and_an_unknown_column_is_not_passed_over(tmp_path: Path) -> None:
+def test_a_sheet_needs_no_recordings_and_an_unknown_column_is_not_passed_over(tmp_path):
     """A payload under a wrong name would else be taken for none."""
     text = "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,payload_gr\na,24,200,280,28,35.6\n"
     (tmp_path / "ideas.csv").write_text(text, encoding="utf-8")

@@ -1,7 +1,5 @@
 """Figures of a diagnosis and of the paper's numbers, from tables written by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -19,7 +17,7 @@ NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pres
 OFF_M = {"before": 8e-3, "after": 1e-3}
 
 
-def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
+def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis():
     (ax,) = figures.draw_ladder(ladder("", "reservoir_depletion")).axes
     assert ax.get_yscale() == "log"
     assert "(mm)" in ax.get_ylabel()
@@ -28,7 +26,7 @@ def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
     assert [label.get_text() for label in ax.get_xticklabels()] == ["initial\nmodel", "+ reservoir\ndepletion"]
 
 
-def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
+def test_a_condition_is_drawn_before_and_after_with_its_errors():
     time_s = np.arange(-10, 100) * 1e-3
     moved_m = np.maximum(time_s, 0)
     table = pd.DataFrame({"time_s": time_s, "lead_position_m": moved_m})
@@ -41,7 +39,7 @@ def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
     assert left.lines[0].get_ydata()[-1] == pytest.approx(8.0)
 
 
-def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() -> None:
+def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour():
     table = pd.DataFrame(
         [
             ("air_drag", "physical", "refitted", 400.0, 20.0, True),
@@ -59,7 +57,7 @@ def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() ->
     assert "k = 1.0 ± 0.1" in ax.texts[0].get_text()
 
 
-def test_a_drifting_parameter_is_drawn_against_the_condition() -> None:
+def test_a_drifting_parameter_is_drawn_against_the_condition():
     """B of one vine against pressure, before and after; γ, that only the larger model has, against the vine."""
     row = {"parameter": "eversion_damping.B", "vine": "v", "symbol": "B", "against": "pressure_Pa", "n_trials": 2}
     rows = [
@@ -77,7 +75,7 @@ def test_a_drifting_parameter_is_drawn_against_the_condition() -> None:
     assert after.get_ydata() == pytest.approx([1, 1, 1])
 
 
-def test_the_missing_force_is_drawn_against_each_variable() -> None:
+def test_the_missing_force_is_drawn_against_each_variable():
     point = {"value": 0.1, "force_N": 0.4, "sigma_N": 0.05}
     rows = [point | {"against": name, "condition": c} for name in NOTHING for c in ("", "a", "b")]
     fig = figures.draw_missing_force(pd.DataFrame(rows))
@@ -87,7 +85,7 @@ def test_the_missing_force_is_drawn_against_each_variable() -> None:
     assert_nothing_is_cut_off(fig)
 
 
-def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter() -> None:
+def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter():
     cells = [
         {"condition_label": f"12 mm, {k} kPa", "n_trials": 2, "growth_from": g / 4, "growth_to": (g + 1) / 4}
         | {"misfit_before_m": sign * 1e-3 * (g + 1), "misfit_after_m": 0.1e-3, "scatter_m": 0.6e-3}
@@ -103,7 +101,7 @@ def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter() 
     assert not after.texts
 
 
-def test_cosines_stand_below_the_diagonal_and_ties_are_framed() -> None:
+def test_cosines_stand_below_the_diagonal_and_ties_are_framed():
     rows = [("b", "a", 0.97), ("c", "a", -0.5), ("c", "b", 0.0)]
     (ax,) = figures.draw_cosines(pd.DataFrame(rows, columns=["effect", "other", "cosine"])).axes
     assert [text.get_text() for text in ax.texts] == [".97", "−.50", ".00"]
@@ -116,7 +114,7 @@ def test_cosines_stand_below_the_diagonal_and_ties_are_framed() -> None:
 Y, V = np.linspace(0, 0.25, 26), np.linspace(0, 8, 20)
 
 
-def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been() -> None:
+def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been():
     curve = pd.DataFrame({**NOTHING, "lead_position_m": Y, "force_N": -Y, "sigma_N": 0.02, "trials": Y < 0.2})
     (ax,) = figures.draw_learned_force(pd.concat([curve.assign(condition=name) for name in ("", "a", "b")])).axes
     assert ax.get_xlabel() == "growth y (mm)"
@@ -126,7 +124,7 @@ def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been
     assert band[:, 1].max() == pytest.approx(1.96 * 0.02)
 
 
-def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
+def test_a_force_of_two_variables_is_a_map_beside_its_error():
     y, v = (grid.ravel() for grid in np.meshgrid(Y, V, indexing="ij"))
     places = {**NOTHING, "lead_position_m": y, "tail_velocity_m_s": v, "sigma_N": 0.02}
     surface = pd.DataFrame({**places, "force_N": -y * v, "trials": v < 6, "condition": ""})
@@ -142,7 +140,7 @@ def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
 NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
 
 
-def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points() -> None:
+def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points():
     way, time_s = np.linspace(0, 1, 30), np.linspace(0, 1 / 7, 100)
     parts = [
         pd.DataFrame({"time_s": way * (1 + 0.3 * k) / kPa, "lead_position_m": 0.28 * way * (1 - 0.05 * k)}).assign(
@@ -162,7 +160,7 @@ def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points() -> None:
     assert_nothing_is_cut_off(fig)
 
 
-def test_printed_lines_have_the_printed_slope() -> None:
+def test_printed_lines_have_the_printed_slope():
     rows = [
         (f"v{scale}", 6.0 * scale, 50.0 * scale, speed, B * speed**0.37)
         for scale, B in ((1, 0.57), (4, 6.44))
@@ -180,7 +178,7 @@ def test_printed_lines_have_the_printed_slope() -> None:
     assert_nothing_is_cut_off(fig)
 
 
-def test_published_errors_stand_beside_ours() -> None:
+def test_published_errors_stand_beside_ours():
     rows = [
         (figure, float(kPa), name, 0.01 * (k + 1), 0.1 * (k + 1))
         for figure, pressures_kPa in (("Fig. 4", (7, 14, 28)), ("Fig. 5", (14, 28, 41)))
@@ -199,7 +197,7 @@ def test_published_errors_stand_beside_ours() -> None:
     assert_nothing_is_cut_off(fig)
 
 
-def test_final_speeds_stand_beside_eq2_where_payloads_differ() -> None:
+def test_final_speeds_stand_beside_eq2_where_payloads_differ():
     row = {"vine": "v", "final_at_mm": 120.0, "n_final": 4, "final_lead_velocity_sigma_m_s": 0.02}
     speeds = pd.DataFrame(
         row | {"pressure_kPa": kPa, "payload_g": g, "final_lead_velocity_m_s": kPa / 20 - g / 100}
@@ -214,7 +212,7 @@ def test_final_speeds_stand_beside_eq2_where_payloads_differ() -> None:
     assert_nothing_is_cut_off(fig)
 
 
-def test_nothing_of_the_reservoir_is_cut_off() -> None:
+def test_nothing_of_the_reservoir_is_cut_off():
     y = np.linspace(0, 0.28, 5)
     left = [pd.DataFrame({"lead_position_m": y, "gauge_left": 1 - y / 2, "pressure_kPa": kPa}) for kPa in (7.0, 28.0)]
     pressures = [one.assign(departure=name) for one in left for name in NAMES[:2]]

@@ -48,7 +48,7 @@ def points(n_vines: int = 2) -> pd.DataFrame:
     return table.assign(x_ss_sigma_m_s=0.02 * table["x_ss_m_s"], force_sigma_N=0.01)
 
 
-def test_both_fits_are_lines_of_slope_n_in_the_band_of_the_covariance() -> None:
+def test_both_fits_are_lines_of_slope_n_in_the_band_of_the_covariance():
     ax = draw_damping_law(points(1), damping(1)).axes[0]
     curves = [line for line in ax.lines if line.get_marker() == "None" and len(line.get_xdata()) == 60]
     assert len(curves) == 2
@@ -69,7 +69,7 @@ def scaling() -> dict:
     return {"method": "both_axes", "isometric": [family], "thickness": [], "reason": None}
 
 
-def test_the_power_law_and_the_straight_line_are_drawn_as_fitted() -> None:
+def test_the_power_law_and_the_straight_line_are_drawn_as_fitted():
     ax = draw_scaling(scaling()).axes[0]
     named = {str(line.get_label()).split()[0]: line for line in ax.lines}
     power, line = named["power"], named["straight"]
@@ -93,9 +93,7 @@ def campaign(n_conditions: int, replicates: int) -> tuple[pd.DataFrame, dict[str
 
 
 @pytest.mark.parametrize(("n_conditions", "replicates", "n_panels"), [(1, 1, 1), (40, 2, 40), (500, 1, 1)])
-def test_all_trials_have_a_panel_for_each_condition_or_for_each_vine(
-    n_conditions: int, replicates: int, n_panels: int
-) -> None:
+def test_all_trials_have_a_panel_for_each_condition_or_for_each_vine(n_conditions, replicates, n_panels):
     figure = motion_figures.draw_overview(*campaign(n_conditions, replicates))
     panels = [ax for ax in figure.axes if ax.get_visible() and ax.get_title(loc="left")]
     assert len(panels) == n_panels
@@ -107,20 +105,20 @@ def test_all_trials_have_a_panel_for_each_condition_or_for_each_vine(
         assert any("pressure (kPa)" in text.get_text() for text in figure.findobj(Text))
 
 
-def test_the_same_figure_gives_the_same_bytes() -> None:
+def test_the_same_figure_gives_the_same_bytes():
     first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
     assert first == second
 
 
 @pytest.mark.slow
-def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off() -> None:
+def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off():
     for n_vines in (4, 20):
         assert_nothing_is_cut_off(draw_damping_law(points(n_vines), damping(n_vines)))
     assert_nothing_is_cut_off(draw_exponents(damping(4)))
     assert_nothing_is_cut_off(draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"}))
 
 
-def test_without_content_there_is_no_figure() -> None:
+def test_without_content_there_is_no_figure():
     assert draw_damping_law(points().iloc[:0], REFUSED) is None
     assert draw_exponents(REFUSED) is None
     assert draw_scaling({"isometric": [], "thickness": []}) is None
@@ -130,7 +128,7 @@ def test_without_content_there_is_no_figure() -> None:
 
 
 # Figures of speed, efficiency and payload, from tables written by hand: content, text, and no overlaps.
-def test_line_and_power_law_are_drawn_as_fitted() -> None:
+def test_line_and_power_law_are_drawn_as_fitted():
     line = {"slope": 0.1, "slope_95": [0.02, 0.18], "intercept": 0.5, "intercept_95": [0, 1], "R2": 0.935, "p": 0.033}
     power = {**line, "slope": 0.7, "slope_95": [0.1, 1.3], "intercept": math.log(0.3), "p": 0.04}
     lines = {"power": power, "line": line, "refused": None}
@@ -149,7 +147,7 @@ def test_line_and_power_law_are_drawn_as_fitted() -> None:
 LONG = "still accelerating: the speed rises by 24 % (20 to 28 %) across the window; choose a later start " * 3
 
 
-def test_x_ss_is_drawn_at_the_speed_of_the_leading_edge() -> None:
+def test_x_ss_is_drawn_at_the_speed_of_the_leading_edge():
     """All rules refuse, in long sentences, but one, which finds 2 m/s of the tail."""
     time_s = np.arange(200) / 1000
     kinematics = pd.DataFrame({"time_s": time_s, "lead_position_m": time_s})
@@ -196,7 +194,7 @@ def test_every_condition_has_a_panel_with_its_numbers(draw, n_conditions: int) -
 FASTER = {"fold_inertia", "wall_stretch", "gravity"}
 
 
-def test_both_curves_are_drawn_in_millimetres_and_milliseconds() -> None:
+def test_both_curves_are_drawn_in_millimetres_and_milliseconds():
     t = np.linspace(0, 0.2, 50)
     table = pd.DataFrame({"time_s": t, "without_position_m": t, "with_position_m": 0.9 * t, "difference_m": -0.1 * t})
     table = table.assign(without_velocity_m_s=1.0, with_velocity_m_s=0.9)
@@ -213,7 +211,7 @@ def test_both_curves_are_drawn_in_millimetres_and_milliseconds() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, effect in catalogue().items() if effect.parameters])
-def test_every_effect_shows_on_the_reference_vine(name: str) -> None:
+def test_every_effect_shows_on_the_reference_vine(name):
     found = effect_motion(catalogue()[name])
     assert np.isfinite(found.to_numpy()).all()
     assert np.max(np.abs(found["difference_m"])) > 1e-6

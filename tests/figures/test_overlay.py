@@ -38,9 +38,7 @@ EDGES = [
     ],
     ids=["along", "larger", "down"],
 )
-def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_length_it_names(
-    axis: Axis, size: tuple[int, int], width_px: int
-) -> None:
+def test_each_edge_stands_where_it_is_along_the_axis_with_a_scale_bar_of_the_length_it_names(axis, size, width_px):
     view, grey = overlay.ClipView("a", axis, 40.0, size, 0.25, 30.0, width_px), np.full(size[::-1], 90, np.uint8)
     zoom = width_px / size[0]
     unseen, picture = (overlay.compose(view, grey, frame, 12.0, EDGES)[-round(zoom * size[1]) :] for frame in (0, 1))
@@ -74,7 +72,7 @@ def tracking(n_along: int = 300, height: int = 60) -> Tracking:
     return Tracking(track, Axis((0.0, 30.0), (n_along - 1.0, 30.0), 20.0), kymograph, pictures, 1.0, 0.1, np.zeros(N))
 
 
-def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_where_it_was() -> None:
+def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_where_it_was():
     kymograph, _, *frames = draw_strip("a", tracking(), 1e-3).axes
     shown = {line.get_label(): line for line in kymograph.lines if not line.get_label().startswith("_")}
     assert list(shown) == ["leading edge, N = 36", "flagged, N = 3", "corrected by hand, N = 1"]
@@ -89,7 +87,7 @@ def test_the_edge_and_flagged_frames_are_counted_apart_and_frames_show_the_edge_
         assert sorted(line.get_ydata()) == pytest.approx([15, 45])
 
 
-def test_a_strip_is_small_in_a_page() -> None:
+def test_a_strip_is_small_in_a_page():
     body = inline_picture(render(draw_strip("a", tracking(900, 320), 1e-3), ["svg"])["svg"].decode(), "p", "strip")
     assert len(body) < 60_000
     assert "matrix(" in body
@@ -103,18 +101,18 @@ def places(amplitude_px: float, count: int = 4000, seed: int = 971) -> np.ndarra
 
 
 @pytest.mark.parametrize("amplitude_px", [0.02, 0.05, 0.1])
-def test_the_amplitude_of_a_periodic_error_is_found(amplitude_px: float) -> None:
+def test_the_amplitude_of_a_periodic_error_is_found(amplitude_px):
     found, chance = periodic_error(places(amplitude_px))
     assert found == pytest.approx(amplitude_px, abs=1.5 * chance)
     assert chance == pytest.approx(math.sqrt(math.log(20) / 4000) / math.pi)
 
 
-def test_edges_that_fall_anywhere_exceed_chance_once_in_twenty() -> None:
+def test_edges_that_fall_anywhere_exceed_chance_once_in_twenty():
     above = [np.greater(*periodic_error(places(0.0, 500, seed))) for seed in range(3000, 3400)]
     assert 8 <= sum(above) <= 34  # 20 expected, binomial to three standard deviations
 
 
-def test_only_sound_moving_frames_of_recordings_count() -> None:
+def test_only_sound_moving_frames_of_recordings_count():
     filmed = pd.DataFrame(
         {"edge_px": [10.25, 11.5, 12.75, np.nan, 14.0], "flag": ["", np.nan, "doubtful", "lost", "after_end"]}
     )
@@ -124,7 +122,7 @@ def test_only_sound_moving_frames_of_recordings_count() -> None:
 
 
 @pytest.mark.parametrize(("amplitude_px", "words"), [(0.1, "more than chance"), (0.0, "no more than chance")])
-def test_the_histogram_holds_every_edge_and_says_what_it_shows(amplitude_px: float, words: str) -> None:
+def test_the_histogram_holds_every_edge_and_says_what_it_shows(amplitude_px, words):
     figure = overlay.draw_pixel_places(places(amplitude_px, 600, seed=972))
     (ax,) = figure.axes
     assert sum(bar.get_height() for bar in ax.patches[:10]) == 600

@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 import vinetrack as vt
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.units import number
-from vinetrack.interface.loaded import LoadedResults
 from vinetrack.narrative.verdict_text import estimate_text, summary_facts
 from vinetrack.pages.page import open_campaign
 from vinetrack.results.folder_layout import ResultsError
@@ -28,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_run(tmp_path_factory):
     """`results/demo` of six trials of one vine: three conditions, two replicates each, with figures and report."""
     folder = tmp_path_factory.mktemp("small_run")
     experiment = make_experiment(folder / "demo", SMALL, SETTINGS + FEW_CANDIDATES)
@@ -41,11 +40,11 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def loaded(small_run: Path) -> LoadedResults:
+def loaded(small_run):
     return vt.load(small_run)
 
 
-def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded: LoadedResults) -> None:
+def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded):
     assert {"trials", "conditions", "steady", "ladder", "comparison", "diagnosis/moved"} <= set(loaded.tables)
     assert loaded.tables["ladder"].equals(loaded.ladder)
     assert [name for name in loaded.ladder.columns if "rms" in name and not name.endswith("_m")] == []
@@ -57,7 +56,7 @@ def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded: Lo
     assert loaded.final_model.parameters_for("24mm-200um-200mm")[2] == n
 
 
-def test_figures_of_the_report_are_figures_and_what_is_not_there_is_said(loaded: LoadedResults, tmp_path: Path) -> None:
+def test_figures_of_the_report_are_figures_and_what_is_not_there_is_said(loaded, tmp_path):
     for name in ("", "overview", "model_comparison", "before_after", "candidates"):
         assert isinstance(loaded.plot(name), Figure)
     assert isinstance(loaded.plot("trial_motion", trial="d24_24kPa_1"), Figure)
@@ -68,7 +67,7 @@ def test_figures_of_the_report_are_figures_and_what_is_not_there_is_said(loaded:
 
 
 @pytest.mark.slow
-def test_the_story_of_the_readme_runs(small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_story_of_the_readme_runs(small_run, tmp_path, monkeypatch):
     pattern = r"\n((?:    [^\n]*\n|\n)*    import vinetrack as vt\n(?:    [^\n]*\n|\n)*)"
     story = re.search(pattern, (ROOT / "README.md").read_text("utf-8"))
     assert story is not None
@@ -82,7 +81,7 @@ def test_the_story_of_the_readme_runs(small_run: Path, tmp_path: Path, monkeypat
     assert (tmp_path / "ladder.png").exists()
 
 
-def test_a_frame_of_tracks_in_other_units_is_the_same_experiment() -> None:
+def test_a_frame_of_tracks_in_other_units_is_the_same_experiment():
     frame = vt.example_tracks()
     inches = frame.assign(diameter_in=frame["diameter_mm"] / 25.4).drop(columns="diameter_mm")
     trials = [[trial for trial, _ in vt.tracks_from_frame(one)] for one in (frame, inches)]
@@ -90,7 +89,7 @@ def test_a_frame_of_tracks_in_other_units_is_the_same_experiment() -> None:
     assert [trial.condition for trial in trials[0]] == [trial.condition for trial in trials[1]]
 
 
-def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_pressure_is_a_trace() -> None:
+def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_pressure_is_a_trace():
     frame = vt.example_tracks()
     wrong = [frame.drop(columns="time_s"), frame.drop(columns="thickness_um"), frame.assign(diameter_mm=3000.0)]
     for one in (*wrong, frame.assign(length_mm=280.0 + frame["time_s"])):
@@ -102,7 +101,7 @@ def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_press
 
 
 @pytest.mark.slow
-def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored() -> None:
+def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored():
     def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
         return [sorted(one.get("data", one)) for one in outputs]
 
@@ -122,14 +121,14 @@ def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored() -> None:
 
 
 @pytest.fixture(scope="module")
-def report(small_run: Path) -> str:
+def report(small_run):
     """The words of the page."""
     page = (small_run / "report.html").read_text("utf-8")
     page = re.sub(r"<(script|style|svg)\b.*?</\1>", " ", page, flags=re.DOTALL)
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", page)).split())
 
 
-def test_numbers_of_the_initial_model_are_those_that_the_diagnosis_began_with(loaded: LoadedResults) -> None:
+def test_numbers_of_the_initial_model_are_those_that_the_diagnosis_began_with(loaded):
     moved = loaded.tables["diagnosis/moved"]
     first = moved[moved["added"] == ""].set_index(["parameter", "vine"])
     for entry in loaded.fit.numbers:
@@ -138,7 +137,7 @@ def test_numbers_of_the_initial_model_are_those_that_the_diagnosis_began_with(lo
         assert row["sigma"] == pytest.approx(entry.sigma, rel=1e-9)
 
 
-def test_errors_and_floor_of_the_ladder_are_those_of_the_comparison(loaded: LoadedResults) -> None:
+def test_errors_and_floor_of_the_ladder_are_those_of_the_comparison(loaded):
     compared = loaded.tables["comparison"]
     rms_m = math.sqrt(float(np.mean(compared["rms_position_m"] ** 2)))  # as many replicates in every condition
     assert loaded.ladder["rms_in_sample_m"].iloc[0] == pytest.approx(rms_m, rel=1e-9)
@@ -149,7 +148,7 @@ def test_errors_and_floor_of_the_ladder_are_those_of_the_comparison(loaded: Load
         assert located.loc[str(row.condition), "rms_m"] == pytest.approx(row.rms_position_m, rel=1e-9)
 
 
-def test_the_report_quotes_the_final_model_first(report: str, loaded: LoadedResults) -> None:
+def test_the_report_quotes_the_final_model_first(report, loaded):
     diagnosis = loaded.diagnosis
     assert diagnosis is not None
     last = loaded.ladder.iloc[-1]
@@ -164,7 +163,7 @@ def test_the_report_quotes_the_final_model_first(report: str, loaded: LoadedResu
         assert fact.note in report
 
 
-def test_commands_and_explorer_give_the_numbers_of_the_files(small_run: Path, loaded: LoadedResults) -> None:
+def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):
     said, compared = run("compare", small_run), loaded.tables["comparison"]
     for row in compared.itertuples():
         line = next(line for line in said.splitlines() if str(row.condition) in line)
@@ -175,7 +174,7 @@ def test_commands_and_explorer_give_the_numbers_of_the_files(small_run: Path, lo
     assert dict(campaign.floors_m) == compared.set_index("condition")["replicate_floor_m"].to_dict()
 
 
-def test_the_worst_condition_is_one(loaded: LoadedResults, report: str, small_run: Path) -> None:
+def test_the_worst_condition_is_one(loaded, report, small_run):
     compared = loaded.tables["comparison"]
     worst = str(compared.loc[compared["rms_position_m"].idxmax(), "condition"])
     assert loaded.tables["diagnosis/conditions"]["condition"].iloc[0] == worst

@@ -59,7 +59,7 @@ def scattered(seed: int, **changes: object) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_exact_data_give_exact_n_and_B(method: str) -> None:
+def test_exact_data_give_exact_n_and_B(method):
     """Vines of two points or one pressure are left out, and so are points without a speed or a force."""
     same = campaign(default_rng(0), vines=("R3",), pressures=1, trials=6)
     two = campaign(default_rng(0), vines=("R4",), pressures=2, trials=1)
@@ -87,7 +87,7 @@ NORRIS = """
 """
 
 
-def test_a_line_of_nist_has_the_certified_numbers_errors_and_scatter() -> None:
+def test_a_line_of_nist_has_the_certified_numbers_errors_and_scatter():
     """Norris (StRD, linear regression): y and x, here ln F and ln x_ss in hundredths, so that n is their slope."""
     y, x = np.array([pair.split() for pair in NORRIS.split(",")], float).T / 100
     points = pd.DataFrame({"trial": [f"t{i}" for i in range(36)], "x_ss_m_s": np.exp(x), "force_N": np.exp(y)})
@@ -102,7 +102,7 @@ def test_a_line_of_nist_has_the_certified_numbers_errors_and_scatter() -> None:
     np.testing.assert_allclose(errors, [0.429796848199937e-3, 0.232818234301152e-2], rtol=1e-9)
 
 
-def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors() -> None:
+def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors():
     draw = default_rng(8)
     points = scattered(2, trials=2)
     count, names = len(points), tuple(B)
@@ -120,7 +120,7 @@ def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors() -> None:
 
 
 @pytest.mark.slow
-def test_scatter_of_the_vines_flattens_log_log_and_not_both_axes() -> None:
+def test_scatter_of_the_vines_flattens_log_log_and_not_both_axes():
     """σ(ln F) of 3 % B and 1 % P against var(ln F): the mean over 60 campaigns, good to 0.0005."""
     fits = [fit_damping(scattered(seed, B_scatter=0.08), resamples=2) for seed in range(60)]
     off = {method: np.array([fit[method]["n"] for fit in fits]) - N for method in METHODS}
@@ -130,7 +130,7 @@ def test_scatter_of_the_vines_flattens_log_log_and_not_both_axes() -> None:
 
 
 @pytest.mark.parametrize("case", ["nothing", "two trials", "speeds that fall with the force"])
-def test_no_fit_without_enough_points_or_a_power_law(case: str) -> None:
+def test_no_fit_without_enough_points_or_a_power_law(case):
     points = campaign(default_rng(0), vines=("R1",))
     points = {"nothing": points[:0], "two trials": points[::39]}.get(case, points)
     if len(points) > 2:
@@ -141,7 +141,7 @@ def test_no_fit_without_enough_points_or_a_power_law(case: str) -> None:
 
 
 @pytest.mark.slow
-def test_95_per_cent_intervals_hold_the_truth_so_often() -> None:
+def test_95_per_cent_intervals_hold_the_truth_so_often():
     """Binomial bounds of 99.9 % for 200 campaigns, of seeds used for nothing else."""
     counted = dict.fromkeys(itertools.product(METHODS, ("n", *B)), 0)
     for seed in range(1000, 1200):
@@ -156,7 +156,7 @@ def test_95_per_cent_intervals_hold_the_truth_so_often() -> None:
 
 
 @pytest.mark.slow
-def test_where_yield_pressures_are_off_only_the_total_interval_covers() -> None:
+def test_where_yield_pressures_are_off_only_the_total_interval_covers():
     """By their stated 0.2 kPa, the same for all trials of a vine: resampling trials cannot see that."""
     inner = outer = 0
     for seed in range(2000, 2060):
@@ -167,7 +167,7 @@ def test_where_yield_pressures_are_off_only_the_total_interval_covers() -> None:
     assert inner < outer
 
 
-def test_an_error_of_the_scale_moves_every_B_by_n_times_it_and_leaves_n_alone() -> None:
+def test_an_error_of_the_scale_moves_every_B_by_n_times_it_and_leaves_n_alone():
     """Exact points have no other error: speeds 1 % off make ln B 1.96·n·1 % wide either side."""
     points = campaign(default_rng(0)).assign(scale_rel_sigma=0.01, yield_force_sigma_N=0.0)
     fit = fit_damping(points, resamples=4000)["both_axes"]
@@ -178,7 +178,7 @@ def test_an_error_of_the_scale_moves_every_B_by_n_times_it_and_leaves_n_alone() 
         assert (-below, above) == pytest.approx((1.96 * N * 0.01,) * 2, rel=0.08)
 
 
-def test_points_of_a_vine_that_carries_no_slope_are_not_used() -> None:
+def test_points_of_a_vine_that_carries_no_slope_are_not_used():
     points = campaign(default_rng(2))
     few = points["vine"].eq("R3") & (points.groupby("vine").cumcount() >= 2)
     points = points[~few].reset_index(drop=True)
@@ -189,7 +189,7 @@ def test_points_of_a_vine_that_carries_no_slope_are_not_used() -> None:
     assert after["n"] == before["n"]
 
 
-def test_the_published_rule_is_fitted_from_its_own_columns() -> None:
+def test_the_published_rule_is_fitted_from_its_own_columns():
     points = campaign(default_rng(0))
     points["x_ss_paper_m_s"] *= 1.2
     points.loc[:9, "x_ss_paper_m_s"] = np.nan
@@ -203,7 +203,7 @@ def test_the_published_rule_is_fitted_from_its_own_columns() -> None:
 
 
 @pytest.mark.slow
-def test_of_ten_points_intervals_hold_n_as_often_as_of_many() -> None:
+def test_of_ten_points_intervals_hold_n_as_often_as_of_many():
     """Ten points resampled scatter by 10/8 less in variance about two numbers than they err, with eight degrees."""
     held = 0
     for seed in range(150):
@@ -213,7 +213,7 @@ def test_of_ten_points_intervals_hold_n_as_often_as_of_many() -> None:
     assert held >= binom.ppf(0.01, 150, 0.95)
 
 
-def test_a_condition_of_which_less_than_half_is_steady_is_left_out_with_its_steady_trials() -> None:
+def test_a_condition_of_which_less_than_half_is_steady_is_left_out_with_its_steady_trials():
     used = [True, False, False, False, True, True, False, False]
     reason = ["" if one else "not steady" for one in used]
     points = pd.DataFrame({"condition": list("aaaabbbb"), "eligible": True, "used": used, "reason": reason})
@@ -222,7 +222,7 @@ def test_a_condition_of_which_less_than_half_is_steady_is_left_out_with_its_stea
 
 
 @pytest.mark.slow
-def test_b_and_n_come_home_with_the_pressure_of_the_model() -> None:
+def test_b_and_n_come_home_with_the_pressure_of_the_model():
     """Two small vines on a chamber of 0.25 L: at the lowest pressure a third of it is lost along the way.
 
     With the set pressure nothing is steady and our rules refuse; the published rule goes on, and is wrong.
@@ -260,7 +260,7 @@ def families(sizes: dict[str, tuple[float, float, float]]) -> dict:
     return fit_scaling({"both_axes": {"vines": vines}})
 
 
-def test_the_published_coefficients() -> None:
+def test_the_published_coefficients():
     """On log axes slope 1.80; the straight line has R² 0.983 and an intercept of −1.7."""
     found = families({f"R{r}": (B, DIAMETER_MM[r], THICKNESS_UM[r]) for r, B in DAMPING_B.items()})
     (family,) = found["isometric"]
@@ -271,7 +271,7 @@ def test_the_published_coefficients() -> None:
     assert found["thickness"] == []
 
 
-def test_walls_of_one_diameter_make_a_line_and_unknown_ones_belong_to_none() -> None:
+def test_walls_of_one_diameter_make_a_line_and_unknown_ones_belong_to_none():
     found = families({f"t{t:g}": (0.02 * t, 12.0, t) for t in (50.0, 100.0, 200.0)} | {"t": (2.0, 12.0, math.nan)})
     (family,) = found["thickness"]
     assert (family["along"], family["sizes"]) == ("thickness_um", [50.0, 100.0, 200.0])
@@ -299,7 +299,7 @@ def speeds(values: list[float], pressure_kPa: float = 24.0) -> list[dict]:
     ]
 
 
-def test_a_power_law_of_speed_comes_back_and_divided_by_diameter_it_is_one_less() -> None:
+def test_a_power_law_of_speed_comes_back_and_divided_by_diameter_it_is_one_less():
     (family,) = fit_trends(conditions(speeds([2.0 * r**0.7 for r in (1, 2, 3, 4)])))["steady_speed"]
     assert family["sizes"] == [6.0, 12.0, 18.0, 24.0]
     assert family["power"]["slope"] == pytest.approx(0.7)
@@ -307,7 +307,7 @@ def test_a_power_law_of_speed_comes_back_and_divided_by_diameter_it_is_one_less(
     assert family["monotonic"]
 
 
-def test_speeds_at_other_pressures_or_walls_are_other_families() -> None:
+def test_speeds_at_other_pressures_or_walls_are_other_families():
     thin = {"diameter_mm": 12.0, "thickness_um": 50.0, "pressure_kPa": 24.0, "x_ss_m_s": 9.0}
     loaded_one = {**thin, "thickness_um": 100.0, "payload_g": 10.0}
     rows = [*speeds([1.0, 2.0, 3.0]), *speeds([4.0, 5.0], pressure_kPa=25.0), thin, loaded_one]
@@ -317,7 +317,7 @@ def test_speeds_at_other_pressures_or_walls_are_other_families() -> None:
     assert families[1]["refused"]
 
 
-def test_powers_of_wall_and_diameter_stand_apart() -> None:
+def test_powers_of_wall_and_diameter_stand_apart():
     rows = []
     for D, t in itertools.product((12.0, 18.0), (50.0, 100.0, 200.0)):
         efficiency = 0.4 * (t / 100) ** -0.6 * (D / 12) ** 0.2
@@ -332,7 +332,7 @@ def test_powers_of_wall_and_diameter_stand_apart() -> None:
     assert family["trend"]["efficiency_with_weight"]["refused"]
 
 
-def test_one_power_is_the_straight_line_of_the_textbook() -> None:
+def test_one_power_is_the_straight_line_of_the_textbook():
     """ln values 0, 1, 1 at ln sizes 0, 1, 2: slope ½, residuals −1/6, 1/3, −1/6, s² = 1/6, error √(s²/2)."""
     found = damping.planes(
         {"thickness_um": np.exp([0.0, 1.0, 2.0]), "diameter_mm": np.full(3, 12.0)}, np.exp([0.0, 1.0, 1.0])

@@ -41,7 +41,7 @@ def force_of(trial: Trial, window: Window = WINDOW, pressure_Pa: np.ndarray | No
     return module.steady_force(moved(pressure_Pa, trial), window, model or base_model())
 
 
-def test_force_is_the_excess_pressure_and_the_weight_of_what_still_moves() -> None:
+def test_force_is_the_excess_pressure_and_the_weight_of_what_still_moves():
     """Mean growth in the window 0.1 m: 0.18 m of film left, and its weight counts r = 2 times."""
     force = force_of(VINE)
     assert force.force_N == pytest.approx(11e3 * AREA + 2 * FILM * 0.18 * G, rel=1e-9)
@@ -55,7 +55,7 @@ def test_force_is_the_excess_pressure_and_the_weight_of_what_still_moves() -> No
         assert force.force_N == pytest.approx(11e3 * AREA + share * 2 * FILM * 0.18 * G, rel=1e-9)
 
 
-def test_a_measured_pressure_takes_the_place_of_the_set_one() -> None:
+def test_a_measured_pressure_takes_the_place_of_the_set_one():
     """A trace that falls by 20 Pa a frame is 12 kPa in the mean, at the middle of the window; a fall is no error."""
     trace = 12e3 - 20.0 * (np.arange(200) - 100)
     force = force_of(VINE, pressure_Pa=trace)
@@ -70,7 +70,7 @@ def test_a_measured_pressure_takes_the_place_of_the_set_one() -> None:
     assert force_of(VINE, pressure_Pa=silent).pressure_source == "set"
 
 
-def test_the_model_in_use_says_what_the_pressure_was() -> None:
+def test_the_model_in_use_says_what_the_pressure_was():
     """An isothermal litre: the mean over the window of the gas law at 50 … 150 mm."""
     trial = replace(VINE, chamber_m3=1e-3)
     model = (base_model() + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": 1.0})
@@ -82,7 +82,7 @@ def test_the_model_in_use_says_what_the_pressure_was() -> None:
     assert mean < 10e3
 
 
-def test_in_a_quasi_steady_window_inertia_is_taken_off() -> None:
+def test_in_a_quasi_steady_window_inertia_is_taken_off():
     """A drift of 10 % of 2 m/s over 0.1 s: ẍ = 2 m/s²."""
     window = replace(WINDOW, rule="quasi_steady", from_s=START_S + 0.05, to_s=START_S + 0.15, drift=0.1)
     exact = 11e3 * AREA + 2 * FILM * 0.18 * (G - 2.0)
@@ -90,7 +90,7 @@ def test_in_a_quasi_steady_window_inertia_is_taken_off() -> None:
     assert force_of(VINE).force_N - force_of(VINE, window).force_N == pytest.approx(2 * FILM * 0.18 * 2.0, rel=1e-2)
 
 
-def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only_and_payloads_are_in_no_law() -> None:
+def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only_and_payloads_are_in_no_law():
     assert module.known_pressure(moved(), base_model()) is None
     found = module.known_pressure(moved(np.where(np.arange(200) % 2, 12e3 + np.arange(200), math.nan)), base_model())
     assert found is not None

@@ -178,7 +178,7 @@ def analysed(pressure_kPa: float, seed: int) -> TrialResult:
     return summarise_trial(trial, track, RunSettings(), make_model(base_model().names))
 
 
-def test_a_measured_pressure_makes_a_point_of_a_speed_that_never_settles() -> None:
+def test_a_measured_pressure_makes_a_point_of_a_speed_that_never_settles():
     result = analysed(20, seed=1000)
     window = result.windows["quasi_steady"]
     assert window.accepted
@@ -188,7 +188,7 @@ def test_a_measured_pressure_makes_a_point_of_a_speed_that_never_settles() -> No
     assert result.point["force_N"] == pytest.approx(B * float(result.point["x_ss_m_s"]) ** N, rel=0.01)
 
 
-def test_where_inertia_rules_there_is_no_window() -> None:
+def test_where_inertia_rules_there_is_no_window():
     """The drive of 34 kPa falls so fast that the film's inertia takes more than a tenth of it."""
     windows = analysed(34, seed=1003).windows
     assert not windows.get("quasi_steady", windows["gated"]).accepted

@@ -32,7 +32,7 @@ def summarise(vine: Vine, **changes: object) -> tuple[Recording, dict, dict]:
     return recording, result.row, result.point
 
 
-def test_a_steady_trial_gives_its_speeds_and_the_force_that_holds_it() -> None:
+def test_a_steady_trial_gives_its_speeds_and_the_force_that_holds_it():
     """B x_ssⁿ from the reported speed is the reported force, weight and all: the law that made the motion."""
     recording, row, _ = summarise(SLOW)
     assert row["steady_rule"] == "gated"
@@ -49,7 +49,7 @@ def test_a_steady_trial_gives_its_speeds_and_the_force_that_holds_it() -> None:
     assert row["final_lead_velocity_m_s"] == pytest.approx(truth, rel=0.03)
 
 
-def test_a_trial_that_still_gathers_speed_or_whose_window_is_outside_the_recording_says_why() -> None:
+def test_a_trial_that_still_gathers_speed_or_whose_window_is_outside_the_recording_says_why():
     outside = {"steady_window_s": (900.0, 901.0)}
     for vine, changes, status in ((Vine(4, 30.0, payload_kg=0.0356), {}, "ok"), (SLOW, outside, "warning")):
         _, row, point = summarise(vine, **changes)
@@ -59,7 +59,7 @@ def test_a_trial_that_still_gathers_speed_or_whose_window_is_outside_the_recordi
         assert np.isfinite(row["final_lead_velocity_m_s"])
 
 
-def test_a_falling_ball_is_measured_but_has_no_place_in_the_law() -> None:
+def test_a_falling_ball_is_measured_but_has_no_place_in_the_law():
     """½gt² at 500 frames a second: no plateau; the last speed is g t."""
     time_s = np.arange(150) / 500
     fallen = 0.5 * G * np.maximum(time_s - 0.05, 0) ** 2
@@ -95,7 +95,7 @@ def table(rows: list[dict] = ROWS) -> pd.DataFrame:
     return found.set_index(found["condition"].str.split("_").str[1:].str.join("_"))
 
 
-def test_speed_is_a_mean_with_its_standard_error() -> None:
+def test_speed_is_a_mean_with_its_standard_error():
     """2.0, 2.4, 2.2: mean 2.2, standard deviation 0.2, over √3. Final speeds count wherever growth got there."""
     bare = table().loc["24kPa_0g"]
     assert bare["x_ss_m_s"] == pytest.approx(2.2)
@@ -111,7 +111,7 @@ def test_speed_is_a_mean_with_its_standard_error() -> None:
     assert bare[["x_ss_m_s", "x_ss_over_diameter_1_s"]].isna().all()
 
 
-def test_failed_trials_count_for_nothing_and_efficiency_has_its_variants() -> None:
+def test_failed_trials_count_for_nothing_and_efficiency_has_its_variants():
     """Film 4.5239 g/m × 0.2 m: 0.22619 g are left at 0.15 m beside 35.6 g; the mean moving mass is 36.1655 g."""
     loaded = table().loc["34kPa_35.6g"]
     assert (loaded["n_trials"], loaded["n_efficiency"]) == (2, 2)
@@ -128,14 +128,14 @@ def test_failed_trials_count_for_nothing_and_efficiency_has_its_variants() -> No
 VINE = replace(LOADED, length_m=0.3)
 
 
-def test_velocity_where_a_position_is_passed_is_interpolated() -> None:
+def test_velocity_where_a_position_is_passed_is_interpolated():
     y, v = np.array([0.0, 0.1, 0.2, 0.4]), np.array([0.0, 1.0, 3.0, 4.0])
     places_m = (0.15, 0.3, 0.2, 0.41, -0.1, 0.0)
     found = [summary.lead_velocity_at(y, v, place_m) for place_m in places_m]
     assert found == pytest.approx([2.0, 3.5, 3.0, math.nan, math.nan, math.nan], nan_ok=True)
 
 
-def test_efficiency_by_hand() -> None:
+def test_efficiency_by_hand():
     """Film of 4.5239 g/m: 0.15 m of 0.3 m left, 0.679 g, and 35.6 g at 2 × 3 m/s, over 34 kPa × 113.1 mm² × 0.15 m."""
     film_kg = 1200 * math.pi * 0.012 * 100e-6 * 0.15
     assert film_kg == pytest.approx(0.679e-3, rel=1e-3)
@@ -144,7 +144,7 @@ def test_efficiency_by_hand() -> None:
     assert truth == pytest.approx(1.132, rel=1e-3)
 
 
-def test_the_weight_of_the_payload_works_beside_the_gas() -> None:
+def test_the_weight_of_the_payload_works_beside_the_gas():
     """35.6 g × 9.81 m/s² × 0.3 m = 0.10477 J, beside 34 kPa × 0.15 m × 113.10 or 254.47 mm² = 0.57679 or 1.29777 J."""
     for D_mm, angle_deg, share in ((12, 0, 0.1816), (18, 0, 0.0807), (12, 60, 0.0908), (12, 180, -0.1816)):
         no_film = replace(VINE, diameter_m=D_mm / 1e3, thickness_m=1e-12, growth_angle_rad=math.radians(angle_deg))

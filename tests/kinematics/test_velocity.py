@@ -1,7 +1,5 @@
 """Velocity against vines integrated by SciPy and against formulas. Scored on seeds 1000 and up (tuned on 0–99)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

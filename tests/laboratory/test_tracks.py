@@ -32,7 +32,7 @@ def nature(**changes: object) -> GroundTruth:
 EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
 
 
-def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_seed_others() -> None:
+def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_seed_others():
     def same(one: tracks.VirtualTrial, other: tracks.VirtualTrial) -> bool:
         moved = np.array_equal(one.track.lead_position_m, other.track.lead_position_m)
         return moved and (one.release_s, one.true) == (other.release_s, other.true)
@@ -44,7 +44,7 @@ def test_a_seed_gives_a_trial_its_numbers_whatever_the_others_are_and_another_se
     assert not any(map(same, whole, grow(trials, replace(hidden, seed=4))))
 
 
-def test_without_scatter_and_noise_a_track_is_the_model_seen_from_an_unknown_origin() -> None:
+def test_without_scatter_and_noise_a_track_is_the_model_seen_from_an_unknown_origin():
     hidden = nature(seed=1, **EXACT)
     for grown in grow(few(), hidden):
         truth = simulate(hidden.model(), grown.stated, grown.track.time_s - grown.release_s)
@@ -60,7 +60,7 @@ def test_without_scatter_and_noise_a_track_is_the_model_seen_from_an_unknown_ori
     np.testing.assert_allclose(seen_m, 1.05 * grown.true_lead_position_m, atol=1e-12)
 
 
-def test_scatter_of_damping_and_pressure_is_as_stated() -> None:
+def test_scatter_of_damping_and_pressure_is_as_stated():
     """Standard deviations of 600 draws are good to 3 % (one sigma); the two do not go together."""
     trials = list(with_names(campaign(isometric_vine(4), (28,), 600)))
     grown = grow(trials, nature(seed=7, longest_frames=50, release_frames=(15, 40)))
@@ -78,7 +78,7 @@ def test_scatter_of_damping_and_pressure_is_as_stated() -> None:
     assert np.std(release % 1) == pytest.approx(math.sqrt(1 / 12), rel=0.1)
 
 
-def test_noise_has_the_stated_deviation_and_correlation() -> None:
+def test_noise_has_the_stated_deviation_and_correlation():
     """Rest frames alone, 4000 of them: errors of 2 % for the deviation (or more), 0.016 for the latter."""
     at_rest = {"release_frames": (4000, 4000), "longest_frames": 4000}
     hidden = nature(seed=11, noise_m=2e-4, noise_correlation=0.6, **at_rest)
@@ -92,7 +92,7 @@ def test_noise_has_the_stated_deviation_and_correlation() -> None:
     assert centred[2:] @ centred[:-2] / (centred @ centred) == pytest.approx(0.36, abs=0.08)
 
 
-def test_a_recorded_pressure_is_what_drove_it_and_noise() -> None:
+def test_a_recorded_pressure_is_what_drove_it_and_noise():
     trials = [replace(trial, chamber_m3=1e-3) for trial in few()]
     effects = (*GroundTruth().effects, "reservoir_depletion")
     values = {**damping_values(trials), "reservoir_depletion.gamma": 1.0}
@@ -107,7 +107,7 @@ def test_a_recorded_pressure_is_what_drove_it_and_noise() -> None:
     assert np.std(loud.track.pressure_Pa - calm[0].track.pressure_Pa) == pytest.approx(100, rel=0.3)
 
 
-def test_what_is_written_reads_back_without_a_word(tmp_path: Path) -> None:
+def test_what_is_written_reads_back_without_a_word(tmp_path):
     grown = grow(few(), nature(seed=1, trace_sigma_kPa=0.05))
     tracks.write_experiment(grown, tmp_path / "e", "chamber_l: 3.7\n")
     assert check_experiment(tmp_path / "e") == []
@@ -125,7 +125,7 @@ def test_what_is_written_reads_back_without_a_word(tmp_path: Path) -> None:
 PAPER = ROOT / "data" / "paper"
 
 
-def test_the_papers_nature_has_the_printed_numbers() -> None:
+def test_the_papers_nature_has_the_printed_numbers():
     """B of a printed diameter is in proportion to the wall; of the 25 mm vine it is 6.44 × ½ × (25/24)^0.75 = 3.320."""
     trials = read_experiment(PAPER).trials
     assert len(trials) == 365
@@ -139,7 +139,7 @@ def test_the_papers_nature_has_the_printed_numbers() -> None:
     assert B["25mm-100um-400mm"] == pytest.approx(3.320, abs=5e-4)
 
 
-def test_tracks_are_put_before_a_camera_on_request(tmp_path: Path) -> None:
+def test_tracks_are_put_before_a_camera_on_request(tmp_path):
     chosen = ["fig4_28kPa_1", "fast_62kPa_1"]
     filming = make_filming({"target": {"squares": [14, 5], "square_m": 0.015, "marker_m": 0.011}})
     filmed = recording_experiment(read_experiment(PAPER), chosen, filming, tmp_path / "filmed")

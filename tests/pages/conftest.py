@@ -1,34 +1,29 @@
 """One small results folder for the explorer, and a folder of rendered clips for the set-up page."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from explorer_campaign import SMALL, make_experiment, make_results
 from plain_scene import Plan, plain_scene, write_video
 
-from vinetrack.pages.campaign import Campaign
 from vinetrack.pages.page import open_campaign
 
 CLIPS = ("d15 24kPa 1.mp4", "d15 30kPa 1.mp4")
 
 
 @pytest.fixture(scope="session")
-def small_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_results(tmp_path_factory):
     """Six trials of one vine, three conditions, two replicates each."""
     folder = tmp_path_factory.mktemp("explorer")
     return make_results(make_experiment(folder / "vines", SMALL), folder / "results" / "vines")
 
 
 @pytest.fixture(scope="session")
-def campaign(small_results: Path) -> Campaign:
+def campaign(small_results):
     """The same, opened."""
     return open_campaign(small_results)
 
 
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rendered(tmp_path_factory):
     """Two clips of a straight tube, 480 × 160 px, and nothing else."""
     folder = tmp_path_factory.mktemp("rendered")
     for seed, name in enumerate(CLIPS):
@@ -40,7 +35,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def clips(rendered: Path, tmp_path: Path) -> Path:
+def clips(rendered, tmp_path):
     """The same, to write in."""
     folder = tmp_path / "campaign"
     folder.mkdir()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +24,7 @@ ROW = "48 * 960, 49 * 960"  # the middle of the bar in the picture
 
 
 @pytest.fixture(scope="module")
-def visitor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visitor]:
+def visitor(tmp_path_factory):
     folder = tmp_path_factory.mktemp("browser")
     experiment = make_experiment(folder / "vines")
     results = make_results(experiment, folder / "results" / "vines")
@@ -40,7 +38,7 @@ def visitor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visitor]:
         assert all(request.startswith(("http://127.0.0.1:", "ws://127.0.0.1:")) for request in asked)
 
 
-def test_dragging_a_slider_moves_the_curves_continuously_and_a_refit_brings_the_error_down(visitor: Visitor) -> None:
+def test_dragging_a_slider_moves_the_curves_continuously_and_a_refit_brings_the_error_down(visitor):
     """Each of thirty moves is drawn before the release; `benchmarks/explorer_speed.py` measures the delay."""
 
     def errors(column: str = "now") -> np.ndarray:
@@ -68,7 +66,7 @@ def test_dragging_a_slider_moves_the_curves_continuously_and_a_refit_brings_the_
     assert "vinetrack add reservoir_depletion" in visitor.text("commands")
 
 
-def test_the_recording_is_scrubbed_with_the_edges_over_it(visitor: Visitor) -> None:
+def test_the_recording_is_scrubbed_with_the_edges_over_it(visitor):
     """The tracked edge is drawn where the picture goes dark, the model's within a few millimetres of it."""
     visitor.chrome.run(f"{visitor.model('film_trial')}.value = {FILMED!r}")
     visitor.until("$film_figure.visible && $film_edges.data.xs.length === 3", "the recording", 60)
@@ -86,7 +84,7 @@ def test_the_recording_is_scrubbed_with_the_edges_over_it(visitor: Visitor) -> N
     assert seen[1] > seen[0] + 20
 
 
-def test_page_and_figures_follow_a_dark_screen(visitor: Visitor) -> None:
+def test_page_and_figures_follow_a_dark_screen(visitor):
     """The ink is the page's own on either; a vine keeps its hue and turns lighter on the dark one."""
     ink, vine = "$motion.below[0].axis_label_text_color", "$motion.renderers[1].glyph.line_color.transform.palette[0]"
     for screen, colours in (("dark", ("#e6e9ee", "#3fa9ea")), ("light", ("#20242a", "#0072b2"))):
@@ -154,7 +152,7 @@ class Person:
 
 
 @pytest.fixture
-def person(clips: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Person]:
+def person(clips, tmp_path, request):
     """A page served by this process, so that the server is not restarted for every test, or else by the command."""
     by_command = getattr(request, "param", False)
     serving = Served(clips, "--port", "0", command="setup") if by_command else served_here(clips)
@@ -164,7 +162,7 @@ def person(clips: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Itera
 
 
 @pytest.mark.parametrize("person", [True], indirect=True)
-def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) -> None:
+def test_a_folder_of_clips_becomes_an_experiment(person, clips):
     """The whole way: four shared values, two ruler marks, one length, a check, a track, and a save."""
     for column, value in SHARED.items():
         person.fill(column, "shared", value)
@@ -187,7 +185,7 @@ def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) ->
     assert read_table(clips / "trials.csv").columns == ("trial", "video", "diameter_mm", "pressure_kPa")
 
 
-def test_the_axis_is_dragged_and_bent_and_its_curve_is_that_tracked_along(person: Person, clips: Path) -> None:
+def test_the_axis_is_dragged_and_bent_and_its_curve_is_that_tracked_along(person, clips):
     """By mouse and keyboard; the bend is taken out again."""
     person.drag("End", 440, 90)
     person.chrome.wait("document.activeElement.dataset.handle?.startsWith('End')", "the focus on the handle")
@@ -212,7 +210,7 @@ def test_the_axis_is_dragged_and_bent_and_its_curve_is_that_tracked_along(person
     assert person.chrome.run("document.activeElement.dataset.handle") == "Start of the growth axis"
 
 
-def test_a_frame_is_corrected_and_the_file_contains_the_correction(person: Person, clips: Path) -> None:
+def test_a_frame_is_corrected_and_the_file_contains_the_correction(person, clips):
     """Frame 20 is dropped by its button, frame 21 moved in the picture by the keyboard, and 22 taken back."""
     person.press("#track")
     person.chrome.wait("document.querySelector('.strip svg') !== null", "the strip", 120)
@@ -234,7 +232,7 @@ def test_a_frame_is_corrected_and_the_file_contains_the_correction(person: Perso
     person.said("#moved-points", "to the former axis")
 
 
-def test_every_control_is_reached_by_tab_and_eight_hundred_pixels_are_enough_in_both_schemes(person: Person) -> None:
+def test_every_control_is_reached_by_tab_and_eight_hundred_pixels_are_enough_in_both_schemes(person):
     seen = set()
     for count in range(160):
         if count % 10 == 0:
@@ -255,7 +253,7 @@ def test_every_control_is_reached_by_tab_and_eight_hundred_pixels_are_enough_in_
         assert brightness > 200 if scheme == "light" else brightness < 60
 
 
-def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(person: Person) -> None:
+def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(person):
     """Rows in another order, with a header in psi and one row of no clip, pasted into the first cell."""
     cells = "[...document.querySelectorAll('#trials [data-column=pressure_kPa]')].slice(1).map((field) => field.value)"
     names = "[...document.querySelectorAll('#trials [data-column=trial]')].map((field) => field.value)"

@@ -25,7 +25,7 @@ from tornado.websocket import websocket_connect
 
 from vinetrack.effects import Parameter
 from vinetrack.laboratory.tracks import grow, read_ground_truth
-from vinetrack.pages.campaign import Campaign, choice_in_use, commands, predict_choice, slider_range
+from vinetrack.pages.campaign import choice_in_use, commands, predict_choice, slider_range
 from vinetrack.pages.page import address as where
 from vinetrack.pages.page import open_campaign, start_server
 from vinetrack.pages.plots import RecordingView, decode, recording_view
@@ -34,7 +34,7 @@ from vinetrack.video.axis import Axis
 
 
 @pytest.mark.slow
-def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> None:
+def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path):
     """No point of a doubtful rest is fitted, but it still determines the origin."""
     experiment = make_experiment(tmp_path / "vines", SMALL[:4])
     for path in (experiment / "tracks").iterdir():
@@ -49,7 +49,7 @@ def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> N
     assert prediction.errors_m == pytest.approx(table["rms_position_m"].to_dict(), rel=1e-6)
 
 
-def test_a_refused_fit_still_shows_the_trials_a_folder_without_any_is_refused(campaign: Campaign, tmp_path: Path):
+def test_a_refused_fit_still_shows_the_trials_a_folder_without_any_is_refused(campaign, tmp_path):
     folder = tmp_path / "results"
     shutil.copytree(campaign.folder, folder)
     (folder / "fit.json").write_text(json.dumps({"model": [], "refused": "no reason"}))
@@ -68,7 +68,7 @@ def test_a_refused_fit_still_shows_the_trials_a_folder_without_any_is_refused(ca
         open_campaign(folder)
 
 
-def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value() -> None:
+def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value():
     drag = Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0))
     assert slider_range("air_drag.C_D", drag, 1.0) == (0.0, 3.0)
     assert slider_range("air_drag.C_D", drag, 17.0) == (0.0, 21.25)
@@ -79,7 +79,7 @@ def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value() -
     assert slider_range("eversion_damping.B", damping, 6.0) == (0.0, 12.0)
 
 
-def test_the_page_shows_the_command_that_reproduces_it(campaign: Campaign) -> None:
+def test_the_page_shows_the_command_that_reproduces_it(campaign):
     start = choice_in_use(campaign)
     folder = campaign.folder.as_posix()
     assert commands(campaign, start, fitted=True) == [f"vinetrack compare {folder}"]
@@ -90,7 +90,7 @@ def test_the_page_shows_the_command_that_reproduces_it(campaign: Campaign) -> No
     assert commands(replace(campaign, in_use=(*campaign.in_use, "leak")), start, fitted=True) == []
 
 
-def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
+def test_frames_come_back_as_they_were_filmed(tmp_path):
     """A bar whose right end moves by 8 px per frame."""
     told: list[tuple[int, float]] = []
     film = decode(write_bars(tmp_path / "a.mp4", 20 + 8.0 * np.arange(30), 320, 96), told.append)
@@ -100,7 +100,7 @@ def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
     assert abs(int(np.argmax(film.picture(10)[48] < 120)) - 100) <= 1
 
 
-def test_edges_stand_across_the_axis_where_the_track_and_the_shake_put_them() -> None:
+def test_edges_stand_across_the_axis_where_the_track_and_the_shake_put_them():
     frames = np.arange(20.0)
     edge_px = np.where(frames < 15, 10 + 5 * frames, np.nan)
     one = RecordingView(
@@ -115,7 +115,7 @@ def test_edges_stand_across_the_axis_where_the_track_and_the_shake_put_them() ->
     np.testing.assert_allclose(upright.across(20.0, 4), ((90.0, 110.0), (70.0, 70.0)))
 
 
-def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campaign, tmp_path: Path) -> None:
+def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign, tmp_path):
     seen = campaign.trials[0]
     results = Results(tmp_path)
     trial = replace(seen.data.trial, video=tmp_path / "gone.mp4", track=None)
@@ -144,7 +144,7 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
     assert np.allclose(direction, found.axis.direction_at(0.5 * found.axis.length_px), atol=1e-9)
 
 
-def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign, tmp_path: Path) -> None:
+def test_an_experiment_that_has_moved_is_named_by_its_option(campaign, tmp_path):
     shutil.copytree(campaign.folder, tmp_path / "results")
     (tmp_path / "results" / "provenance.json").write_text(json.dumps({"experiment": str(tmp_path / "vines")}))
     for folder, said in (("nowhere", ""), ("results", "--experiment")):
@@ -155,7 +155,7 @@ def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign,
 
 
 @pytest.mark.slow
-def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign: Campaign) -> None:
+def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign):
     async def from_elsewhere() -> None:
         request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Origin": "http://example.org"})
         with pytest.raises(HTTPClientError, match="403"):
@@ -178,7 +178,7 @@ def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign: Camp
     assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
 
 
-def test_no_route_answers_under_another_name_or_without_the_secret() -> None:
+def test_no_route_answers_under_another_name_or_without_the_secret():
     def status(address: str, host: str) -> int:
         request = HTTPRequest(address, headers={"Host": host})
         return server.io_loop.run_sync(lambda: AsyncHTTPClient().fetch(request, raise_error=False)).code

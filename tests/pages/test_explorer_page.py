@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -74,18 +74,18 @@ def fitted(campaign: Campaign) -> BackgroundFit:
 
 
 @pytest.fixture(scope="module")
-def background(campaign: Campaign) -> BackgroundFit:
+def background(campaign):
     return fitted(campaign)
 
 
 @pytest.fixture
-def browser(background: BackgroundFit) -> Iterator[Browser]:
+def browser(background):
     opened = Browser(background)
     yield opened
     opened.page.close()
 
 
-def test_a_slider_adds_its_effect_and_moves_the_curves(browser: Browser) -> None:
+def test_a_slider_adds_its_effect_and_moves_the_curves(browser):
     assert browser.model("tick_gravity").disabled
     assert browser.model("tick_inlet_loss").disabled  # the sheet states no inlet
     before = [list(part) for part in browser.model("model_curves").data["ys"]]
@@ -99,7 +99,7 @@ def test_a_slider_adds_its_effect_and_moves_the_curves(browser: Browser) -> None
     assert browser.text("commands") == ""
 
 
-def test_conditions_and_trials_can_be_chosen(browser: Browser) -> None:
+def test_conditions_and_trials_can_be_chosen(browser):
     browser.model("conditions").active = [0]
     assert browser.model("residual_curves").data["condition"] == ["24 kPa", "24 kPa"]
     assert browser.model("error_bars").data["alpha"][2] > browser.model("error_bars").data["alpha"][0]
@@ -115,7 +115,7 @@ def test_conditions_and_trials_can_be_chosen(browser: Browser) -> None:
     assert browser.model("conditions").active == [0, 1, 2]
 
 
-def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) -> None:
+def test_a_refit_brings_the_error_down_and_says_what_it_found(browser):
     before, said = list(browser.model("error_bars").data["now"]), browser.text("headline")
     browser.model("tick_reservoir_depletion").active = True
     browser.turn()
@@ -141,7 +141,7 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) 
     browser.click("hold")
 
 
-def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: BackgroundFit, tmp_path: Path) -> None:
+def test_a_diagnosis_appears_by_itself(campaign, background, tmp_path):
     folder = tmp_path / "vines"
     shutil.copytree(campaign.folder, folder)
     own = BackgroundFit(open_campaign(folder, campaign.experiment.folder))
@@ -159,7 +159,7 @@ def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: Backgroun
     Browser(own).page.close()  # opens with a diagnosis that is torn
 
 
-def test_a_failed_simulation_is_reported_and_curves_stay(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_simulation_is_reported_and_curves_stay(browser, monkeypatch):
     before = list(browser.model("error_bars").data["now"])
     monkeypatch.setattr("vinetrack.pages.page.predict_choice", Mock(side_effect=FitError("Trial a: too hard.")))
     browser.model(GAMMA).value = 1.1
@@ -168,7 +168,7 @@ def test_a_failed_simulation_is_reported_and_curves_stay(browser: Browser, monke
     assert list(browser.model("error_bars").data["now"]) == before
 
 
-def test_a_torn_recording_is_named(browser: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_torn_recording_is_named(browser, monkeypatch, tmp_path):
     """Also once the text of the page was updated."""
     (tmp_path / "torn.mp4").write_bytes(b"not a film")
     no = np.zeros(0)
@@ -220,7 +220,7 @@ def slide(numbers: Browser, size: float) -> None:
 
 
 @pytest.mark.slow
-def test_every_step_of_a_user_shows_the_errors_of_a_comparison_and_what_add_finds(tmp_path: Path) -> None:
+def test_every_step_of_a_user_shows_the_errors_of_a_comparison_and_what_add_finds(tmp_path):
     """Trials with measured pressures and an effect that is not in the model."""
     nature = yaml.safe_load(DEMO.read_text(encoding="utf-8"))
     nature |= {"effects": [*nature["effects"], EFFECT], "trace_sigma_kPa": 0.1}
@@ -274,7 +274,7 @@ Opened = tuple[Browser, list[BackgroundFit]]
 
 
 @pytest.fixture
-def opened(campaign: Campaign, tmp_path: Path) -> Iterator[Opened]:
+def opened(campaign, tmp_path):
     """A page of a copy of experiment and results, diagnosed as `unexplained`, and the pages opened in its place."""
     experiment, folder = tmp_path / "vines", tmp_path / "results"
     shutil.copytree(campaign.experiment.folder, experiment)
@@ -290,9 +290,7 @@ def opened(campaign: Campaign, tmp_path: Path) -> Iterator[Opened]:
 
 
 @pytest.mark.slow
-def test_the_proposed_effect_is_opened_fitted_and_saved(
-    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_proposed_effect_is_opened_fitted_and_saved(opened, tmp_path, monkeypatch):
     browser, reopened = opened
     folder, going_on = tmp_path / "vines", threading.Event()
 
@@ -333,7 +331,7 @@ def test_the_proposed_effect_is_opened_fitted_and_saved(
     assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
 
 
-def test_a_stopped_or_failed_search_can_be_restarted(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_or_failed_search_can_be_restarted(opened, monkeypatch):
     browser, _ = opened
     begun, ended = threading.Event(), threading.Event()
 

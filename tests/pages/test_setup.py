@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from vinetrack.pages.setup_server import SetupServer, draft_from_json, draft_pro
 from vinetrack.video.curved_axis import axis_through
 
 
-def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of_their_numbers(tmp_path):
     names = "run 10.mp4,run 2.MOV,notes.txt,.hidden.mp4,board.png,calibration/board.mp4,two/1.png,two/2.png"
     names += ",monday/a.avi,trials.csv,corrections.csv,p 10.csv,p 2.csv,traces/a.csv"
     names += ",results/provenance.json,results/overlay.mp4,results/trials.csv"
@@ -62,7 +61,7 @@ NAMES = {
 }  # fmt: skip
 
 
-def test_a_name_says_cells_and_a_unit_that_all_share_is_kept_while_mixed_ones_are_converted() -> None:
+def test_a_name_says_cells_and_a_unit_that_all_share_is_kept_while_mixed_ones_are_converted():
     assert {name: columns_from_names([name]) for name in NAMES} == {name: [cells] for name, cells in NAMES.items()}
     assert columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
     assert columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
@@ -72,7 +71,7 @@ SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
 SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"
 
 
-def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_its_cells(tmp_path: Path) -> None:
+def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_its_cells(tmp_path):
     for name in ("a.mp4", "d12_30kPa_1.mp4"):
         (tmp_path / name).write_bytes(b"x")
     sheet, settings = tmp_path / "trials.csv", tmp_path / "experiment.yaml"
@@ -95,7 +94,7 @@ def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_
         open_draft(tmp_path)
 
 
-def test_shared_values_are_set_in_place_and_in_the_unit_chosen() -> None:
+def test_shared_values_are_set_in_place_and_in_the_unit_chosen():
     after = with_shared(SETTINGS, {"yield_pressure_psi": "0.5", "thickness_um": "100", "capture_fps": "1069"})
     assert after.startswith("# of the lab\nyield_pressure_psi: 0.5 # measured twice\n")
     assert shared_values(after) == {"thickness_um": 100, "yield_pressure_psi": 0.5, "capture_fps": 1069}
@@ -131,14 +130,14 @@ def notes(text: str, at_column: str = "trial") -> int:
 @pytest.mark.parametrize("mark", ["\t", ";", ",", "  "])
 @pytest.mark.parametrize("header", ["clip{0}pressure (psi){0}payload_g", "Trial{0}Pressure [psi]{0}Payload"])
 @pytest.mark.parametrize("at_column", ["trial", "payload_g"])
-def test_a_header_names_columns_and_units_and_rows_are_those_of_their_clips(mark: str, header: str, at_column: str):
+def test_a_header_names_columns_and_units_and_rows_are_those_of_their_clips(mark, header, at_column):
     lines = [header.format(mark), "monday/d15 36kPa 1.mov|5.3|5", "d15 24kPa 1.mp4|3.5|0", "d15_30kPa_1|4.5|20"]
     text = "\r\n".join(lines).replace("|", mark) + "\r\n"
     assert changed(text, 1, at_column) == EXPECTED
     assert notes(text, at_column) == 0
 
 
-def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_they_are_pasted() -> None:
+def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_they_are_pasted():
     assert changed("name pressure_psi payload_g\nlate 5.3 5\nd15_24kPa_1 3.5 0\nd15_30kPa_1 4.5 20") == EXPECTED
     expected = {(2, "pressure_kPa"): "36", (2, "payload_g"): "5", (0, "pressure_kPa"): "24", (0, "payload_g"): "0"}
     assert changed("late\t36\t5\nd15_24kPa_1\t24\t0\n", 0, "pressure_kPa") == expected
@@ -149,7 +148,7 @@ def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_the
     assert changed("pressure\n24", 1, "diameter_mm") == {(1, "pressure_kPa"): "24"}
 
 
-def test_what_matches_nothing_is_named_and_changes_nothing() -> None:
+def test_what_matches_nothing_is_named_and_changes_nothing():
     text = "clip\tpressure_kPa\tcolour\nd15_24kPa_1\t24\tred\nd99_1\t99\tblue"
     assert changed(text) == {(0, "pressure_kPa"): "24"}
     assert changed("24\n30\n36\n42", 1, "pressure_kPa") == {(1, "pressure_kPa"): "24", (2, "pressure_kPa"): "30"}
@@ -161,7 +160,7 @@ def test_what_matches_nothing_is_named_and_changes_nothing() -> None:
     assert place_block("1.mp4\t24\nx/1.mp4\t30", COLUMNS, rows, 0, "pressure_kPa")[0] == [(0, "pressure_kPa", "30")]
 
 
-def test_decimal_commas_are_read_and_written_as_the_sheet_has_them() -> None:
+def test_decimal_commas_are_read_and_written_as_the_sheet_has_them():
     assert read_block("24,5\n30,5") == [["24,5"], ["30,5"]]
     assert changed("24,5\n30,5", 0, "pressure_kPa") == {(0, "pressure_kPa"): "24.5", (1, "pressure_kPa"): "30.5"}
     assert changed("late;36,5", 0, "pressure_kPa", ",") == {(2, "pressure_kPa"): "36,5"}
@@ -181,7 +180,7 @@ def problems(folder: Path, **more: Any) -> list[dict[str, Any]]:
     return draft_problems(folder, draft_from_json(folder, sent(folder, **more)))["problems"]
 
 
-def test_problems_name_their_field_in_the_unit_of_the_sheet_and_blanks_are_told_from_what_is_wrong(clips: Path) -> None:
+def test_problems_name_their_field_in_the_unit_of_the_sheet_and_blanks_are_told_from_what_is_wrong(clips):
     scale = {"kind": "two_points", "from_px": [10, 150], "to_px": [460, 150], "length_mm": 337.5}
     whole = problems(clips, shared=FILLED, calibration=scale)
     assert [one for one in whole if one["severity"] == "error"] == []
@@ -203,7 +202,7 @@ def test_problems_name_their_field_in_the_unit_of_the_sheet_and_blanks_are_told_
     assert not codes["yield_pressure_kPa"] & {"missing", "blank"}
 
 
-def test_a_new_folder_is_unsaved_and_a_sheet_that_is_there_is_shown_with_its_unknown_columns(clips: Path) -> None:
+def test_a_new_folder_is_unsaved_and_a_sheet_that_is_there_is_shown_with_its_unknown_columns(clips):
     assert page_state(clips)["unsaved"]
     (clips / "trials.csv").write_text("trial,video,note\nold,d15 24kPa 1.mp4,of Monday\n")
     state = page_state(clips)
@@ -216,7 +215,7 @@ OURS = {"X-Vinetrack": "setup"}
 
 
 @pytest.fixture
-def server(clips: Path) -> Iterator[SetupServer]:
+def server(clips):
     with served_here(clips) as made:
         yield made
 
@@ -231,7 +230,7 @@ def ask(
         return answer.status, answer.read(), answer.getheader("Content-Type") or ""
 
 
-def test_the_page_frames_and_the_axis_along_the_tube_are_served(server: SetupServer) -> None:
+def test_the_page_frames_and_the_axis_along_the_tube_are_served(server):
     assert b"<title>vinetrack set-up</title>" in ask(server, "/")[1]
     assert b"--ink" in ask(server, "/setup.css")[1]
     assert ask(server, "/table.js")[2].startswith("text/javascript")
@@ -249,7 +248,7 @@ def test_the_page_frames_and_the_axis_along_the_tube_are_served(server: SetupSer
     assert ask(server, "/api/curve?points=20,80;20,80;20,80")[0] == 422
 
 
-def test_one_row_is_tracked_before_the_sheet_is_filled_in_and_with_its_pressure(server: SetupServer, clips: Path):
+def test_one_row_is_tracked_before_the_sheet_is_filled_in_and_with_its_pressure(server, clips):
     made = json.loads(ask(server, "/api/track", sent(clips, row=0))[1])
     assert (made["timed"], made["scaled"]) == (False, False)
     edge = np.array([np.nan if value is None else value for value in made["edge_px"]])
@@ -266,7 +265,7 @@ def test_one_row_is_tracked_before_the_sheet_is_filled_in_and_with_its_pressure(
     assert made["pressure"] == {"time_s": [0.0, 0.05], "pressure_kPa": [24.0, 22.0]}
 
 
-def test_saving_writes_two_files_and_no_file_that_changed_meanwhile(server: SetupServer, clips: Path) -> None:
+def test_saving_writes_two_files_and_no_file_that_changed_meanwhile(server, clips):
     before, content = {path.name for path in clips.iterdir()}, sent(clips)
     made = json.loads(ask(server, "/api/save", sent(clips))[1])
     assert made["written"] == ["trials.csv", "experiment.yaml"]
@@ -277,7 +276,7 @@ def test_saving_writes_two_files_and_no_file_that_changed_meanwhile(server: Setu
     assert (clips / "experiment.yaml").read_text() == "chamber_l: 2\n"
 
 
-def test_other_pages_names_and_requests_without_the_secret_get_nothing(server: SetupServer, clips: Path) -> None:
+def test_other_pages_names_and_requests_without_the_secret_get_nothing(server, clips):
     for headers in ({"Host": "elsewhere.example"}, {**OURS, "Origin": "http://elsewhere.example"}):
         assert ask(server, "/api/save", sent(clips), headers)[0] == 403
     assert not (clips / "trials.csv").exists()

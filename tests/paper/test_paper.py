@@ -21,7 +21,7 @@ from vinetrack.paper import rows as lines
 # What follows from the paper's own numbers, each worked out by hand.
 
 
-def test_what_the_chamber_the_injector_and_the_sizes_say() -> None:
+def test_what_the_chamber_the_injector_and_the_sizes_say():
     """π × 12² mm² × 280 mm = 126.67 mL of 3700 mL; the gas law holds for absolute pressure.
 
     The injector: 2.5² × 12.5 over 15² × 20: 1/57.6 = 1.736 %; 149.325 × (1 − 1/1.017361) = 2.5482 kPa of 48.
@@ -49,7 +49,7 @@ FILM = 1200 * math.pi * 0.024 * 200e-6
 
 
 @pytest.fixture(scope="module")
-def departures() -> pd.DataFrame:
+def departures():
     return motions.departure_table([35.6])
 
 
@@ -70,7 +70,7 @@ def by_scipy(pressure_Pa, gamma, time_s, payload_kg=PAY, wall=1.0) -> np.ndarray
 
 
 @pytest.mark.parametrize(("pressure_kPa", "gamma", "name"), [(14, 1.0, "depletion_slow"), (28, 1.4, "depletion_fast")])
-def test_depletion_by_another_integrator(departures: pd.DataFrame, pressure_kPa: int, gamma: float, name: str) -> None:
+def test_depletion_by_another_integrator(departures, pressure_kPa, gamma, name):
     time_s = np.arange(0, 1.5, 1 / 1069)
     plain, sagging = (np.minimum(by_scipy(1e3 * pressure_kPa, one, time_s)[0], L) for one in (0.0, gamma))
     stop = np.searchsorted(plain, 0.95 * L)
@@ -79,7 +79,7 @@ def test_depletion_by_another_integrator(departures: pd.DataFrame, pressure_kPa:
     assert row["rms_position_m"] == pytest.approx(rms_m, rel=2e-3)
 
 
-def test_the_tail_goes_slack_when_the_balance_says_and_leaves_the_tip_alone(departures: pd.DataFrame) -> None:
+def test_the_tail_goes_slack_when_the_balance_says_and_leaves_the_tip_alone(departures):
     """At 7 kPa from the start, at 14 kPa after about 24 ms, at 28 kPa after about 145 ms.
 
     At 7 kPa the tip follows (P − P_y)A = B(2ẏ)ⁿ: 1.8096 N, ẏ = ½ (1.8096/6.44)^(1/0.37) = 0.01622 m/s all the way.
@@ -92,7 +92,7 @@ def test_the_tail_goes_slack_when_the_balance_says_and_leaves_the_tip_alone(depa
     assert slack.set_index("pressure_kPa").loc[7, "rms_position_m"] > 0.05
 
 
-def test_drag_by_mechanics_is_an_eighth_of_what_is_printed() -> None:
+def test_drag_by_mechanics_is_an_eighth_of_what_is_printed():
     """½ρ C_D ẏ²/P against ½ρ C_D (2ẏ)²/(½P): a factor eight; and the place decides, below 5 % and above."""
     shares = {fraction: (share, printed) for fraction, share, printed in motions.drag_shares([0.5, 0.95, 0.99])}
     for share, printed in shares.values():
@@ -100,7 +100,7 @@ def test_drag_by_mechanics_is_an_eighth_of_what_is_printed() -> None:
     assert shares[0.5][0] < 0.02 < shares[0.95][0] < 0.05 < shares[0.99][0]
 
 
-def test_without_weight_and_noise_the_published_rule_finds_what_was_put_in_and_less_where_a_chamber_sags() -> None:
+def test_without_weight_and_noise_the_published_rule_finds_what_was_put_in_and_less_where_a_chamber_sags():
     """Horizontal vines weigh nothing along their path: what is left is the window's own bias.
 
     Of a chamber the larger vines lose most, and most where they are slow: set pressure overstates the force there.
@@ -145,7 +145,7 @@ def filmed(**factors: float) -> dict[str, pd.DataFrame]:
     return moved
 
 
-def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent() -> None:
+def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent():
     """1.1 times Eq. (2) is there first, when Eq. (2) has grown to 0.95 · 280/1.1 = 242 mm."""
     mean = motions.mean_motions(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.9), RESTS)
     plain = motions.follow(TRIALS[0], motions.NONE, 6.44)
@@ -163,7 +163,7 @@ def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent() -> Non
     assert row.n_trials == 2
 
 
-def test_speeds_are_taken_at_12_cm_from_where_each_trial_rested() -> None:
+def test_speeds_are_taken_at_12_cm_from_where_each_trial_rested():
     """Speed 10 y beyond the rest: 1.2 m/s there, 1.4 where the origin lies 20 mm lower; mean 1.3, error 0.1."""
     y = np.linspace(0, 0.28, 500)
     kinematics = {name: pd.DataFrame({"lead_position_m": y, "lead_velocity_m_s": 10 * y}) for name in ("d", "e", "f")}
@@ -242,7 +242,7 @@ def table_rows(of: lines.ExperimentResults) -> pd.DataFrame:
     return lines.as_table(lines.result_rows(of)).set_index("row")
 
 
-def test_what_an_experiment_found_stands_beside_what_is_printed() -> None:
+def test_what_an_experiment_found_stands_beside_what_is_printed():
     rows = table_rows(found())
     law = rows.loc["n_both_axes", ["published", "ours", "ours_low_95", "ours_high_95"]]
     assert law.tolist() == pytest.approx([0.37, 0.372, 0.362, 0.382])
@@ -286,7 +286,7 @@ EVERY_NUMBER = {
 """Every published number, as it is printed."""
 
 
-def test_no_published_number_is_without_its_line() -> None:
+def test_no_published_number_is_without_its_line():
     steady = pd.DataFrame(columns=["trial", "rule", "accepted", "points", "cv", "drift"]).astype({"accepted": bool})
     rows = [*lines.protocol_rows([], steady, lines.SIMULATED), *lines.result_rows(nothing())]
     whole = lines.as_table([*rows, *lines.computed_rows(), *lines.theory_rows([])])

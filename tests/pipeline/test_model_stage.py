@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +50,7 @@ def fitted(experiment: Path, results: Path) -> dict:
     return read_json(results / "fit.json")
 
 
-def test_a_campaign_is_fitted_and_written_with_its_numbers_and_their_errors(tmp_path: Path) -> None:
+def test_a_campaign_is_fitted_and_written_with_its_numbers_and_their_errors(tmp_path):
     """Two vines, four pressures, two replicates, n = 0.4, and one broken track."""
     pairs, results = small_campaign(seed=21)[0], Results(tmp_path / "results")
     torn = replace(pairs[0][0], name="torn"), plain_track(np.zeros(1), np.zeros(1))
@@ -80,7 +80,7 @@ def test_a_campaign_is_fitted_and_written_with_its_numbers_and_their_errors(tmp_
     np.testing.assert_array_equal(pairs[0][1].lead_position_m, by_hand["position_m"].to_numpy())
 
 
-def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> None:
+def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path):
     time_s = np.arange(20) / 1000
     brought = {"time_s": time_s, "position_m": time_s / 10, "pressure_kPa": 20 - 100 * time_s}
     pd.DataFrame(brought).to_csv(tmp_path / "a.csv", index=False)
@@ -94,7 +94,7 @@ def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> 
 
 # A recording whose axis is not that of the others fails when the trials are gathered, and enters no fit.
 @pytest.fixture(scope="module")
-def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def tracked(tmp_path_factory):
     """Five trials filmed level and two filmed straight down, analysed."""
     folder = tmp_path_factory.mktemp("askew")
     pairs = [(replace(trial, name=f"t{k}"), track) for k, (trial, track) in enumerate(small_campaign(seed=23)[0][:7])]
@@ -121,8 +121,8 @@ FIVE = {f"t{k}": LEVEL for k in range(5)}
     ],
 )
 def test_a_recording_along_another_axis_than_most_fails_with_its_remedy_and_enters_no_fit(
-    tracked: tuple[Path, Path], tmp_path: Path, axes: Mapping[str, Mapping[str, object]], failed: set[str]
-) -> None:
+    tracked, tmp_path, axes, failed
+):
     experiment, results = tracked[0], Results(shutil.copytree(tracked[1], tmp_path / "results"))
     for name, axis in axes.items():
         path = results.analysed(name)

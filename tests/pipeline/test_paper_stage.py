@@ -3,8 +3,6 @@
 The trials are those of `data/paper`, with its own seed; nothing was tuned on them.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pandas as pd
@@ -28,7 +26,7 @@ HEADER = (
 
 
 @pytest.mark.slow
-def test_tables_and_figures_are_there_what_was_grown_is_answered_and_what_was_not_is_blank(tmp_path: Path) -> None:
+def test_tables_and_figures_are_there_what_was_grown_is_answered_and_what_was_not_is_blank(tmp_path):
     experiment, results = tmp_path / "part", tmp_path / "results"
     trials = [trial for trial in read_experiment(ROOT / "data" / "paper").trials if trial.name in CHOSEN]
     assert len(trials) == len(CHOSEN)

@@ -26,11 +26,11 @@ def planned(folder: Path, more: str = "") -> Path:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return planned(tmp_path_factory.mktemp("planned"))
 
 
-def test_a_sheet_without_recordings_says_what_was_guessed(folder: Path) -> None:
+def test_a_sheet_without_recordings_says_what_was_guessed(folder):
     power = power_of_target(PowerRequest(folder, noise_mm=0.2))
     origins = {entry.name: (entry.value, entry.origin) for entry in power.inputs}
     assert power.n_trials == 4
@@ -42,7 +42,7 @@ def test_a_sheet_without_recordings_says_what_was_guessed(folder: Path) -> None:
     assert list(power.not_testable) == ["payload_drag"]
 
 
-def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder: Path) -> None:
+def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder):
     uncorrected = power_of_target(PowerRequest(folder))
     corrected = power_of_target(PowerRequest(folder, systematic_mm=0.0))
     assert ("0 mm", "stated") in {(entry.value, entry.origin) for entry in corrected.inputs}
@@ -51,7 +51,7 @@ def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder
 
 
 @pytest.mark.slow
-def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: Path, tmp_path: Path) -> None:
+def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder, tmp_path):
     planned(tmp_path, "limits: {pressure_kPa: 14:40, new_vines: no}\n")
     now = power_of_target(PowerRequest(folder))["leak"]
     rows, size = tmp_path / "more.csv", f"leak={0.7 * now.size_at(0.9):.4g}"
@@ -61,7 +61,7 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88
 
 
-def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simulated_campaigns_are_counted_beside_the_prediction(folder, monkeypatch):
     asked_for: list[tuple[str, int]] = []
 
     def answered(_design: object, effect: str, _values: object, seed: int) -> SimulatedDiagnosis:
@@ -77,7 +77,7 @@ def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, mon
 
 
 @pytest.mark.slow
-def test_the_trials_that_would_reveal_most_are_recommended(tmp_path: Path) -> None:
+def test_the_trials_that_would_reveal_most_are_recommended(tmp_path):
     power = power_of_target(
         PowerRequest(planned(tmp_path, "limits: {pressure_kPa: 14:40, trials: 2}\n"), recommend=True)
     )

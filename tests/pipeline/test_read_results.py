@@ -36,7 +36,7 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 
 
 # The fit and the diagnosis of a results folder, read back as they were written.
-def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_sentence(tmp_path: Path) -> None:
+def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_sentence(tmp_path):
     free = math.nan
     damping = Number("eversion_damping.B", "v", "B", "N·(s/m)ⁿ", 6.4, 0.1, 6.2, 6.6, free, "linear")
     onset = Number("yield_pressure.P_y", "", "P_y", "Pa", 3000.0, free, free, free, free, "none", 0.0)
@@ -71,7 +71,7 @@ def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_
             read_fit(results)
 
 
-def test_a_diagnosis_comes_back_as_it_was_written_and_a_refused_one_has_no_verdict(tmp_path: Path) -> None:
+def test_a_diagnosis_comes_back_as_it_was_written_and_a_refused_one_has_no_verdict(tmp_path):
     for verdict in VERDICTS:
         written = json.loads(json.dumps(Diagnosis.from_json(diagnosis(verdict)).to_json(), default=float))
         again = json.loads(json.dumps(Diagnosis.from_json(written).to_json(), default=float))
@@ -125,7 +125,7 @@ def folder(path: Path, content: dict | None, after: bool = True, compared: bool 
     return results
 
 
-def test_predictions_count_from_release_and_origin(tmp_path: Path) -> None:
+def test_predictions_count_from_release_and_origin(tmp_path):
     for compared in (True, False):
         trials = predicted_trials(folder(tmp_path / str(compared), diagnosis(), compared=compared), conditions())
         one = trials[trials["trial"] == "a"]
@@ -134,7 +134,7 @@ def test_predictions_count_from_release_and_origin(tmp_path: Path) -> None:
         assert one["lead_position_m"].iloc[-1] == pytest.approx(0.2)
 
 
-def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(tmp_path: Path) -> None:
+def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(tmp_path):
     results = folder(tmp_path / "r", diagnosis())
     found = read_diagnosis_tables(results, conditions())
     assert found is not None
@@ -159,7 +159,7 @@ def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(
     assert slow["misfit_after_m"] == pytest.approx(0, abs=1e-12)
 
 
-def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path: Path) -> None:
+def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):
     for verdict in VERDICTS:
         results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
         found = read_diagnosis_tables(results, conditions())
@@ -174,7 +174,7 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_t
     assert not any(draw(name, DiagnosisTables()) for name in diagnosis_figures())
 
 
-def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path: Path) -> None:
+def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
     results = folder(tmp_path / "r", diagnosis())
     trajectories = {name: pd.read_csv(results.trajectories(name)) for name in ("slow", "fast")}
     joined = with_final_model(trajectories, read_diagnosis_tables(results, conditions()))
@@ -185,7 +185,7 @@ def test_what_the_last_model_says_joins_the_comparison_where_something_was_added
     assert "model_after_m" not in with_final_model(shorter, read_diagnosis_tables(results, conditions()))["slow"]
 
 
-def test_ties_stand_in_the_order_of_the_ranking() -> None:
+def test_ties_stand_in_the_order_of_the_ranking():
     cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
     cells = cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
     leak, time_base = ["leak", "air_drag", 0.3], ["time_base", "air_drag", 0.2]
@@ -204,9 +204,7 @@ def test_ties_stand_in_the_order_of_the_ranking() -> None:
         (("missing", "unexplained"), True, None),
     ],
 )
-def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted_one(
-    tmp_path: Path, verdicts: tuple[str, ...], final: bool, model: list[str] | None
-) -> None:
+def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted_one(tmp_path, verdicts, final, model):
     results, added = Results(tmp_path), ["air_drag"] if verdicts[0] == "missing" else []
     write_json(results.fit, {"model": ["base"]})
     if final:
@@ -223,7 +221,7 @@ def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted
 
 
 # What recordings and speeds contradict in the sheet stands beside the verdict, for it passes for physics.
-def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tmp_path: Path) -> None:
+def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tmp_path):
     size = {"diameter_m": 0.012, "thickness_m": 1e-4, "length_m": 0.14, "capture_fps": 1000}
     vine = Trial(name="a", pressure_Pa=30e3, yield_pressure_Pa=3e3, **size)
     # A track at the steady speed of F = B·ẋⁿ with the B that tubes of this size have.
@@ -250,7 +248,7 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tm
     assert set(seen.values()) <= set(with_contradictions(made, results, pairs).notes)
 
 
-def test_a_figure_is_shown_from_the_files_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_figure_is_shown_from_the_files_there_are(tmp_path, monkeypatch):
     def shown(name: str, limit: int, **files: str) -> str | bytes:
         path = partial(Results(tmp_path).figure, name)
         path(".svg").parent.mkdir(exist_ok=True)

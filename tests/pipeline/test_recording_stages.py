@@ -26,9 +26,7 @@ from vinetrack.video.write import write_clip
 
 
 @pytest.mark.slow
-def test_a_film_gives_pixels_of_the_picture_and_with_rate_and_scale_seconds_and_metres(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_film_gives_pixels_of_the_picture_and_with_rate_and_scale_seconds_and_metres(tmp_path, monkeypatch):
     scene = plain_scene(Plan(seed=20940, width=640, height=160, from_px=(30.0, 80.0), end_px=560.0, radius=22.0))
     clip = write_video(tmp_path / "vine.mp4", scene.frames, options={"crf": "12"})
     drawn: list[Tracking] = []
@@ -67,7 +65,7 @@ def test_a_film_gives_pixels_of_the_picture_and_with_rate_and_scale_seconds_and_
     assert json.loads(done.stdout)["mm_per_px"] == pytest.approx(0.5)
 
 
-def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentence(tmp_path: Path) -> None:
+def test_a_film_without_motion_and_an_axis_that_is_none_are_refused_in_a_sentence(tmp_path):
     still = write_video(tmp_path / "still.mp4", np.full((40, 160, 640), 90, np.uint8))
     done = run("track", still, "--out", tmp_path / "out")
     assert (done.exit_code, done.stderr.strip()) == (1, "still.mp4: nothing moves in the picture")
@@ -122,7 +120,7 @@ def campaign(folder: Path, diagnosed: bool = True) -> tuple[Path, Path]:
     return experiment, results
 
 
-def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path: Path) -> None:
+def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path):
     _, results = campaign(tmp_path)
     path = overlays_stage.overlay_one(results, "a")
     assert path == results / "overlays" / "a.mp4"
@@ -140,7 +138,7 @@ def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path: Path)
         assert np.sort(away, axis=0)[:8].mean(axis=0).argmin() == pytest.approx(place, abs=2), colour
 
 
-def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_where_they_were_fitted(tmp_path: Path) -> None:
+def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_where_they_were_fitted(tmp_path):
     for diagnosed in (False, True):
         results = Results(campaign(tmp_path / str(diagnosed), diagnosed)[1])
         if diagnosed:
@@ -151,7 +149,7 @@ def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone_and_models_where_th
     assert np.flatnonzero(np.isfinite(edges[1].along_px)).tolist() == list(range(5, 40))
 
 
-def test_edges_go_along_with_a_shaken_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_edges_go_along_with_a_shaken_picture(tmp_path, monkeypatch):
     _, results = campaign(tmp_path)
     drawn: list[np.ndarray] = []
 
@@ -171,7 +169,7 @@ def test_edges_go_along_with_a_shaken_picture(tmp_path: Path, monkeypatch: pytes
     np.testing.assert_allclose(shaken - still, np.tile(shake_px[shown, None], 3), atol=1e-9)
 
 
-def test_metres_turn_into_pixels_through_lens_and_tilt() -> None:
+def test_metres_turn_into_pixels_through_lens_and_tilt():
     edge = np.linspace(10, 900, 200)
     metres = 2.4e-4 * edge * (1 + 5e-5 * edge)
     seen = np.where((np.arange(200) < 3) | (np.arange(200) > 9), edge, math.nan)
@@ -179,7 +177,7 @@ def test_metres_turn_into_pixels_through_lens_and_tilt() -> None:
     assert overlays_stage.position_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
 
 
-def test_one_recording_a_condition_is_drawn_and_one_that_cannot_be_does_not_stop_the_others(tmp_path: Path) -> None:
+def test_one_recording_a_condition_is_drawn_and_one_that_cannot_be_does_not_stop_the_others(tmp_path):
     experiment, results = campaign(tmp_path)
     read = read_experiment(experiment)
     chosen = {
@@ -193,7 +191,7 @@ def test_one_recording_a_condition_is_drawn_and_one_that_cannot_be_does_not_stop
     assert [path.name for path in (results / "overlays").iterdir()] == ["c.mp4"]
 
 
-def test_a_clip_goes_from_before_to_after_the_motion_about_as_long_as_asked_at_a_rate_that_players_know() -> None:
+def test_a_clip_goes_from_before_to_after_the_motion_about_as_long_as_asked_at_a_rate_that_players_know():
     shown, margin = overlays_stage.frames_to_show(pd.DataFrame({"edge_px": edge_px()})), overlays_stage.MARGIN_FRAMES
     assert shown.start == 21 - margin
     assert 49 + margin <= shown.stop <= 51 + margin

@@ -40,7 +40,7 @@ def write_sheet(folder: Path, settings: str = "", **cells: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def tracked(tmp_path_factory):
     """An experiment of two films, and its results."""
     folder = tmp_path_factory.mktemp("kept") / "vines"
     folder.mkdir()
@@ -90,14 +90,12 @@ KEYS = (
 
 
 @pytest.mark.parametrize("column", [name for name in COLUMNS if CELLS[name] is not None])
-def test_a_changed_cell_tracks_its_film_again_only_where_the_picture_is_read_otherwise(
-    tracked: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, column: str
-) -> None:
+def test_a_changed_cell_tracks_its_film_again_only_where_the_picture_is_read_otherwise(tracked, monkeypatch, column):
     write_sheet(tracked[0], **{column: CELLS[column]})
     assert again(tracked, monkeypatch) == (["a"] if column in RETRACKED else [])
 
 
-def test_a_replaced_film_is_tracked_again_alone(tracked: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replaced_film_is_tracked_again_alone(tracked, monkeypatch):
     for settings in KEYS:
         write_sheet(tracked[0], settings)
         assert again(tracked, monkeypatch) == [], settings
@@ -108,7 +106,7 @@ def test_a_replaced_film_is_tracked_again_alone(tracked: tuple[Path, Path], monk
 
 
 @pytest.mark.slow
-def test_a_changed_scale_gives_the_metres_of_a_new_track(tracked: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_changed_scale_gives_the_metres_of_a_new_track(tracked, tmp_path):
     folder, results = tracked
     write_sheet(folder, mm_per_px=0.29)
     for place in (results, tmp_path):
@@ -119,7 +117,7 @@ def test_a_changed_scale_gives_the_metres_of_a_new_track(tracked: tuple[Path, Pa
         assert (tmp_path / file).read_bytes() == (results / file).read_bytes(), file
 
 
-def test_what_is_kept_is_every_bit_of_a_tracking(tracked: tuple[Path, Path]) -> None:
+def test_what_is_kept_is_every_bit_of_a_tracking(tracked):
     (path, *_) = (tracked[1] / ".kept").glob("*.npz")
     tracking = unpacked(path.read_bytes())
     again = unpacked(packed(tracking))
@@ -131,7 +129,7 @@ def test_what_is_kept_is_every_bit_of_a_tracking(tracked: tuple[Path, Path]) -> 
 
 
 @pytest.mark.slow
-def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked, tmp_path):
     folder, results = tracked
     write_sheet(folder)
     command = [sys.executable, "-m", "vinetrack.cli.main", "trials", str(folder), str(tmp_path)]
@@ -167,7 +165,7 @@ for _ in map_unordered(task, range(8), 2):
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="which processes are there is read from /proc")
-def test_every_item_is_answered_and_workers_of_a_killed_run_end_too(tmp_path: Path) -> None:
+def test_every_item_is_answered_and_workers_of_a_killed_run_end_too(tmp_path):
     def is_alive(process: int) -> bool:
         """Whether a process is there, and not only waiting to be counted."""
         try:

@@ -50,14 +50,14 @@ def planned(folder: Path, **config: object) -> WorkflowPlan:
     return make_plan({"experiment": str(folder), **config}, folder.parent)
 
 
-def test_results_are_named_after_the_last_part_of_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_named_after_the_last_part_of_the_path(tmp_path, monkeypatch):
     folder = experiment(tmp_path / "2024")
     monkeypatch.chdir(tmp_path)
     for given in (2024, str(folder), f"{folder}/", f"{folder}/."):
         assert make_plan({"experiment": given}, tmp_path).results == Path("results/2024")
 
 
-def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_there_are(tmp_path: Path) -> None:
+def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_there_are(tmp_path):
     rows = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,100,300,20,3,no\nc,gone.csv,12,100,300,9999,3,\n"
     folder = experiment(tmp_path / "v", rows)
     assert (planned(folder).trials, planned(folder).inputs) == (("a", "c"), (folder / "trials.csv", folder / "a.csv"))
@@ -76,7 +76,7 @@ def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_th
     assert planned(folder).unwatched != before.unwatched
 
 
-def test_shipped_experiments_are_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shipped_experiments_are_found_from_anywhere(tmp_path, monkeypatch):
     experiment(tmp_path / "house" / "data" / "demo")
     monkeypatch.chdir(tmp_path)
     plan = make_plan({"experiment": "data/demo"}, tmp_path / "house")
@@ -91,14 +91,14 @@ def test_shipped_experiments_are_found_from_anywhere(tmp_path: Path, monkeypatch
         assert folders <= {"videos", "calibration", "tracks"}
 
 
-def test_a_stage_depends_on_its_own_settings_alone(tmp_path: Path) -> None:
+def test_a_stage_depends_on_its_own_settings_alone(tmp_path):
     folder = experiment(tmp_path / "v")
     before, after = planned(folder), planned(folder, damping={"seed": 99})
     changed = {name for name, stage in STAGES.items() if before.settings_of(stage) != after.settings_of(stage)}
     assert changed == {"damping", "model", "report"}
 
 
-def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_path: Path) -> None:
+def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_path):
     folder = experiment(tmp_path / "v")
     assert "overlays" not in planned(folder).stages
     filmed(folder)
@@ -107,7 +107,7 @@ def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_p
     assert "overlays" not in planned(folder, overlays={"of": "none"}).stages
 
 
-def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path: Path) -> None:
+def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path):
     for name in ("a{b}", "<b>x"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "trials.csv").write_text("trial\n")
@@ -115,7 +115,7 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
     assert path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
 
 
-def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path: Path) -> None:
+def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path):
     names = [f"t{i}" for i in range(2 * workflow.TRIALS_PER_JOB + 1)]
     plan = planned(experiment(tmp_path / "v", "".join(f"{name},{name}.csv,12,100,300,20,3,\n" for name in names)))
     assert [name for name in plan.jobs if name.startswith("trials")] == ["trials_1", "trials_2", "trials_3"]
@@ -125,7 +125,7 @@ def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path: Path) 
     assert [*planned(experiment(tmp_path / "w")).jobs] == ["trials", "damping", "model", "figures", "report"]
 
 
-def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path: Path) -> None:
+def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path):
     folder = experiment(tmp_path / "v")
     filmed(folder)
     (folder / "experiment.yaml").write_text("published: measured\n")
@@ -137,7 +137,7 @@ def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path: P
 
 
 # `vinetrack run`: the chain from anywhere, its progress, its last lines, and whose results a folder holds.
-def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path, monkeypatch):
     folder = experiment(tmp_path / "week" / "my vines")
     monkeypatch.chdir(tmp_path)
     assert run_paths(folder, None) == RunPaths(folder, tmp_path / make_plan({"experiment": folder}, tmp_path).results)
@@ -151,7 +151,7 @@ def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path: Path, monkey
     assert elsewhere == "snakemake --config 'experiment=week/my vines' results=results/other"
 
 
-def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keeps_its_own(tmp_path: Path) -> None:
+def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keeps_its_own(tmp_path):
     first, second = (experiment(tmp_path / week / "vines") for week in ("monday", "friday"))
     begin_run(tmp_path / "out" / "vines", first).release()
     with pytest.raises(ExperimentError) as refused:
@@ -165,7 +165,7 @@ def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keep
 
 
 @pytest.mark.slow
-def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path: Path) -> None:
+def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path):
     experiment(tmp_path / "vines: ü & 'q'")
     folder = experiment(tmp_path / "vines: ü & 'q' #2 $(x);")
     paths = RunPaths(folder, tmp_path / "out" / folder.name)
@@ -179,7 +179,7 @@ def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.pipeline
-def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path: Path) -> None:
+def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
     write_campaign(tmp_path / "my vines")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -210,7 +210,7 @@ time.sleep(60)
 """
 
 
-def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp_path: Path) -> None:
+def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", BEGIN]
     paths = RunPaths(tmp_path / "vines", tmp_path / "results" / "vines")
@@ -225,7 +225,7 @@ def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp
     begin_run(paths.results, paths.experiment).release()
 
 
-def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(tmp_path: Path) -> None:
+def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(tmp_path):
     folders = tmp_path / "results" / "vines" / "tracks", tmp_path / "vines"
     for folder in folders:
         folder.mkdir(parents=True)

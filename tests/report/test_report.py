@@ -6,7 +6,6 @@ import base64
 import io
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from urllib.parse import unquote
@@ -96,7 +95,7 @@ class Tags(HTMLParser):
             self.wrong.append(tag)
 
 
-def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped() -> None:
+def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped():
     fit, unfitted = damping(EVIL), damping(EVIL, refused=EVIL)
     for one in (fit, unfitted):
         one["both_axes"] |= {"left_out": {EVIL: EVIL}}
@@ -127,7 +126,7 @@ def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped() -> N
         assert "&lt;script&gt;" in html
 
 
-def test_the_page_is_one_file_with_the_numbers_of_its_figures_that_asks_for_nothing_from_elsewhere() -> None:
+def test_the_page_is_one_file_with_the_numbers_of_its_figures_that_asks_for_nothing_from_elsewhere():
     """With a further section before the trials, each with status and reason."""
     table = build.ReportTable("Numbers", ("what", "value"), [("n", "0.37")], frozenset({1}), "by hand")
     figure = build.ReportFigure("own", "Own", "caption", SVG, "o.csv", "a\n1\n")
@@ -162,7 +161,7 @@ def png() -> bytes:
     return file.getvalue()
 
 
-def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short_coordinates() -> None:
+def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short_coordinates():
     data = base64.b64encode(png()).decode()
     placed = f'<image xlink:href="data:image/png;base64,{data}" transform="matrix(0.123456 0 0 1 0 0)"/></svg>'
     given = SVG.replace("M 0 0 L 5 5", "M 0.123456 0 L 5 5").replace("</svg>", placed)
@@ -176,7 +175,7 @@ def test_an_inlined_picture_follows_the_page_keeps_its_proportions_and_has_short
         assert gone not in svg
 
 
-def test_a_sparkline_marks_the_steady_window() -> None:
+def test_a_sparkline_marks_the_steady_window():
     time_s = np.linspace(0, 1, 50)
     svg = build.speed_sparkline(pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": np.ones(50)}), (0.5, 1.0))
     steady = re.search(r'class="steady" points="([^"]+)"', svg)
@@ -187,7 +186,7 @@ def test_a_sparkline_marks_the_steady_window() -> None:
     assert max(x) == pytest.approx(131, abs=0.1)
 
 
-def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn() -> None:
+def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn():
     html = page(figures=[build.ReportFigure("law", "Law", "caption", png())], trial_figures={"a": png()})
     images = [attributes for tag, attributes in Tags(html).tags if tag == "img"]
     assert [image["style"] for image in images] == ["--wide:192px"] * 2  # 2 in of 96 px
@@ -211,7 +210,7 @@ def shown(content: dict, **changes: object) -> str:
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
-def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict: str) -> None:
+def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict):
     html = shown(diagnosis(verdict), moved=moved())
     assert heading(html).startswith(f"{verdict} ")
     assert f'class="badge badge-{verdict}"' in html
@@ -226,7 +225,7 @@ def test_the_page_begins_with_the_verdict_and_every_link_leads_somewhere(verdict
     assert heading(page(diagnosis=read(bare))).startswith(verdict)
 
 
-def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit() -> None:
+def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit():
     found = [list(row) for row in build.moved_table(moved()).rows]
     assert found == [["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"], ["γ", "–", "1.1700 ± 0.0040"]]
     found = [Candidate.from_json(candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")}))]
@@ -239,7 +238,7 @@ def test_tables_of_parameters_and_of_upper_limits_are_in_the_displayed_unit() ->
     assert limit[1] == kappa.symbol
 
 
-def test_pictures_stand_in_the_parts_they_belong_to() -> None:
+def test_pictures_stand_in_the_parts_they_belong_to():
     figures = [build.ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in diagnosis_figures()]
     html = page(diagnosis=replace(read(diagnosis()), ladder=ladder("", "a")), figures=figures)
     order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-missing_force"]
@@ -250,7 +249,7 @@ def test_pictures_stand_in_the_parts_they_belong_to() -> None:
         assert f'download="{key}.csv"' in html
 
 
-def test_the_page_says_what_the_trials_could_have_seen() -> None:
+def test_the_page_says_what_the_trials_could_have_seen():
     sizes = tuple(1 + 0.1 * (probability - 0.9) for probability in PROBABILITIES)
     drag = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
     leak = replace(drag, effect="leak", symbol="1/τ", unit="1/s", largest=0.5)
@@ -292,7 +291,7 @@ def result(**changes: object) -> dict[str, object]:
     return {"fit": FitSummary.from_json({**FIT, **changes}), "comparison": compared, "check": pd.DataFrame(check)}
 
 
-def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
+def test_the_page_shows_comparison_numbers_check_and_warnings():
     html = page(**result())
     text = re.sub(r"\s+", " ", re.sub("<[^>]+>", " ", html[html.index('id="model"') :]))
     assert "c1 4.00 1.00 4.0 0.250 70.0 123" in text
@@ -304,7 +303,7 @@ def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
 
 
 # The section on the paper's numbers: both tables, every row, and the explanation of the marks.
-def test_table_two_sets_departures_beside_the_errors() -> None:
+def test_table_two_sets_departures_beside_the_errors():
     row = {"row": "position_rms_7kPa", "where": "Fig. 4", "quantity": "rms", "mark": SIMULATED, "published": 1.9}
     row |= {"as_printed": "1.9", "ours": 0.32, "unit": "cm", "setting": "", "how": "", "beside": ""}
     named = zip(DEPARTURES, (0.057, 0.069, 0.095, 0.110, 0.114), strict=True)
@@ -325,7 +324,7 @@ def recording() -> build.TrackedRecording:
     return build.TrackedRecording(SVG, ["before_release", "", "", "doubtful"], board)
 
 
-def test_strip_and_motion_stand_side_by_side_with_calibration_and_clips() -> None:
+def test_strip_and_motion_stand_side_by_side_with_calibration_and_clips():
     clips = {"clips": {"a": "overlays/a.mp4"}, "clip": build.Clip("a", b"film", "caption", b"frame")}
     html = page(recordings={"a": recording()}, trial_figures={"a": SVG}, **clips)
     for once in ('<div class="pair">', 'aria-label="Strip of a with its tracked edge"', 'aria-label="Motion of a"'):
@@ -338,7 +337,7 @@ def test_strip_and_motion_stand_side_by_side_with_calibration_and_clips() -> Non
     assert all(link in html for link in links)
 
 
-def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch):
     names = ("a", "b", "c")
     recordings = {name: recording() for name in names}
     weight = len(build.inline_picture(SVG, "s-a", "Strip of a with its tracked edge"))
@@ -351,7 +350,7 @@ def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: p
 
 # The page in a real browser: no errors, no requests, adapts to the colour scheme, and prints.
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> str:
+def address(tmp_path_factory):
     """A page with all optional parts."""
     folder = tmp_path_factory.mktemp("page")
     steps, time_s = ladder("", "reservoir_depletion"), np.arange(-10, 100) * 1e-3
@@ -378,14 +377,14 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
+def chrome(tmp_path_factory):
     if find_chrome() is None:
         pytest.skip("there is no Chromium on this machine")
     with Chrome(tmp_path_factory.mktemp("browser")) as browser:
         yield browser
 
 
-def test_the_browser_logs_no_errors_makes_no_requests_and_plays_the_clip(chrome: Chrome, address: str) -> None:
+def test_the_browser_logs_no_errors_makes_no_requests_and_plays_the_clip(chrome, address):
     chrome.open(address)
     assert chrome.complaints == []
     asked = {request.split(":", 1)[0] for request in chrome.requests if not request.startswith("about:")}
@@ -396,7 +395,7 @@ def test_the_browser_logs_no_errors_makes_no_requests_and_plays_the_clip(chrome:
     assert chrome.run("document.querySelector('video').duration") == pytest.approx(1.0, abs=0.05)
 
 
-def test_nothing_reaches_beyond_the_screen_and_a_phones_first_shows_the_verdict(chrome: Chrome, address: str) -> None:
+def test_nothing_reaches_beyond_the_screen_and_a_phones_first_shows_the_verdict(chrome, address):
     for width, height in ((1400, 900), (768, 900), (390, 844)):
         chrome.size(width, height)
         chrome.open(address)
@@ -407,7 +406,7 @@ def test_nothing_reaches_beyond_the_screen_and_a_phones_first_shows_the_verdict(
         assert chrome.run(f"document.querySelector('{what}').getBoundingClientRect().bottom") < 844
 
 
-def test_page_and_pictures_follow_a_dark_screen(chrome: Chrome, address: str) -> None:
+def test_page_and_pictures_follow_a_dark_screen(chrome, address):
     ask = {
         "page": "getComputedStyle(document.body).backgroundColor",
         "text": "getComputedStyle(document.querySelector('#figure-ladder text')).fill",
@@ -425,7 +424,7 @@ def test_page_and_pictures_follow_a_dark_screen(chrome: Chrome, address: str) ->
     assert dark["page"] < dark["grid"] < dark["text"]
 
 
-def test_it_prints_in_dark_on_light_whatever_the_screen(chrome: Chrome, address: str) -> None:
+def test_it_prints_in_dark_on_light_whatever_the_screen(chrome, address):
     features = [{"name": "prefers-color-scheme", "value": "dark"}]
     chrome.send("Emulation.setEmulatedMedia", media="print", features=features)
     chrome.open(address)

@@ -53,7 +53,7 @@ def steady_track(noise_m: float = 2e-5, n: int = 120) -> Track:
 
 
 @pytest.mark.parametrize(("row", "noise_m", "sure"), [(70, 1e-4, True), (110, 1e-4, False), (110, 1e-5, True)])
-def test_a_jump_of_only_the_nearest_points_is_sure_where_noise_is_far_below_it(row: int, noise_m: float, sure: bool):
+def test_a_jump_of_only_the_nearest_points_is_sure_where_noise_is_far_below_it(row, noise_m, sure):
     out = correct_frames(dropped(steady_track(noise_m), row))
     assert flags(out) == {row: "gap;retimed"}
     assert frames_surely_missing(out) is sure
@@ -84,7 +84,7 @@ def test_a_long_step_between_points_that_are_stated_to_be_unsure_is_no_dropped_f
 
 
 @pytest.mark.parametrize("seen", [False, True])
-def test_a_copy_changes_times_only_where_it_was_inserted(seen: bool):
+def test_a_copy_changes_times_only_where_it_was_inserted(seen):
     """Whether or not the tracker has seen that the picture is the one before it."""
     clean = steady_track()
     for fault in (stale, inserted):

@@ -33,7 +33,7 @@ def rows(*columns: np.ndarray, separator: str = ",", decimal: str = ".") -> str:
 
 
 @pytest.mark.parametrize(("encoding", "separator"), [("utf-8", ","), ("utf-8-sig", ";"), ("utf-16", ";")])
-def test_a_table_of_positions_and_what_comes_along(tmp_path: Path, encoding: str, separator: str) -> None:
+def test_a_table_of_positions_and_what_comes_along(tmp_path, encoding, separator):
     """Semicolons with decimal commas."""
     sigma, pressure = np.linspace(1e-4, 2e-4, 8), np.linspace(28, 24, 8)
     text = rows(pressure, TIMES, sigma, POSITIONS, separator=separator, decimal="." if separator == "," else ",")
@@ -47,7 +47,7 @@ def test_a_table_of_positions_and_what_comes_along(tmp_path: Path, encoding: str
     assert track.usable.all()
 
 
-def test_blank_pressures_are_interpolated_and_a_frame_without_a_point_has_no_position(tmp_path: Path) -> None:
+def test_blank_pressures_are_interpolated_and_a_frame_without_a_point_has_no_position(tmp_path):
     text = "time_s,position_m,pressure_kPa\n0,0,20\n1,1,\n2,2,24\n3,3,\n4,4,28\n"
     track = read_track(write(tmp_path, text))
     np.testing.assert_allclose(track.pressure_Pa, [20e3, 22e3, 24e3, 26e3, 28e3])
@@ -72,7 +72,7 @@ NO_TRACKS = [
 
 
 @pytest.mark.parametrize("text", NO_TRACKS)
-def test_an_invalid_track_is_refused(tmp_path: Path, text: str) -> None:
+def test_an_invalid_track_is_refused(tmp_path, text):
     with pytest.raises(TrackError):
         read_track(write(tmp_path, text))
 
@@ -91,7 +91,7 @@ def test_an_invalid_track_is_refused(tmp_path: Path, text: str) -> None:
         ("t (ms)\tx (cm)\n", "\t", ".", (1000, 100)),
     ],
 )
-def test_exports_of_a_straight_motion(tmp_path: Path, header, separator, decimal, scales) -> None:
+def test_exports_of_a_straight_motion(tmp_path, header, separator, decimal, scales):
     """In a plane the principal axis is exact along any direction, whatever the origin."""
     origin_m = 0.3 if len(scales) > 2 else 0.0
     columns = (TIMES * scales[0], *(origin_m + scale * POSITIONS for scale in scales[1:]))
@@ -101,7 +101,7 @@ def test_exports_of_a_straight_motion(tmp_path: Path, header, separator, decimal
     np.testing.assert_allclose(track.lead_position_m, POSITIONS, atol=2e-9)
 
 
-def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path: Path) -> None:
+def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path):
     """Out to +1 m and back to 0.2 m on the other side: the end counts as forwards."""
     there = np.array([0.0, 0.5, 0.9, 1.0, 0.9, 0.5, 0.1, -0.2])
     track = read_track(write(tmp_path, "t,x,y\n" + rows(TIMES, 0.6 * there, 0.8 * there)))
@@ -149,7 +149,7 @@ TRAVEL = 0.05 * np.arange(6) ** 1.5
 MARKS = {n: (100 + 0.8 * SCALE * s, 250 - 0.6 * SCALE * s) for n, s in zip(FRAMES, TRAVEL, strict=True)}
 
 
-def test_a_project_with_frames_left_out_and_a_camera_that_moved(tmp_path: Path) -> None:
+def test_a_project_with_frames_left_out_and_a_camera_that_moved(tmp_path):
     """From frame 6 on everything in the picture is 40 px further right, and so is the origin: a key frame says so."""
     track = read_track(write(tmp_path, project(MARKS), "tip.trk"))
     np.testing.assert_allclose(track.time_s, 0.1 + (np.array(FRAMES) - 2) * 0.004, rtol=1e-12)
@@ -169,12 +169,12 @@ NO_PROJECTS = [
 
 
 @pytest.mark.parametrize("text", NO_PROJECTS)
-def test_projects_that_cannot_be_used(tmp_path: Path, text: str) -> None:
+def test_projects_that_cannot_be_used(tmp_path, text):
     with pytest.raises(TrackError):
         read_track(write(tmp_path, text, "tip.trk"))
 
 
-def test_a_trace_is_interpolated_on_the_times_of_the_track_unless_it_is_of_another_clock(tmp_path: Path) -> None:
+def test_a_trace_is_interpolated_on_the_times_of_the_track_unless_it_is_of_another_clock(tmp_path):
     time_s, pressure_Pa = read_pressure_trace(write(tmp_path, "time_s;pressure_kPa\n-1;30,5\n0,5;29\n10;10\n"))
     np.testing.assert_allclose(pressure_Pa, [30500, 29000, 10000])
     track = make_track(np.arange(5.0), np.arange(5.0))
@@ -188,7 +188,7 @@ def test_a_trace_is_interpolated_on_the_times_of_the_track_unless_it_is_of_anoth
 
 
 @pytest.mark.real
-def test_a_real_project_is_read_in_its_own_scale() -> None:
+def test_a_real_project_is_read_in_its_own_scale():
     """Published with the file: 11 points from frame 2, 398.71 px/m, 66 ms a frame."""
     if "VINETRACK_REAL_DATA" not in os.environ:
         pytest.skip("VINETRACK_REAL_DATA is not set")
@@ -201,7 +201,7 @@ def test_a_real_project_is_read_in_its_own_scale() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "digits"), [(240.0, 3), (240.0, 4), (1069.0, 3), (2400.0, 3), (2400.0, 4)])
-def test_rounded_times_of_even_frames_become_even(rate_hz: float, digits: int) -> None:
+def test_rounded_times_of_even_frames_become_even(rate_hz, digits):
     for seed in range(5):
         true_s = float(np.random.default_rng(seed).uniform(0, 0.3)) + np.arange(150) / rate_hz
         for written_s in (np.round(true_s, digits), np.floor(true_s * 10**digits) / 10**digits):
@@ -224,13 +224,13 @@ OTHER_TIMES = {
 
 
 @pytest.mark.parametrize("name", OTHER_TIMES)
-def test_other_times_stay_as_they_are(name: str) -> None:
+def test_other_times_stay_as_they_are(name):
     kept_s, note = importers.unrounded_times(OTHER_TIMES[name])
     assert kept_s is OTHER_TIMES[name]
     assert note == ""
 
 
-def test_a_file_with_times_to_the_millisecond_is_read(tmp_path: Path) -> None:
+def test_a_file_with_times_to_the_millisecond_is_read(tmp_path):
     time_s, position_m = np.arange(60) / 1069, 1e-3 * np.arange(60) ** 1.5
     lines = [f"{t:.3f},{y:.6f}" for t, y in zip(time_s, position_m, strict=True)]
     table = write(tmp_path, "\n".join(["time_s,position_m", *lines]))
@@ -267,7 +267,7 @@ def test_a_bounce_or_an_abrupt_stop_ends_the_motion(restitution):
 
 
 @pytest.mark.parametrize(("length_m", "is_cut"), [(0.4, True), (0.3, True), (0.2, False)])
-def test_an_abrupt_stop_ends_the_motion_of_a_vine_unless_it_is_the_end_of_its_length(length_m: float, is_cut: bool):
+def test_an_abrupt_stop_ends_the_motion_of_a_vine_unless_it_is_the_end_of_its_length(length_m, is_cut):
     position_m = np.minimum(np.maximum(CLOCK_S - 0.05, 0.0), 0.2)
     after, notes = ended(position_m, 625, travel_ratio=2.0, length_m=length_m)
     assert after.size == (CLOCK_S > 0.25 - 1e-9).sum() * is_cut
@@ -289,7 +289,7 @@ def test_a_motion_without_an_end_keeps_its_points(position_m):
 @pytest.mark.parametrize(
     ("travel_ratio", "frames_used", "ends"), [(1.0, None, True), (2.0, None, False), (1.0, (0, 119), False)]
 )
-def test_only_bodies_without_chosen_frames_are_cut(tmp_path: Path, travel_ratio, frames_used, ends):
+def test_only_bodies_without_chosen_frames_are_cut(tmp_path, travel_ratio, frames_used, ends):
     path = write(tmp_path, "time_s,position_m\n" + rows(CLOCK_S, fall(0.7, 0.6)))
     track = importers.load_track(Trial(name="ball", track=path, travel_ratio=travel_ratio, frames_used=frames_used))
     assert with_flag(track.flag, "after_end").any() == ends
@@ -317,7 +317,7 @@ def read_tdms(folder: Path, made: bytes) -> tuple[np.ndarray, np.ndarray]:
     return read_pressure_trace(path)
 
 
-def test_times_and_pressures_come_out_as_they_were_written(tmp_path: Path) -> None:
+def test_times_and_pressures_come_out_as_they_were_written(tmp_path):
     """A waveform says its own times and unit."""
     time_s, pressure_Pa = read_tdms(tmp_path, BOTH_CHANNELS)
     assert np.array_equal(time_s, TRACE_S)
@@ -336,14 +336,14 @@ NO_TRACES = {
 
 
 @pytest.mark.parametrize("made", NO_TRACES.values(), ids=NO_TRACES)
-def test_unsupported_content_is_refused(tmp_path: Path, made: bytes) -> None:
+def test_unsupported_content_is_refused(tmp_path, made):
     with pytest.raises(TrackError):
         read_tdms(tmp_path, made)
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=st.integers(0, 10_000), value=st.integers(0, 255))
-def test_a_changed_byte_gives_numbers_or_a_refusal(tmp_path: Path, place: int, value: int) -> None:
+def test_a_changed_byte_gives_numbers_or_a_refusal(tmp_path, place, value):
     damaged = bytearray(BOTH_CHANNELS)
     damaged[place % len(damaged)] = value
     try:

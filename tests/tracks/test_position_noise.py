@@ -192,7 +192,7 @@ def test_at_the_ends_a_motion_may_have_stopped_or_begun_and_not_the_other_way(ro
     assert rejected(reject_outliers(make_track(time_s, y))) == ([row] if (steps > 0) == (row > 1) else [])
 
 
-def test_a_point_placed_by_hand_is_not_an_outlier() -> None:
+def test_a_point_placed_by_hand_is_not_an_outlier():
     track = steady_track(np.array([150]), 5e-3)
     assert rejected(reject_outliers(track)) == [150]
     by_hand = replace(track, flag=np.where(np.arange(300) == 150, "corrected", track.flag))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hidden.laboratory_folder import write_experiment
@@ -30,19 +28,19 @@ def tracks(seed: int, rho: float = 0.0, smooth=lambda y: y) -> list[tuple[Trial,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.3, 0.6, 0.85])
-def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
+def test_noise_of_a_camera_is_not_smoothed(rho):
     assert all(detect_smoothing(tracks(seed, rho)) is None for seed in range(351, 371))
 
 
 @pytest.mark.parametrize(("degree", "frames"), [(0, 3), (0, 5), (0, 9), (2, 7), (2, 11)])
-def test_a_moving_average_and_a_polynomial_are_found_with_their_lengths(degree: int, frames: int) -> None:
+def test_a_moving_average_and_a_polynomial_are_found_with_their_lengths(degree, frames):
     average, polynomial = (lambda y: uniform_filter1d(y, frames)), (lambda y: savgol_filter(y, frames, 3))
     found = detect_smoothing(tracks(352 + degree // 2, smooth=polynomial if degree else average))
     assert (found.window, found.degree) == (frames, degree)
     assert 1 < found.decimation < frames if degree else found.decimation == frames
 
 
-def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path: Path) -> None:
+def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path):
     smoothed = tracks(355, smooth=lambda y: uniform_filter1d(y, 5))
     uneven_s = TIME_S + 3e-4 * np.sin(np.arange(TIME_S.size))
     assert detect_smoothing([(trial, as_track(uneven_s, track.lead_position_m)) for trial, track in smoothed]) is None
@@ -52,7 +50,7 @@ def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_model_is_smoothed_as_its_positions_were(tmp_path: Path) -> None:
+def test_a_model_is_smoothed_as_its_positions_were(tmp_path):
     """Each release is rounded off by half a millimetre and more, ten times the noise."""
     shot = campaign("smoothed", 20616, (8, 8), weighed=False)
     write_experiment(shot, tmp_path / "laboratory")

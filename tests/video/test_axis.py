@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,7 +20,7 @@ from vinetrack.video.strip import Strip, cut_strip
 from vinetrack.video.track import track_recording
 
 
-def test_black_background_is_not_used_for_flicker() -> None:
+def test_black_background_is_not_used_for_flicker():
     luma = np.zeros((12, 120, 200), np.uint16)
     luma[:, 55:65] = 180
     strip = cut_strip(luma, Axis((5.0, 60.0), (195.0, 60.0)), 8)
@@ -62,7 +61,7 @@ def slope_deg(axis: Axis) -> float:
 
 
 @pytest.mark.parametrize("growth_px", [90, 140, 220])
-def test_the_axis_is_that_of_the_tube_beside_a_door_as_long_as_its_growth(growth_px: int) -> None:
+def test_the_axis_is_that_of_the_tube_beside_a_door_as_long_as_its_growth(growth_px):
     small = SmallPictures(beside_a_door(41, growth_px, door_px=100, speed_px=4.0))
     axis = find_growth_axis(small)
     assert type(axis) is Axis
@@ -71,9 +70,7 @@ def test_the_axis_is_that_of_the_tube_beside_a_door_as_long_as_its_growth(growth
 
 
 @pytest.mark.parametrize(("tube_px", "brighter"), [(40, -80.0), (100, 80.0), (150, -80.0), (150, 80.0)])
-def test_a_tube_as_wide_as_most_of_the_picture_is_followed_along_itself(
-    tmp_path: Path, tube_px: int, brighter: float
-) -> None:
+def test_a_tube_as_wide_as_most_of_the_picture_is_followed_along_itself(tmp_path, tube_px, brighter):
     rng = np.random.default_rng(47)
     ground = 120 + cv2.GaussianBlur(rng.normal(0, 30, (200, 240)), (0, 0), 5)
     tip = np.minimum(20 + 4.3 * np.arange(46), 205)
@@ -94,7 +91,7 @@ def test_a_tube_as_wide_as_most_of_the_picture_is_followed_along_itself(
     np.testing.assert_allclose(off - np.median(off), 0.0, atol=0.4)
 
 
-def test_a_bright_door_beside_the_tube_is_not_flicker() -> None:
+def test_a_bright_door_beside_the_tube_is_not_flicker():
     frames = beside_a_door(44, growth_px=140, door_px=100, speed_px=4.0)
     # The door comes to rest, and stood at first, in the bands that tell of flicker; nothing here flickers.
     strip = cut_strip(frames, Axis((5.0, float(MOUTH[1])), (470.0, float(MOUTH[1]))), 12)
@@ -102,7 +99,7 @@ def test_a_bright_door_beside_the_tube_is_not_flicker() -> None:
     assert np.ptp(still) < 2.0
 
 
-def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path() -> None:
+def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path():
     rng = np.random.default_rng(48)
     ground, film = rng.uniform(60, 90, (40, 300)), rng.uniform(100, 130, (40, 300))
     tip = np.clip(40 + 4 * (np.arange(80) - 14), 40, 290)

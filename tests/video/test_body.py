@@ -1,7 +1,5 @@
 """A body registered against itself: a disc drawn at known places, bright, dark on dark, falling with known g."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -190,7 +190,7 @@ def test_file_that_is_no_picture(tmp_path):
 @pytest.mark.parametrize(
     ("squares", "name"), [((14, 5), "DICT_4X4_50"), ((7, 9), "DICT_5X5_50"), ((12, 9), "DICT_6X6_100"), ((9, 6), "")]
 )
-def test_a_printed_board_is_named_from_a_picture_alone(squares: tuple[int, int], name: str) -> None:
+def test_a_printed_board_is_named_from_a_picture_alone(squares, name):
     if name:
         words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         page = cv2.aruco.CharucoBoard(squares, 80, 60, words).generateImage((squares[0] * 80, squares[1] * 80))

@@ -32,7 +32,7 @@ def quarter(count: int = 25) -> CurvedAxis:
     return axis
 
 
-def test_two_points_are_the_straight_axis() -> None:
+def test_two_points_are_the_straight_axis():
     axis = axis_through([(10.0, 30.0), (100.0, 70.0)], 12.0)
     assert type(axis) is Axis
     assert axis == Axis((10.0, 30.0), (100.0, 70.0), 12.0)
@@ -42,7 +42,7 @@ def test_two_points_are_the_straight_axis() -> None:
     assert set(curves.axis_entry(axis)) == {"from_px", "to_px"}
 
 
-def test_positions_on_a_quarter_of_a_circle_are_its_arc_length() -> None:
+def test_positions_on_a_quarter_of_a_circle_are_its_arc_length():
     axis = quarter()
     assert axis.length_px == pytest.approx(RADIUS * math.pi / 2, rel=2e-3)
     place = axis.points(RADIUS * np.array([0.3, 0.8, 1.3]))
@@ -64,7 +64,7 @@ def test_positions_on_a_quarter_of_a_circle_are_its_arc_length() -> None:
     assert np.allclose(axis.nearest_px(beside), along, atol=1e-2)
 
 
-def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused() -> None:
+def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused():
     with pytest.raises(RecordingError):
         axis_through([(10.0, 10.0), (10.5, 10.0), (90.0, 40.0)])
     sharp = axis_through([(20.0, 20.0), (60.0, 20.0), (60.0, 50.0)])
@@ -74,7 +74,7 @@ def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused() -> Non
     assert curve_problem(quarter(), 5.0, (310, 400)) is not None
 
 
-def test_rings_about_the_circles_middle_become_level_lines() -> None:
+def test_rings_about_the_circles_middle_become_level_lines():
     y, x = np.mgrid[:400, :400].astype(float)
     rings = np.clip(128 + (np.hypot(x - 20, y - 330) - RADIUS), 0, 255)
     strip = cut_strip(np.repeat(rings[None], 4, axis=0).round().astype(np.uint8), quarter(), 12.0)
@@ -91,7 +91,7 @@ def drawn(scene: BentScene) -> Axis:
 
 
 @pytest.mark.slow
-def test_metres_are_lengths_along_the_curve_in_the_tilted_plane() -> None:
+def test_metres_are_lengths_along_the_curve_in_the_tilted_plane():
     bent = bent_scene(BentPlan(seed=3, speed=22.0, **BENDS["quarter"]))
     parameters = np.array([0.45, 0.02, 0.0, -0.01, 0.4, 0.0, 0.08, 0.05, -0.05, 0.0])
     covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
@@ -117,7 +117,7 @@ def test_metres_are_lengths_along_the_curve_in_the_tilted_plane() -> None:
 
 
 @pytest.mark.slow
-def test_camera_shake_is_removed_along_a_curve() -> None:
+def test_camera_shake_is_removed_along_a_curve():
     short = {"pieces": ((120.0, 0.0), (345.0, 66.0)), "from_px": (40.0, 90.0)}
     shaken = bent_scene(BentPlan(seed=2, speed=22.0, shake=1.2, width=560, height=480, **short))
     tracking = tracked(shaken.frames, shaken.plan.exposure, drawn(shaken))
@@ -131,7 +131,7 @@ def test_camera_shake_is_removed_along_a_curve() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "is_drawn"), [("quarter", True), ("quarter", False), ("gentle", False)])
-def test_a_bent_vine_is_followed_along_a_curve_drawn_or_found(name: str, is_drawn: bool) -> None:
+def test_a_bent_vine_is_followed_along_a_curve_drawn_or_found(name, is_drawn):
     sd_px, off_px = (0.35, 2.0) if is_drawn else (0.4, 2.5)
     scene = bent_scene(BentPlan(seed=3 if is_drawn else 4, speed=22.0, **BENDS[name]))
     tracking = tracked(scene.frames, scene.plan.exposure, drawn(scene) if is_drawn else None)
@@ -148,14 +148,14 @@ def test_a_bent_vine_is_followed_along_a_curve_drawn_or_found(name: str, is_draw
 
 
 @pytest.mark.parametrize("changes", [{"door": True}, {"shake": 1.2}, {"gradient": 110.0, "film": 130.0}])
-def test_a_straight_vine_keeps_the_straight_axis_it_had(changes: dict) -> None:
+def test_a_straight_vine_keeps_the_straight_axis_it_had(changes):
     plan = Plan(**({"seed": 5, "width": 640, "end_px": 540.0} | changes))
     small = SmallPictures(plain_scene(plan).frames)
     assert curves.find_growth_axis(small) == find_axis(small)
 
 
 @pytest.mark.parametrize(("length_px", "width_px"), [(21, 2), (3, 10), (9, 3), (14, 1), (40, 40)])
-def test_a_band_hardly_longer_than_wide_has_no_curve(length_px: int, width_px: int) -> None:
+def test_a_band_hardly_longer_than_wide_has_no_curve(length_px, width_px):
     rng = np.random.default_rng(2211)
     for _ in range(10):
         frames = rng.normal(60, 2, (20, 99, 134))

@@ -61,7 +61,7 @@ class Clip:
 
 
 @pytest.fixture(scope="module")
-def clip(tmp_path_factory) -> Clip:
+def clip(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clip")
     stated = Trial(
         name="p36", video=folder / "a.mp4", diameter_m=0.012, thickness_m=100e-6, length_m=0.14, pressure_Pa=36e3,
@@ -77,14 +77,14 @@ def clip(tmp_path_factory) -> Clip:
     return Clip(grown.stated, truth, read_frames(grown.stated.video))
 
 
-def test_frames_after_a_damaged_one_are_damaged_up_to_the_next_key_frame(clip: Clip, tmp_path: Path) -> None:
+def test_frames_after_a_damaged_one_are_damaged_up_to_the_next_key_frame(clip, tmp_path):
     frames = read_frames(clip.damaged_at(tmp_path, 40))
     wrong = np.abs(frames.luma.astype(float) - clip.frames.luma).max(axis=(1, 2)) > 8
     assert wrong[40:60].all()  # what the decoder shows of them is wrong indeed
     assert frames.damaged.tolist() == [40 <= i < KEY_FRAMES[2] for i in range(len(frames))]
 
 
-def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip: Clip, tmp_path: Path) -> None:
+def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip, tmp_path):
     path = clip.damaged_at(tmp_path, *KEY_FRAMES)
     with pytest.raises(RecordingError):
         track_recording(replace(clip.trial, video=path))
@@ -92,7 +92,7 @@ def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip: Clip
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frame", [50, 62])
-def test_only_the_sound_frames_before_the_damage_are_tracked(clip: Clip, tmp_path: Path, frame: int) -> None:
+def test_only_the_sound_frames_before_the_damage_are_tracked(clip, tmp_path, frame):
     """Beyond it, from the key frame 60 on, the tracker would have to leap, and errs by centimetres when it does."""
     track = track_recording(replace(clip.trial, video=clip.damaged_at(tmp_path, frame))).track
     assert np.isfinite(track.edge_px[20:frame]).all()
@@ -102,7 +102,7 @@ def test_only_the_sound_frames_before_the_damage_are_tracked(clip: Clip, tmp_pat
 
 
 @pytest.mark.parametrize("unused", ["frames_used", "damaged tail"])
-def test_frames_that_are_not_used_keep_their_distance_in_time_after_a_dropped_one(clip: Clip, unused: str) -> None:
+def test_frames_that_are_not_used_keep_their_distance_in_time_after_a_dropped_one(clip, unused):
     kept = np.delete(np.arange(len(clip.frames)), 35)
     frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=np.arange(70), damaged=np.arange(70) >= 50)
     trial = clip.trial
@@ -112,7 +112,7 @@ def test_frames_that_are_not_used_keep_their_distance_in_time_after_a_dropped_on
     assert np.rint((track.time_s - track.time_s[0]) * CAPTURE_FPS).tolist() == kept.tolist()
 
 
-def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fails(clip: Clip, tmp_path: Path) -> None:
+def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fails(clip, tmp_path):
     path = write_video(tmp_path / "a.mkv", clip.frames.luma[:12], "ffv1", "gray", options={"g": "1"})
     data = bytearray(path.read_bytes())
     data[int(0.55 * len(data))] ^= 0xFF
@@ -123,7 +123,7 @@ def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fai
     assert frames.damaged.tolist() == wrong.tolist()
 
 
-def test_a_frame_unlike_those_around_it_along_a_row_of_blocks_is_torn(clip: Clip) -> None:
+def test_a_frame_unlike_those_around_it_along_a_row_of_blocks_is_torn(clip):
     luma = clip.frames.luma.astype(np.int16)
     assert not torn_frames(luma.astype(np.uint8)).any()
     for torn in ({0: (3, 30)}, {35: (8, 30)}, {70: (15, 30)}, {30: (8, 30), 31: (8, 50)}):
@@ -133,7 +133,7 @@ def test_a_frame_unlike_those_around_it_along_a_row_of_blocks_is_torn(clip: Clip
         assert np.flatnonzero(torn_frames(np.clip(wrong, 0, 255).astype(np.uint8))).tolist() == list(torn)
 
 
-def test_moving_patches_and_flicker_are_not_torn_frames(clip: Clip) -> None:
+def test_moving_patches_and_flicker_are_not_torn_frames(clip):
     lit = clip.frames.luma.astype(float) * np.where(np.arange(len(clip.frames.luma)) % 2, 1.0, 0.96)[:, None, None]
     assert not torn_frames(np.rint(lit).astype(np.uint8)).any()
     crossed = clip.frames.luma.copy()
@@ -142,7 +142,7 @@ def test_moving_patches_and_flicker_are_not_torn_frames(clip: Clip) -> None:
     assert not torn_frames(crossed).any()
 
 
-def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many() -> None:
+def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many():
     times = np.delete(np.arange(60.0), np.arange(20, 30))
     assert np.array_equal(slots_from_times(times)[0], np.arange(50))
     assert np.array_equal(slots_from_times(times, known_missing=10)[0], times)
@@ -150,7 +150,7 @@ def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many() -> None:
     assert slots_from_times(in_milliseconds, known_missing=21)[0][[29, 30]].tolist() == [29, 51]
 
 
-def test_frames_beyond_lost_ones_are_not_used(clip: Clip) -> None:
+def test_frames_beyond_lost_ones_are_not_used(clip):
     kept = np.delete(np.arange(len(clip.frames)), np.arange(48, 58))
     frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=kept, damaged=np.zeros(len(kept), dtype=bool))
     track = track_frames(frames, clip.trial, CAPTURE_FPS).track
@@ -159,7 +159,7 @@ def test_frames_beyond_lost_ones_are_not_used(clip: Clip) -> None:
     assert np.max(np.abs(error - np.median(error))) < 1e-3
 
 
-def test_a_tube_of_two_widths_has_one_of_them() -> None:
+def test_a_tube_of_two_widths_has_one_of_them():
     n, rows, columns = 60, 81, 240
     values = np.random.default_rng(6).normal(60, 2, (n, rows, columns))
     inside = np.abs(np.arange(rows) - rows // 2)[:, None] <= np.where(np.arange(columns) < 120, 8, 30)
@@ -188,7 +188,7 @@ for _ in range(60):
 
 
 @pytest.mark.slow
-def test_a_damaged_recording_that_is_given_up_lets_go_of_its_decoder(tmp_path: Path) -> None:
+def test_a_damaged_recording_that_is_given_up_lets_go_of_its_decoder(tmp_path):
     draw = np.random.default_rng(0)
     noise = draw.integers(0, 255, (60, 320, 960), dtype=np.uint8)
     path = write_video(tmp_path / "noise.mp4", noise, options={"g": "30", "bf": "0"})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -146,7 +145,7 @@ def test_a_track_does_not_follow_the_payload(flight):
 
 
 @pytest.mark.parametrize(("length_px", "complete"), [(405, True), (395, True), (430, False), (370, False)])
-def test_travel_is_compared_with_the_length(length_px: float, complete: bool) -> None:
+def test_travel_is_compared_with_the_length(length_px, complete):
     edge_px = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
     slot = np.arange(edge_px.size)
     quality = PointQuality(np.full(56, "", dtype="<U64"), slot, (), 10, 49, None, np.zeros(56, dtype=bool), 0.0 * slot)
@@ -156,7 +155,7 @@ def test_travel_is_compared_with_the_length(length_px: float, complete: bool) ->
 
 
 @pytest.mark.slow
-def test_an_edge_is_followed_across_the_place_where_film_and_background_are_alike(tmp_path: Path) -> None:
+def test_an_edge_is_followed_across_the_place_where_film_and_background_are_alike(tmp_path):
     """Seed 341, which tuned nothing; without shading of the tip the edge is lost in some frames there."""
     time = np.linspace(0, 0.08, 800)
     motion = time, np.clip(6.0 * (time - 0.015), 0, 0.2)
@@ -175,7 +174,7 @@ def test_an_edge_is_followed_across_the_place_where_film_and_background_are_alik
     assert error.std() < 2.0 * np.sqrt(np.mean(stated**2))
 
 
-def test_points_moved_dropped_and_confirmed_by_hand_stand_beside_the_trackers_own() -> None:
+def test_points_moved_dropped_and_confirmed_by_hand_stand_beside_the_trackers_own():
     flag = np.array(["", "doubtful", "lost", "gap", "", "after_end"], dtype="<U64")
     edge = np.array([0.0, 10.0, np.nan, 30.0, 40.0, 50.0])
     track = Track(np.arange(6) / 1000, np.full(6, np.nan), np.full(6, 0.1), flag, edge)
@@ -187,7 +186,7 @@ def test_points_moved_dropped_and_confirmed_by_hand_stand_beside_the_trackers_ow
     np.testing.assert_array_equal(out.tracked_px, edge)
 
 
-def test_a_recording_is_tracked_with_its_corrections(tmp_path: Path) -> None:
+def test_a_recording_is_tracked_with_its_corrections(tmp_path):
     scene = plain_scene(Plan(width=480, height=160, from_px=(20, 80), start_px=40, end_px=400, speed=14, radius=20))
     film = write_video(tmp_path / "a.mp4", scene.frames)
     plain = Trial(name="a", video=film, capture_fps=1000.0, m_per_px=2.5e-4)
@@ -231,7 +230,7 @@ def test_a_tip_at_rest_in_sight_stays_ok(film):
 
 
 @pytest.mark.slow
-def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path: Path) -> None:
+def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path):
     """Rendered; what the door misplaces is the same in all bands of rows, so that they do not show it."""
     errors, stated = [], []
     for seed in (901, 903):

@@ -51,7 +51,7 @@ GRAINS = [{}, {"wall_sd": 30.0, "tail_sd": 30.0}, {"wall_sd": 5.0, "tail_sd": 45
 
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [*GRAINS, {"door": True}])
-def test_stated_errors_match_the_true_errors(changes: dict[str, float]) -> None:
+def test_stated_errors_match_the_true_errors(changes):
     """Random errors show in second differences of the errors: Σ(1, −2, 1)² = 6."""
     short = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
     pulls = []
@@ -67,7 +67,7 @@ def test_stated_errors_match_the_true_errors(changes: dict[str, float]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
-def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods: tuple[int, int]) -> None:
+def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods):
     """By root mean squares over three draws: that of one, with four bands of which two mirror two, is known to half.
 
     Waves of eleven frames are part noise and part slow error, and both together are judged; long ones are slow.
@@ -91,7 +91,7 @@ def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods: tup
 
 
 @pytest.mark.parametrize("exposure", [0.1, 0.9])
-def test_an_edge_that_speeds_up_is_placed_where_it_was_at_mid_exposure(exposure: float) -> None:
+def test_an_edge_that_speeds_up_is_placed_where_it_was_at_mid_exposure(exposure):
     """At 4 px a frame² its mean over 0.9 frames lies aτ²/24 = 0.135 px ahead of where it was in their middle."""
     frames = np.arange(32.0)
     at, true = (60.0 + 2.0 * np.clip(t - 12.0, 0.0, 13.0) ** 2 for t in (instants(frames, exposure), frames))
@@ -101,7 +101,7 @@ def test_an_edge_that_speeds_up_is_placed_where_it_was_at_mid_exposure(exposure:
     assert abs(error[use].mean()) < 0.05
 
 
-def test_an_edge_that_stops_within_an_exposure_has_the_error_of_its_dwell() -> None:
+def test_an_edge_that_stops_within_an_exposure_has_the_error_of_its_dwell():
     """Half of an exposure at 20 px a frame, half at rest: seen on average vτ/8 behind where it is in the middle."""
     frames, exposure = np.arange(36.0), 0.5
     at, true = (
@@ -115,7 +115,7 @@ def test_an_edge_that_stops_within_an_exposure_has_the_error_of_its_dwell() -> N
 
 
 @pytest.mark.slow
-def test_a_noisier_picture_has_a_larger_error() -> None:
+def test_a_noisier_picture_has_a_larger_error():
     """Every fourth picture has five times the noise, as where a coder spares bits."""
     frames = np.arange(95.0)
     true = grown_px(frames)
@@ -134,7 +134,7 @@ def test_a_noisier_picture_has_a_larger_error() -> None:
 
 
 @pytest.mark.parametrize("door_grey", [30, 60, 90])
-def test_an_edge_behind_a_sliding_door_is_lost(door_grey: int) -> None:
+def test_an_edge_behind_a_sliding_door_is_lost(door_grey):
     """A striped door slides by in front of the first 80 px of growth; the tip comes out from behind it and is seen."""
     frames, columns = np.arange(80.0), np.arange(COLUMNS)
     true = grown_px(frames)
@@ -149,7 +149,7 @@ def test_an_edge_behind_a_sliding_door_is_lost(door_grey: int) -> None:
     assert np.abs(error[usable]).max() < 0.1
 
 
-def test_a_followed_door_is_off_by_its_distance_from_the_extrapolated_motion_and_a_tip_by_nothing() -> None:
+def test_a_followed_door_is_off_by_its_distance_from_the_extrapolated_motion_and_a_tip_by_nothing():
     """Hidden frames that do not lead up to the motion after them, and those that do: a tip followed from rest."""
     frames, noise = np.arange(40.0), np.random.default_rng(351).normal(0, 0.1, 40)
     for frame in (8.0, 8.99, 8.3):

@@ -24,7 +24,7 @@ Filmed = tuple[Scene, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def filmed() -> Filmed:
+def filmed():
     """A scene, and its frames with rest before and after it, each frame of rest with grain of its own."""
     scene = plain_scene(
         Plan(seed=20942, width=384, height=96, from_px=(24.0, 48.0), end_px=320.0, radius=14.0, speed=9.0)
@@ -43,7 +43,7 @@ def track(path: Path, **stated: object) -> Track:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("key_frames", ["30", "5000", "1"])
-def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monkeypatch, key_frames) -> None:
+def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monkeypatch, key_frames):
     """With a key frame every 30, with one, and with key frames alone; tracked as the whole film is."""
     scene, long_frames = filmed
     film = write_video(tmp_path / "long.mp4", long_frames, options={"crf": "14", "g": key_frames})
@@ -76,7 +76,7 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monke
 
 
 @pytest.mark.slow
-def test_of_a_long_cine_the_event_is_read_and_no_more(filmed: Filmed, tmp_path: Path, monkeypatch) -> None:
+def test_of_a_long_cine_the_event_is_read_and_no_more(filmed, tmp_path, monkeypatch):
     scene, long_frames = filmed
     monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
     missing = np.delete(np.arange(len(long_frames) + 1), BEFORE + 30) / 1000 + 0.2
@@ -92,7 +92,7 @@ def test_of_a_long_cine_the_event_is_read_and_no_more(filmed: Filmed, tmp_path: 
     assert made.time_s[-1] == pytest.approx(len(long_frames) / 1000 + 1e-4)
 
 
-def test_the_event_lies_between_the_pictures_that_differ_from_either_end() -> None:
+def test_the_event_lies_between_the_pictures_that_differ_from_either_end():
     rng = np.random.default_rng(8)
     pictures = [rng.normal(80, 1.5, (48, 64)).clip(0, 255).astype(np.uint8) for _ in range(60)]
     for i in range(20, 60):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ def fitted(strip: np.ndarray, start: np.ndarray, pictures: np.ndarray, shading: 
 
 
 @pytest.mark.parametrize("contrast", [110.0, -15.0, 0.0])
-def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_like_background(contrast: float) -> None:
+def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_like_background(contrast):
     strip, edge, pictures = stepping(rim=True, contrast=contrast)
     known, ignored = (fitted(strip, edge - 1.4, pictures, shading)[:, 0] - edge for shading in (RIM, 0 * RIM))
     assert np.abs(known).max() < 0.15
@@ -52,7 +51,7 @@ FITS = "from test_kernels import *; s, e, p = stepping(); print(fitted(s, e + 1.
 
 
 @pytest.mark.slow
-def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and_in_later_ones(tmp_path: Path) -> None:
+def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and_in_later_ones(tmp_path):
     where = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
     run = [sys.executable, "-c", FITS]
     first, later = (subprocess.run(run, env=os.environ | where, capture_output=True, check=True) for _ in range(2))
@@ -60,13 +59,13 @@ def test_a_fit_is_the_same_to_the_last_digit_in_the_process_that_compiles_it_and
 
 
 @pytest.mark.parametrize(("stated", "expected"), [("1", 1), ("2", 2), ("64", 4), ("", 4), ("0", 4), ("many", 4)])
-def test_the_usual_variable_limits_the_threads(monkeypatch: pytest.MonkeyPatch, stated: str, expected: int) -> None:
+def test_the_usual_variable_limits_the_threads(monkeypatch, stated, expected):
     monkeypatch.setattr(threads, "available_cores", lambda: 8)
     monkeypatch.setenv("OMP_NUM_THREADS", stated)
     assert threads.n_threads() == expected
 
 
-def test_a_track_is_the_same_to_the_last_digit_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_track_is_the_same_to_the_last_digit_whatever_the_number_of_threads(monkeypatch):
     luma = plain_scene(Plan(seed=13, end_px=300, width=420, rest_frames=20, end_frames=20)).frames
     found = []
     for number in (1, 3):

@@ -48,7 +48,7 @@ def check(folder: Path, *videos: str, settings: str = SCALE, header: str = HEADE
 
 
 @pytest.mark.parametrize("fault", ["text", "empty", "cut off", "three frames", "missing", "empty folder", "no images"])
-def test_what_is_no_recording_is_an_error_at_its_place(tmp_path: Path, fault: str) -> None:
+def test_what_is_no_recording_is_an_error_at_its_place(tmp_path, fault):
     path = tmp_path / "a.mp4"
     if fault in ("text", "empty"):
         path.write_text("not a film\n" * 50 if fault == "text" else "")
@@ -64,14 +64,14 @@ def test_what_is_no_recording_is_an_error_at_its_place(tmp_path: Path, fault: st
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
-def test_fewer_frames_than_declared_are_counted_without_decoding(tmp_path: Path, name: str) -> None:
+def test_fewer_frames_than_declared_are_counted_without_decoding(tmp_path, name):
     write_clip(tmp_path / name, 60, share=0.6)
     assert check(tmp_path, name) == ["warning t0 video"]
     (problem,) = check_experiment(tmp_path, Surveyor())
     assert 25 <= int(problem.message.split(":")[1].split()[0]) <= 40
 
 
-def test_a_rate_that_contradicts_the_frames_own_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rate_that_contradicts_the_frames_own_is_refused(tmp_path, monkeypatch):
     write_clip(tmp_path / "a.mp4")
     inspect = module.inspect_recording
     monkeypatch.setattr(module, "inspect_recording", lambda path: replace(inspect(path), capture_fps=1069.0))
@@ -90,7 +90,7 @@ NO_SCALES = {
 
 
 @pytest.mark.parametrize("case", NO_SCALES)
-def test_what_gives_no_scale_is_reported_once(tmp_path: Path, case: str) -> None:
+def test_what_gives_no_scale_is_reported_once(tmp_path, case):
     scale, size_px, found = NO_SCALES[case]
     for name in ("a.mp4", "b.mp4"):
         write_clip(tmp_path / name)
@@ -109,7 +109,7 @@ def test_what_gives_no_scale_is_reported_once(tmp_path: Path, case: str) -> None
         ("from_px: [5, 30], via_px: [[50, 34]], to_px: [90, 50], width_mm: 2", []),
     ],
 )
-def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(tmp_path: Path, given, found) -> None:
+def test_an_axis_that_leaves_the_picture_or_bends_too_sharply_is_refused(tmp_path, given, found):
     write_clip(tmp_path / "a.mp4")
     assert check(tmp_path, "a.mp4", settings=SCALE + f"axis: {{{given}}}\n") == found
 
@@ -139,7 +139,7 @@ SWAPPED = replace(VINE, diameter_m=VINE.length_m, length_m=VINE.diameter_m)
         (replace(VINE, compare_sizes=False), 10.0, 138.0, []),
     ],
 )
-def test_sizes_that_contradict_the_sheet_are_named_once(trial: Trial, scale: float, grown_mm: float, found) -> None:
+def test_sizes_that_contradict_the_sheet_are_named_once(trial, scale, grown_mm, found):
     facts = replace(FACTS, tube_width_mm=12.1 * scale, tube_width_sigma_mm=0.25 * scale, growth_mm=grown_mm)
     assert [f"{problem.severity} {problem.column}" for problem in module.size_problems(trial, facts)] == found
 
@@ -150,7 +150,7 @@ DIRECTIONS += [(DOWN, 90, False, True), (ACROSS, 0, True, True)]
 
 
 @pytest.mark.parametrize(("to_px", "angle_deg", "blank", "noted"), DIRECTIONS)
-def test_growth_in_another_direction_than_stated_is_noted(to_px: tuple, angle_deg: float, blank: bool, noted: bool):
+def test_growth_in_another_direction_than_stated_is_noted(to_px, angle_deg, blank, noted):
     trials = [replace(VINE, name=name, growth_angle_rad=np.radians(angle_deg)) for name in "ab"]
     facts = replace(FACTS, axis=Axis((60.0, 30.0), to_px))
     assert len(module.direction_notes([facts] * 2, trials, ["a", "b"] if blank else [])) == noted
@@ -161,7 +161,7 @@ SLOPES_DEG += [([0, 1, 60, 61], ""), ([0, 60], ""), ([88, 90, -89, 0], "d")]
 
 
 @pytest.mark.parametrize(("slopes_deg", "named"), SLOPES_DEG)
-def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg: list[float], named: str) -> None:
+def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg, named):
     ends = [(100 + 200 * np.cos(np.radians(s)), 100 + 200 * np.sin(np.radians(s))) for s in slopes_deg]
     named_ends = zip("abcde", ends, strict=False)
     trials = [replace(VINE, name=name, axis=Axis((100.0, 100.0), end)) for name, end in named_ends]
@@ -173,7 +173,7 @@ def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg: list[floa
 
 
 @pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def clip(tmp_path_factory):
     """A tube of 12 mm that grows 140 mm at 6 m/s, with an exposure of half a frame, as a film of 60 a second."""
     scene = preset("half_frame_exposure")
     assert isinstance(scene.subject, Tube)
@@ -185,7 +185,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_rate_of_playback_is_refused_unless_it_is_said_to_be_that_of_capture(clip: Path) -> None:
+def test_the_rate_of_playback_is_refused_unless_it_is_said_to_be_that_of_capture(clip):
     recording = inspect_recording(clip)
     assert recording.playback_fps == 60
     with pytest.raises(RecordingError):
@@ -199,7 +199,7 @@ RIGHT = "12,100,140,36,3"
 
 
 @pytest.mark.slow
-def test_check_reports_the_facts_of_a_correct_recording(clip: Path, tmp_path: Path) -> None:
+def test_check_reports_the_facts_of_a_correct_recording(clip, tmp_path):
     """Of two trials, the second of which has a scale of its own."""
     (tmp_path / "a.mp4").symlink_to(clip)
     found = check(tmp_path, "a.mp4", "a.mp4", settings=FILMED, header=f"{HEADER},mm_per_px", row=RIGHT + ",")
@@ -233,13 +233,13 @@ def test_check_reports_the_facts_of_a_correct_recording(clip: Path, tmp_path: Pa
     ],
     ids=["rate", "scale ×10", "scale 20 %", "sizes swapped", "ms as µs", "µs as ms"],
 )
-def test_check_catches_a_mistake(clip: Path, tmp_path: Path, row: str, settings: str, expected: list[str]) -> None:
+def test_check_catches_a_mistake(clip, tmp_path, row, settings, expected):
     (tmp_path / "a.mp4").symlink_to(clip)
     assert check(tmp_path, "a.mp4", settings=settings, row=row) == expected
 
 
 @pytest.mark.slow
-def test_a_scale_a_fifth_off_is_kept_with_the_trial_for_the_verdict(clip: Path, tmp_path: Path) -> None:
+def test_a_scale_a_fifth_off_is_kept_with_the_trial_for_the_verdict(clip, tmp_path):
     shutil.copy(clip, tmp_path / "a.mp4")
     noted = []
     for scale in (SCALE_MM, 0.8 * SCALE_MM):

@@ -20,7 +20,7 @@ def pictures(n: int, height: int = 64, width: int = 96) -> list[np.ndarray]:
     return made
 
 
-def test_pictures_come_back_in_order_and_in_colour(tmp_path: Path) -> None:
+def test_pictures_come_back_in_order_and_in_colour(tmp_path):
     path = tmp_path / "overlays" / "a.mp4"
     assert write_clip(path, iter(pictures(10)), 12.5) == 10
     with av.open(str(path)) as container:
@@ -54,7 +54,7 @@ def test_a_failed_write_leaves_the_old_clip_and_no_other_file(tmp_path: Path, gi
 
 
 @pytest.mark.slow
-def test_the_same_pictures_are_the_same_bytes_whatever_the_memory_held(tmp_path: Path) -> None:
+def test_the_same_pictures_are_the_same_bytes_whatever_the_memory_held(tmp_path):
     draw = np.random.default_rng(20701)
     noisy = [np.clip(p + draw.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in pictures(30, 198, 480)]
     written = []
