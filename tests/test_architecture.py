@@ -28,7 +28,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 
 BUDGETS = {
     "cli": (634, 4, 5),
-    "core": (1482, 9, 59),
+    "core": (1488, 9, 59),
     "diagnosis": (10870, 22, 129),
     "dynamics": (2403, 8, 27),
     "effects": (765, 3, 8),
@@ -41,7 +41,7 @@ BUDGETS = {
     "narrative": (1877, 3, 12),
     "pages": (3362, 8, 24),
     "paper": (842, 3, 15),
-    "pipeline": (3132, 10, 14),
+    "pipeline": (3131, 10, 14),
     "planning": (2391, 5, 18),
     "report": (747, 2, 3),
     "results": (252, 2, 8),

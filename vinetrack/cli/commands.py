@@ -69,9 +69,8 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
     with compilation_told(say):
         check_before_run(paths, say)
     run_chain(paths, cores, say, verbose)
-    made = Results(paths.results)
-    content = {"results": made.folder, "report": made.report, "diagnosis": read_json(made.diagnosis)}
-    return run_lines(made.folder), content
+    to = Results(paths.results)
+    return run_lines(to.folder), {"results": to.folder, "report": to.report, "diagnosis": read_json(to.diagnosis)}
 
 
 @command()
@@ -288,8 +287,9 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
         if unknown := [name for name in trials or () if name not in read.names]:
             raise typer.BadParameter(f"{unknown[0]!r} is not a trial of the sheet", param_hint="--trials")
         in_run = RUN in os.environ
-        job = Job(read, results, run_settings(settings), trials or None, threads, typer.echo if in_run else report)
-        lines = stage.run(job)
+        say = typer.echo if in_run else report
+        say(stage.does.rstrip("."))
+        lines = stage.run(Job(read, results, run_settings(settings), trials or None, threads, say))
         return [stage.done] if in_run else lines, None
 
     run_stage.__doc__ = stage.does

@@ -74,11 +74,16 @@ class Progress(Generic[Item]):
         def text(content: str) -> ProgressColumn:
             return rich.TextColumn(content, markup=False)
 
-        columns: list[ProgressColumn] = [rich.SpinnerColumn(), text("{task.description} … {task.elapsed:.0f} s")]
-        if total is not None:
-            amount = [rich.BarColumn(), rich.MofNCompleteColumn(), text(unit)]
-            left = [rich.TimeRemainingColumn(compact=True), text("left")]
-            columns = [text("{task.description}:"), *amount, *left]
+        def where(is_known: bool, column: ProgressColumn) -> ProgressColumn:
+            """Show a column only where the number of steps is known, or only where it is not."""
+            shown = column.render
+            column.render = lambda task: shown(task) if (task.total is not None) == is_known else ""  # type: ignore[method-assign]
+            return column
+
+        amount = [text("{task.description}:"), rich.BarColumn(), rich.MofNCompleteColumn(), text(unit)]
+        amount += [rich.TimeRemainingColumn(compact=True), text("left")]
+        columns = [where(False, rich.SpinnerColumn()), where(False, text("{task.description} … {task.elapsed:.0f} s"))]
+        columns += [where(True, column) for column in amount]
         self._items = items
         self._bar = rich.Progress(*columns, console=Console(stderr=True), transient=True)
         self._task = self._bar.add_task(description, total=total)
@@ -94,7 +99,8 @@ class Progress(Generic[Item]):
 
     def begin(self, description: str) -> None:
         """Show other work, of unknown length until `reach` says more."""
-        self._bar.reset(self._task, description=description, total=None)
+        self._bar.remove_task(self._task)
+        self._task = self._bar.add_task(description, total=None)
 
     def reach(self, done: int, total: int, what: str) -> None:
         """Set the number of completed steps, of how many, and of what."""

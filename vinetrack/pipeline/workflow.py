@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
 from vinetrack.core.tables import is_readable, write_text
-from vinetrack.core.terminal import Progress, progress
+from vinetrack.core.terminal import waiting
 from vinetrack.figures.registry import figures_of
 from vinetrack.pipeline.stages import COMPILING, STAGES, Stage
 
@@ -460,7 +460,6 @@ def run_chain(paths: RunPaths, cores: int, say: Say, verbose: bool = False) -> N
         "--directory", str(paths.results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--configfile",
         str(config_file), *([] if verbose else ["--quiet", "all"]),
     ]  # fmt: skip
-    bar: Progress[None]
     # Its standard output is what the stages say, since Snakemake itself is quiet; in a process of its own it stops its
     # jobs itself when the user interrupts the run.
     with (
@@ -468,7 +467,7 @@ def run_chain(paths: RunPaths, cores: int, say: Say, verbose: bool = False) -> N
         subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=shown, env=os.environ | {RUN: "1"}, encoding="utf-8"
         ) as process,
-        progress(0, "trials") as bar,
+        waiting("starting") as bar,
     ):
         assert process.stdout is not None
         told = {COMPILING, *(stage.done for stage in STAGES.values())}
