@@ -29,7 +29,7 @@ from vinetrack.diagnosis.result import (
 from vinetrack.diagnosis.score_test import slip_of
 from vinetrack.dynamics.model import base_model
 from vinetrack.experiment.folder import CONFOUNDING_CORRELATION, order_pressure_correlation, trial_order
-from vinetrack.inference.fit_result import EXPONENT, Number
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
 from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.robust_covariance import FILM_ERROR
 
@@ -204,15 +204,15 @@ def verdict_meaning(diagnosis: Diagnosis) -> str:
 def summary_facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
     """Return significance, sizes, power, change of the error and damping exponent, as far as the verdict has them."""
     bounded = [row for row in diagnosis.ranking if row.largest] if diagnosis.verdict == ADEQUATE else []
-    n = [entry for entry in diagnosis.parameters if entry.key == EXPONENT and is_finite(entry.value)]
-    limits = f"{len(bounded)} candidates", "the largest undetected size of each is listed below"
+    n, B = ([p for p in diagnosis.parameters if p.key == key and is_finite(p.value)] for key in (EXPONENT, DAMPING))
+    vines = [estimate_text(p) for p in B[:3]]  # as many as a tile has room for
     return [
         *filter(None, [_significance(diagnosis)]),
         *_sizes(diagnosis),
-        *([Fact("Upper limits", *limits)] if bounded else []),
+        *([Fact("Upper limits", f"{len(bounded)} candidates", "of undetected sizes, listed below")] if bounded else []),
         *_power_facts(diagnosis),
         *_errors(ladder),
-        *(Fact("Damping exponent", estimate_text(entry), interval_text(entry)) for entry in n[:1]),
+        *(Fact("Damping law", estimate_text(p), "; ".join([interval_text(p), *vines])) for p in n[:1]),
     ]
 
 
