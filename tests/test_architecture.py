@@ -36,7 +36,7 @@ BUDGETS = {
     "figures": (2880, 8, 38),
     "inference": (6618, 14, 59),
     "interface": (629, 2, 2),
-    "kinematics": (1849, 6, 12),
+    "kinematics": (1811, 6, 12),
     "laboratory": (1780, 6, 13),
     "narrative": (1877, 3, 12),
     "pages": (3362, 8, 24),

@@ -201,40 +201,6 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
     )
 
 
-def trim(
-    time_s: Floats, position_m: Floats, kinematics: Kinematics, window: tuple[int, int], band: float, drift_limit: float
-) -> tuple[int, int]:
-    """Trim the ends of a steady window that deviate from its speed line. The first and last 1, 2, 4 … frames must move
-    within `band` (a fraction of the mean speed) plus 2.5 standard errors of the speed that the window's
-    parabola has there. Returns first and last point of the trimmed window, both included. Shapes: time_s, position_m
-    (n,).
-    """
-    first, last = window
-    noise_m, rho = kinematics.noise_m, kinematics.noise_correlation
-    fit = fit_window(time_s[first : last + 1], position_m[first : last + 1], noise_m, rho)
-    while last - first >= 4:
-        t, y = time_s[first : last + 1], position_m[first : last + 1]
-        middle, length = (t[0] + t[-1]) / 2, t[-1] - t[0]
-        cuts, span = [0, 0], 1
-        while span <= max(1, (t.size - 1) // 4):
-            for end, (i, j) in enumerate(((0, span), (t.size - 1 - span, t.size - 1))):
-                gap_s = t[j] - t[i]
-                expected = fit.speed_m_s * (1 + fit.drift * ((t[i] + t[j]) / 2 - middle) / length)
-                error = noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
-                # 2.5: standard errors by which an end must deviate from its speed line to be trimmed
-                if abs((y[j] - y[i]) / gap_s - expected) > band * abs(fit.speed_m_s) + 2.5 * error:
-                    cuts[end] = max(cuts[end], (span + 1) // 2)
-            span *= 2
-        shorter = slice(first + cuts[0], last - cuts[1] + 1)
-        if cuts == [0, 0] or shorter.stop - shorter.start < 4:
-            break
-        fit = fit_window(time_s[shorter], position_m[shorter], noise_m, rho)
-        if max(abs(bound) for bound in fit.drift_95) > drift_limit:
-            break
-        first, last = shorter.start, shorter.stop - 1
-    return first, last
-
-
 BAND = 0.5  # Half width of the band that contains every velocity, in drift limits (derived)
 
 SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (derived)
@@ -255,11 +221,7 @@ def gated_window(track: Track, kinematics: Kinematics, limits: SteadySettings, *
     steady, nearest = _Search(time_s[inside], position_m[inside], kinematics, inside, latest, drift_limit).longest()
     if steady is None:
         return Window("gated", False, nearest)
-    untrimmed = (first + steady[0], first + steady[1])
-    # 1 / 6: deviation of the ends of a window from its speed line, in drift limits, above which they are trimmed
-    # (derived)
-    trimmed = trim(time_s, position_m, kinematics, untrimmed, (1 / 6) * drift_limit, drift_limit)
-    window = judge(time_s, position_m, kinematics, *trimmed, "gated")
+    window = judge(time_s, position_m, kinematics, first + steady[0], first + steady[1], "gated")
     moving = last - first + 1
     reason = (
         f"steady over {window.n_points} of {moving} moving points: speed changes by {_percent(window)},"
