@@ -28,9 +28,9 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 
 BUDGETS = {
     "cli": (634, 4, 5),
-    "core": (1488, 9, 59),
+    "core": (1487, 9, 59),
     "diagnosis": (10870, 22, 129),
-    "dynamics": (2403, 8, 27),
+    "dynamics": (2407, 8, 27),
     "effects": (765, 3, 8),
     "experiment": (1904, 7, 18),
     "figures": (2880, 8, 38),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import tempfile
 from typing import Any
 
 from vinetrack.core.terminal import progress, severity_first, waiting
 from vinetrack.core.threads import njit
+from vinetrack.dynamics.kernel import _cache_folder
 from vinetrack.pipeline.stages import COMPILING, compilation_told
 
 
@@ -54,3 +56,15 @@ def test_compilation_is_told_once_and_code_is_compiled_where_no_folder_can_be_wr
     with compilation_told(said.append):
         assert doubled(4) == 8
     assert said == [COMPILING]
+
+
+def test_a_model_is_kept_in_a_folder_of_ones_own_where_no_other_can_be_written(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    for name in ("VINETRACK_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.setenv(name, str(tmp_path / "file"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = _cache_folder.__wrapped__()
+    assert folder.parent == tmp_path
+    assert folder.stat().st_mode & 0o777 == 0o700
+    monkeypatch.setenv("VINETRACK_CACHE", str(tmp_path))
+    assert _cache_folder.__wrapped__() == tmp_path / "vinetrack" / "kernels"

@@ -26,10 +26,9 @@ FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "correct
 # Flags of points that are not measurements of the leading edge
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 
-# Suffixes of recordings: side files of high-speed cameras, all their files, which state the capture rate, films, and
-# pictures of which a folder or a stack is one
-SIDE_FILES = (".cih", ".cihx")
-CAMERA_FILES = frozenset({".cine", ".mraw", *SIDE_FILES})
+SIDE_FILES = (".cih", ".cihx")  # Suffixes of headers that lie beside a Photron `.mraw`
+CAMERA_FILES = frozenset({".cine", ".mraw", *SIDE_FILES})  # Those of high-speed cameras, which state the capture rate
+# Suffixes of recordings: films, and pictures of which a folder or a stack is one
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts"}) | CAMERA_FILES - {*SIDE_FILES}
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
 

@@ -70,7 +70,7 @@ N_BY_VINE, ORDER_DRIFT, SPECIMEN, DAY = ("n_by_vine", "order_drift", "specimen",
 
 @dataclass(frozen=True)
 class BetweenHypothesis:
-    """Trials differ so; do this. With standard deviations (of ln B, P, ln P): groups of the column of its name."""
+    """A way in which trials differ. With standard deviations (ln B, P, ln P): between groups of the column so named."""
 
     summary: str
     remedy: str

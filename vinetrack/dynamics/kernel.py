@@ -7,12 +7,14 @@ on, so that other processes find the compiled form.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import importlib.util
 import inspect
 import itertools
 import math
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence, Sized
@@ -180,7 +182,9 @@ def _cache_folder() -> Path:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
-    return Path(tempfile.mkdtemp(prefix="vinetrack-"))  # of this process alone: code is run from there
+    own = tempfile.mkdtemp(prefix="vinetrack-")  # of this process alone: code is run from there
+    atexit.register(shutil.rmtree, own, ignore_errors=True)
+    return Path(own)
 
 
 _LOADED: dict[str, ModuleType] = {}  # Kernels of this process by their hash

@@ -237,12 +237,12 @@ def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
 
 def _settings(trial: Trial) -> dict[str, str]:
     """Settings that may distinguish conditions, by column of the sheet and in its units; no payload is none."""
-    texts = {"bends": f"{len(trial.bends)} bends"} if trial.bends else {}
+    texts = {}
     for name, column in COLUMNS.items():
         if column.limit and math.isfinite(value := column.of_trial(trial)) and (value or name != "payload_g"):
             which = f" {column.quantity}" if name in RIG or name == "length_mm" else ""
             texts[name] = f"{value:.3g} {column.unit}{which}"
-    return texts
+    return texts | ({"bends": f"{len(trial.bends)} bends"} if trial.bends else {})
 
 
 # ------------------------------------------------------------------------------
