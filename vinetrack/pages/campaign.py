@@ -240,8 +240,9 @@ def _settings(trial: Trial) -> dict[str, str]:
     texts = {}
     for name, column in COLUMNS.items():
         if column.limit and math.isfinite(value := column.of_trial(trial)) and (value or name != "payload_g"):
-            which = f" {column.quantity}" if name in RIG or name == "length_mm" else ""
-            texts[name] = f"{value:.3g} {column.unit}{which}"
+            unit = {"degrees": "°", "litres": "L"}.get(column.unit, column.unit)
+            which = f" {column.quantity}" if unit == "mm" and name != "diameter_mm" else ""  # several are in mm
+            texts[name] = f"{value:.3g} {unit}{which}"
     return texts | ({"bends": f"{len(trial.bends)} bends"} if trial.bends else {})
 
 
