@@ -240,9 +240,8 @@ def _settings(trial: Trial) -> dict[str, str]:
     texts = {}
     for name, column in COLUMNS.items():
         if column.limit and math.isfinite(value := column.of_trial(trial)) and (value or name != "payload_g"):
-            unit = {"degrees": "°", "litres": "L"}.get(column.unit, column.unit)
-            which = f" {column.quantity}" if unit == "mm" and name != "diameter_mm" else ""  # several are in mm
-            texts[name] = f"{value:.3g} {unit}{which}"
+            text = f"{value:.3g} {column.unit}".replace("degrees", "°").replace("litres", "L")
+            texts[name] = f"{text} {column.quantity}" if column.unit == "mm" and name != "diameter_mm" else text
     return texts | ({"bends": f"{len(trial.bends)} bends"} if trial.bends else {})
 
 
