@@ -105,8 +105,7 @@ def decode_container(
                     decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base)
                     decoded.corrupt.append(bool(frame.is_corrupt))
                     decoded.key.append(bool(frame.key_frame))
-                    # 3: code of a B frame (defined)
-                    decoded.between.append(frame.pict_type == 3)
+                    decoded.between.append(frame.pict_type == 3)  # 3: code of a B frame (defined)
         except av.error.FFmpegError as error:
             messages.append(str(error.strerror or error))
     decoded.messages = list(messages)
@@ -254,6 +253,7 @@ def quiet_log() -> Iterator[list[str]]:
     with _one_log:
         level = av.logging.get_level()
         av.logging.set_level(av.logging.ERROR)
+        av.logging.set_skip_repeated(False)  # Else what two films say alike is heard once, in either
         try:
             with av.logging.Capture(False) as logs:
                 yield messages
