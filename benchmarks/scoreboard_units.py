@@ -208,10 +208,8 @@ def whole_run(name: str, seed: int, folder: Path, known: object) -> list[Row]:  
     if name == "many tracks":
         import many_trials
 
-        found, verdict = many_trials.costs("null:white", seed, MANY_TRACKS, folder)
-        row: Row = {f"{stage}_s": cost.processor_s for stage, cost in found.items()}
-        row |= {"all_s": sum(cost.processor_s for cost in found.values()), "verdict": verdict}
-        return [row | {"peak_mb": max(cost.peak_mb for cost in found.values())}]
+        used, verdict = many_trials.of_tracks("null:white", seed, MANY_TRACKS, folder)
+        return [{"all_s": used.processor_s, "peak_mb": used.peak_mb, "verdict": verdict}]
     import demonstration
     from hidden.verdicts import Answer
 
