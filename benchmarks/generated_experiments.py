@@ -140,7 +140,7 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
 
     read = read_experiment(folder)
     job = Job(read, results, run_settings(SETTINGS))
-    for name in ("trials", "damping", "model", *(("figures", "report") if figures else ())):
+    for name in ("trials", "model", *(("report",) if figures else ())):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

@@ -41,10 +41,10 @@ BUDGETS = {
     "narrative": (1877, 3, 12),
     "pages": (3362, 8, 24),
     "paper": (842, 3, 15),
-    "pipeline": (3131, 10, 14),
+    "pipeline": (3102, 10, 14),
     "planning": (2391, 5, 18),
     "report": (747, 2, 3),
-    "results": (252, 2, 8),
+    "results": (251, 2, 8),
     "tracks": (1629, 4, 19),
     "video": (6700, 17, 86),
 }

@@ -19,6 +19,7 @@ from PIL import Image
 
 import vinetrack
 from vinetrack.cli.main import app
+from vinetrack.pipeline.stages import STAGES
 
 # README and docs: links and pictures lead somewhere, commands exist, nothing names the machine it was written on.
 ROOT = Path(__file__).parents[1]
@@ -128,7 +129,7 @@ def test_its_effect_is_printed_as_shown_and_goes_through_every_stage_into_the_pr
     assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
     said = run("effects", "spring_line", "--experiment", experiment).stdout
     assert said.strip().replace(str(experiment), "my_experiment") == shown.output
-    for stage in ("trials", "damping", "model", "figures", "report"):
+    for stage in STAGES:
         succeed(stage, experiment, results, "--settings", '{"figures": {"dpi": 50}}')
     assert "spring_line" in json.loads((results / "fit.json").read_text())["model"]
     assert "spring_line.py" in json.loads((results / "provenance.json").read_text())["inputs"]

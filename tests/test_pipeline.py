@@ -18,6 +18,7 @@ from commanded import run, succeed
 from lsoda_vine import grown_position, vine_trial
 
 import vinetrack
+from vinetrack.pipeline.stages import STAGES
 
 # A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
 ROOT = Path(__file__).parents[1]
@@ -116,13 +117,11 @@ def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign):
     assert {name: (results / name).read_text().splitlines()[0] for name in HEADERS} == HEADERS
 
     figures = results / "figures"
-    drawn = json.loads((figures / "campaign.json").read_text())["figures"]
-    assert {"damping_law", "exponents", "scaling", "overview", "model_comparison", "model_residuals"} <= set(drawn)
+    drawn = {path.stem for path in figures.glob("*.svg") if not path.stem.startswith(("trial_", "strip_"))}
+    assert {"damping_law", "exponents", "scaling", "overview", "model_comparison", "model_residuals"} <= drawn
     for name in (*drawn, "trial_d12_0", "trial_torn"):
         assert (figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert "<svg" in (figures / f"{name}.svg").read_text(encoding="utf-8")
-    written = {path.stem for path in figures.glob("*.svg") if not path.stem.startswith(("trial_", "strip_"))}
-    assert written == set(drawn)
 
     provenance = json.loads((results / "provenance.json").read_text())
     sheet = results.parents[1] / "my vines (1)" / "trials.csv"
@@ -166,7 +165,7 @@ def test_snakemake_stops_with_a_sentence_where_there_is_no_experiment(tmp_path):
 def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
     """All stages by their own commands, in this process; the rows of trials.csv."""
     settings = '{"damping": {"resamples": 200}, "figures": {"dpi": 50}}'
-    for stage in ("trials", "damping", "model", "figures", "report"):
+    for stage in STAGES:
         succeed(stage, experiment, results, "--settings", settings)
     return read_rows(results / "trials.csv")
 
@@ -197,7 +196,7 @@ def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_pa
     for stage, *options in (
         ("trials", "--trials", '["a", "c"]', "--settings", '{"figures": {"formats": ["png"]}}'),
         ("trials", "--trials", '["b", "d"]'),
-        ("damping",),
+        ("model",),
     ):
         succeed(stage, folder, results, *options)
     assert sorted(path.suffix for path in (results / "figures").glob("trial_[ad].*")) == [".png", ".png", ".svg"]

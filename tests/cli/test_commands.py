@@ -70,7 +70,7 @@ def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):
     folder = experiment(tmp_path / "v")
     without_input, no_json, out_of_bounds = "{}", "seed=3", '{"damping": {"resamples": 3}}'
     for settings, status in ((without_input, 1), (no_json, 2), (out_of_bounds, 1)):
-        done = run("damping", folder, tmp_path, "--settings", settings)
+        done = run("model", folder, tmp_path, "--settings", settings)
         assert done.exit_code == status
         assert "Traceback" not in done.output
     for command in (("diagnose",), ("add", "air_drag"), ("check",)):
@@ -82,9 +82,9 @@ def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path, monkeypatch):
     monkeypatch.setattr("vinetrack.pipeline.trials.summarise_trial", Mock(side_effect=ZeroDivisionError("unforeseen")))
     succeed("trials", folder, tmp_path / "r", "--log", log)
     assert "ZeroDivisionError: unforeseen" in log.read_text()
-    assert "1 trials, 1 failed" in run("damping", folder, tmp_path / "r").output
+    assert "1 trials, 1 failed" in run("model", folder, tmp_path / "r").output
     monkeypatch.setattr("vinetrack.pipeline.trials.gather", Mock(side_effect=RuntimeError("the bottom fell out")))
-    done = run("damping", folder, tmp_path / "r", "--log", log)
+    done = run("model", folder, tmp_path / "r", "--log", log)
     assert done.exit_code == 1
     assert "Traceback" not in done.output
     assert "RuntimeError: the bottom fell out" in log.read_text()
@@ -116,7 +116,7 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path, 
     assert [path.name for path in alone.iterdir()] == ["answer.json"]
     assert sorted(folder.rglob("*")) == before
 
-    for stage in ("trials", "damping", "model"):
+    for stage in ("trials", "model"):
         succeed(stage, folder, results)
     (results / "provenance.json").write_text(json.dumps({"experiment": str(folder)}))
 
@@ -161,7 +161,7 @@ def test_a_law_is_written_beside_the_experiment_and_added(tmp_path, monkeypatch)
     virtual = grown(sheet_command((4,), replicates=1), 103, own=[effect_file(tmp_path)], values=values)
     experiment, results = tmp_path / "bench", tmp_path / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
-    for stage in ("trials", "damping", "model"):
+    for stage in ("trials", "model"):
         succeed(stage, experiment, results)
     (results / "provenance.json").write_text(json.dumps({"experiment": str(experiment)}))
     diagnosis = json.loads((results / "diagnosis.json").read_text())

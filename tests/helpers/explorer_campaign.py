@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from commanded import fit_law
 from commanded import succeed as run
 from hand_diagnosis import diagnosis, next_experiment
 from plain_scene import write_video
@@ -52,7 +53,7 @@ def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = S
 def make_results(experiment: Path, results: Path) -> Path:
     """The results of the workflow, as far as the explorer reads them."""
     run("trials", experiment, results)
-    run("damping", experiment, results, "--settings", '{"damping": {"resamples": 100}}')
+    fit_law(experiment, results, damping={"resamples": 100})
     fit_model(Job(read_experiment(experiment), results, run_settings({})))
     made = {"experiment": experiment.absolute().as_posix(), "settings": {"damping": {"resamples": 100}}}
     Results(results).provenance.write_text(json.dumps(made))

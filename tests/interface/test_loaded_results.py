@@ -34,7 +34,6 @@ def small_run(tmp_path_factory):
     results = folder / "results" / "demo"
     make_results(experiment, results)
     run("model", experiment, results)
-    run("figures", experiment, results)
     run("report", experiment, results)
     return results
 

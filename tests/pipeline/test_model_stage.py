@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from commanded import succeed
+from commanded import fit_law, succeed
 from lsoda_vine import small_campaign
 from test_pipeline import MODEL_HEADERS
 
@@ -42,8 +42,8 @@ def write_experiment(folder: Path, pairs: Iterable[tuple[Trial, Track]], angles_
 
 def fitted(experiment: Path, results: Path) -> dict:
     """What the stage of the model writes, once those before it have run."""
-    for stage in ("trials", "damping"):
-        succeed(stage, experiment, results, "--settings", '{"damping": {"resamples": 200}}')
+    succeed("trials", experiment, results)
+    fit_law(experiment, results, damping={"resamples": 200})
     fit_model(Job(read_experiment(experiment), results, run_settings({})))
     for name, header in MODEL_HEADERS.items():
         assert (results / name).read_text(encoding="utf-8").startswith(header)
@@ -127,7 +127,7 @@ def test_a_recording_along_another_axis_than_most_fails_with_its_remedy_and_ente
     for name, axis in axes.items():
         path = results.analysed(name)
         path.write_text(json.dumps(json.loads(path.read_text()) | {"axis": axis}))
-    succeed("damping", experiment, results.folder)
+    fit_law(experiment, results.folder)
     rows = pd.read_csv(results.folder / "trials.csv").set_index("trial")
     assert set(rows.index[rows["status"] == "failed"]) == failed
     assert all("column `axis`" in rows.loc[name, "reason"] for name in failed)

@@ -56,7 +56,7 @@ from vinetrack.narrative.diagnosis_text import (
 )
 from vinetrack.narrative.verdict_text import settled_rows, summary_facts
 from vinetrack.pipeline.stages import Job
-from vinetrack.pipeline.trials import model_of
+from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results.folder_layout import (
     Results,
@@ -78,10 +78,11 @@ log = logging.getLogger(__name__)
 
 
 def fit_and_diagnose(job: Job) -> list[str]:
-    """Fit the model in use, compare and audit it, and diagnose what it lacks."""
+    """Gather the trials, fit the damping law and the model in use, compare and audit it, and diagnose what it lacks."""
+    lines = fit_damping(job)
     job.say("fitting the model")
     diagnose_results(job, fit_model(job))
-    return [*comparison_lines(job.results), *diagnosis_lines(job.results)]
+    return [*lines, *comparison_lines(job.results), *diagnosis_lines(job.results)]
 
 
 def fit_model(job: Job) -> Fit | None:

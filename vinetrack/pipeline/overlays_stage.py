@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,13 +42,18 @@ FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a p
 
 
 def draw_overlays(job: Job) -> list[str]:
-    """Write the clips that the settings request; return a line for every clip that could not be made."""
+    """Write the clips that the settings request, and again those that there are; a line for each that could not be."""
     experiment, results, settings = job.experiment, Results(job.results), job.settings.overlays
-    results.overlays.mkdir(parents=True, exist_ok=True)
     chosen = chosen_trials(experiment, results, settings.of)
+    for path in results.overlays.glob("*.mp4"):  # of a trial that is not tracked any more
+        if path.stem not in chosen:
+            path.unlink()
     work = partial(_try_overlay, results=results, settings=settings)
-    messages = map_unordered(work, [experiment.trial(name) for name in chosen], job.threads)
-    return sorted(f"  {line}" for line in messages if line)
+    messages = []
+    for count, line in enumerate(map_unordered(work, [experiment.trial(name) for name in chosen], job.threads), 1):
+        messages += [f"  {line}"] if line else []
+        job.say(f"{count} of {len(chosen)} clips")
+    return sorted(messages)
 
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
@@ -67,16 +72,15 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
 
 
 def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
-    """Return the names of the trials to draw: the first tracked recording of every condition, all, or none."""
-    if of == "none":
-        return []
+    """Return the names of the trials to draw: the first tracked recording of every condition, all, or none; and those
+    whose clip is there already, which would show another model otherwise.
+    """
     trials = read_result(results.trials)
     tracked = set(trials.loc[~trials["status"].isin(("failed", "left_out")), "trial"])
     filmed = {trial.name: trial.condition for trial in experiment.trials if trial.video and trial.name in tracked}
-    if of == "all":
-        return list(filmed)
     first = {condition: name for name, condition in reversed(filmed.items())}
-    return [name for name, condition in filmed.items() if first[condition] == name]
+    wanted: dict[str, Collection[str]] = {"all": filmed.keys(), "one_per_condition": first.values(), "none": ()}
+    return [name for name in filmed if name in wanted[of] or results.overlay(name).exists()]
 
 
 def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> str:

@@ -21,7 +21,8 @@ from vinetrack.figures.registry import FigureTables, RegisteredFigure, campaign_
 from vinetrack.figures.style import blank, render
 from vinetrack.paper import motions
 from vinetrack.paper import rows as paper
-from vinetrack.pipeline.stages import Job
+from vinetrack.pipeline.overlays_stage import draw_overlays
+from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
 from vinetrack.report.build import (
     Clip,
@@ -39,26 +40,30 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from vinetrack.core.records import Trial
 
-# ------------------------------------------------------------------------------
-# Figures of a results folder: one per trial, and those of the whole experiment.
 
 log = logging.getLogger(__name__)
+
+# ------------------------------------------------------------------------------
+# Figures of the whole experiment.
 
 
 def draw_campaign(job: Job) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
-    results, tables = Results(job.results), FigureTables(job.results, job.experiment.trials)
-    drawn = []
-    for name in campaign_figures():
-        for form in ("png", "svg", "pdf"):
-            results.figure(name, f".{form}").unlink(missing_ok=True)
-        if picture := draw(name, tables):
-            _write(picture, partial(results.figure, name), job.settings.figures)
-            drawn.append(name)
-            log.info("drew %s", name)
-    write_json(results.figure_list, {"figures": drawn})
-    return [f"{len(drawn)} figures."]
+    job.say("drawing figures")
+    work = partial(_drawn, folder=job.results, trials=job.experiment.trials, settings=job.settings.figures)
+    return [f"{sum(map_unordered(work, list(campaign_figures()), job.threads))} figures."]
+
+
+def _drawn(name: str, folder: Path, trials: tuple[Trial, ...], settings: FigureSettings) -> bool:
+    """Draw a figure of the whole experiment; whether it has content."""
+    tables = FigureTables(folder, trials)
+    for form in ("png", "svg", "pdf"):
+        tables.results.figure(name, f".{form}").unlink(missing_ok=True)
+    if picture := draw(name, tables):
+        _write(picture, partial(tables.results.figure, name), settings)
+    return picture is not None
 
 
 def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
@@ -137,14 +142,17 @@ MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 
 
 def write_report(job: Job) -> list[str]:
-    """Write `provenance.json` and `report.html`."""
+    """Draw what the report shows, and write `provenance.json` and `report.html`."""
+    lines = [*draw_overlays(job), *draw_campaign(job)]
+    lines += compare_with_paper(job) if job.experiment.settings.published else []
+    job.say("writing the report")
     results = Results(job.results)
     settings = job.settings.model_dump(mode="json", exclude={"experiment", "results"})
     content = report_content(job.experiment, job.results, settings)
     page = build_report(content)
     write_json(results.provenance, dict(content.provenance))
     write_text(results.report, page)
-    return [f"Report: {results.report}"]
+    return [*lines, f"Report: {results.report}"]
 
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
@@ -154,8 +162,6 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
     inputs = [path for path in input_files(experiment) if path.exists() or path.name not in SHARED_FILES]
-    names = set(read_json(results.figure_list)["figures"])
-    drawings = [one for name, one in campaign_figures().items() if name in names]
     paper: list[ReportSection] = []
     if experiment.settings.published:
         figures = _figures(tables, figures_of("paper").values(), diagnosis)
@@ -170,7 +176,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         damping=read_json(results.damping),
         provenance=describe_run(experiment.folder, inputs, dict(settings), experiment.settings.model),
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
-        figures=_figures(tables, drawings, diagnosis),
+        figures=_figures(tables, campaign_figures().values(), diagnosis),
         trial_figures={name: picture for name in drawn if (picture := _picture(partial(results.trial_figure, name)))},
         recordings={
             name: TrackedRecording(

@@ -49,7 +49,6 @@ class Stage:
     writes: tuple[str, ...]
     done: str
     parallel: bool = False
-    priority: int = 0
 
     def run(self, job: Job) -> list[str]:
         """Do the job; return lines for the terminal."""
@@ -69,56 +68,23 @@ STAGES = {
         "trials analysed",
         parallel=True,
     ),
-    "damping": Stage(
-        "Gather the trials in the tables of the experiment, and fit the damping law and its scaling with size.",
-        "trials:fit_damping",
-        ("final_at_fraction", "efficiency_at_mm", "damping"),
-        ("<experiment>", "<analysed>"),
-        ("trials.csv", "conditions.csv", "steady.csv", "damping_points.csv", "damping.json", "scaling.json"),
-        "damping law fitted",
-    ),
     "model": Stage(
-        "Fit the model in use and compare it with the tracks, audit neglected effects, and diagnose what it lacks.",
+        "Fit the damping law and the model in use to all trials, audit neglected effects, and diagnose what it lacks.",
         "model_stage:fit_and_diagnose",
-        ("steady", "velocity", "damping", "final_at_fraction"),
-        ("<experiment>", "<tracks>", "<kinematics>", "trials.csv", "damping.json"),
-        ("fit.json", "comparison.csv", "model_check.csv", "audit.csv", "comparison/", "diagnosis.json", "ladder.csv",
-         "diagnosis/"),
+        ("steady", "velocity", "damping", "final_at_fraction", "efficiency_at_mm"),
+        ("<experiment>", "<tracks>", "<kinematics>", "<analysed>"),
+        ("trials.csv", "conditions.csv", "steady.csv", "damping_points.csv", "damping.json", "scaling.json", "fit.json",
+         "comparison.csv", "model_check.csv", "audit.csv", "comparison/", "diagnosis.json", "ladder.csv", "diagnosis/"),
         "model fitted and diagnosed",
-        priority=1,
-    ),
-    "figures": Stage(
-        "Draw the figures of the whole experiment.",
-        "report_stage:draw_campaign",
-        ("figures",),
-        ("<kinematics>", "trials.csv", "damping.json", "fit.json", "diagnosis.json", "diagnosis/"),
-        ("figures/campaign.json",),  # which figures have content is not known in advance
-        "figures of the experiment drawn",
-    ),
-    "paper": Stage(
-        "Compare with the published numbers and figures of the paper.",
-        "report_stage:compare_with_paper",
-        ("figures",),
-        ("<experiment>", "<kinematics>", "steady.csv", "damping.json", "fit.json"),
-        ("<paper>",),
-        "comparison with the paper made",
-    ),
-    "overlays": Stage(
-        "Write slowed-down clips of the recordings with tracked and modelled edges.",
-        "overlays_stage:draw_overlays",
-        ("overlays",),
-        ("<measurements>", "<tracks>", "<analysed>", "trials.csv", "fit.json", "diagnosis.json", "diagnosis/"),
-        ("overlays/",),
-        "clips drawn",
-        parallel=True,
     ),
     "report": Stage(
-        "Write the report, a single file, and the provenance of the results.",
+        "Draw the figures of the experiment and clips of its recordings, and write the report, a single file.",
         "report_stage:write_report",
         (),
-        ("<inputs>", "<pictures>", "figures/campaign.json", "<made of paper>", "<made of overlays>", "diagnosis.json"),
-        ("report.html", "provenance.json"),
+        ("<inputs>", "<tracks>", "<kinematics>", "<analysed>", "<pictures>", "<made of model>"),
+        ("<paper>", "report.html", "provenance.json"),  # which figures have content is not known in advance
         "report written",
+        parallel=True,
     ),
 }  # fmt: skip
 

@@ -209,17 +209,10 @@ class WorkflowPlan:
         return f"{code_hash()} {self.unwatched}"
 
     @property
-    def stages(self) -> dict[str, Stage]:
-        """The stages of this run: the comparison with the paper and clips only where they were asked for."""
-        clips = self.filmed and self.settings.overlays.of != "none"
-        wanted = {"paper": self.published, "overlays": clips}
-        return {name: stage for name, stage in STAGES.items() if wanted.get(name, True)}
-
-    @property
     def jobs(self) -> dict[str, tuple[str, Stage, Sequence[str]]]:
         """Jobs by name: name of the stage, stage, trials; many trials are shared out over several jobs."""
         jobs: dict[str, tuple[str, Stage, Sequence[str]]] = {}
-        for name, stage in self.stages.items():
+        for name, stage in STAGES.items():
             step = TRIALS_PER_JOB if name == "trials" else len(self.trials)
             parts = [self.trials[first : first + step] for first in range(0, len(self.trials), max(step, 1))] or [()]
             jobs |= {name if len(parts) == 1 else f"{name}_{k}": (name, stage, part) for k, part in enumerate(parts, 1)}
@@ -231,8 +224,7 @@ class WorkflowPlan:
         if not group.startswith("<"):
             return [self.result(group)]
         if group.startswith("<made of"):
-            stage = self.stages.get(group[9:-1])
-            return [path for part in stage.writes for path in self.files(part)] if stage else []
+            return [path for part in STAGES[group[9:-1]].writes for path in self.files(part)]
         per_trial = {"<tracks>": ".csv", "<kinematics>": ".csv", "<analysed>": ".json"}
         if group in per_trial:
             return [self.result(group[1:-1], f"{trial}{per_trial[group]}") for trial in trials]
@@ -240,6 +232,8 @@ class WorkflowPlan:
             filmed = [trial for trial in trials if trial in self.filmed]
             return [*self._figures("trial_", trials), *self._figures("strip_", filmed)]
         if group == "<paper>":
+            if not self.published:
+                return []
             return [*(self.result(f"{name}.csv") for name in PAPER_TABLES), *self._figures("", figures_of("paper"))]
         kinds = {"<experiment>": (True,), "<measurements>": (False,), "<inputs>": (True, False)}[group]
         return [path.as_posix() for path in self.inputs if _is_stated(path) in kinds]

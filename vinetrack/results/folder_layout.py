@@ -104,7 +104,6 @@ class Results:
     ladder = _File("ladder.csv")  # Errors of the initial model and of each later model
     final_fit = _File("diagnosis", "final_fit.json")  # The fit with all added effects; exists only if there are any
     overlays = _File("overlays")  # Folder of the clips
-    figure_list = _File("figures", "campaign.json")  # The figures of the whole experiment that were drawn
     provenance = _File("provenance.json")  # Versions, settings and hashes of all inputs
     report = _File("report.html")  # The report
 
