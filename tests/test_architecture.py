@@ -41,7 +41,7 @@ BUDGETS = {
     "narrative": (1877, 3, 12),
     "pages": (3362, 8, 24),
     "paper": (842, 3, 15),
-    "pipeline": (3102, 10, 14),
+    "pipeline": (3114, 10, 14),
     "planning": (2391, 5, 18),
     "report": (747, 2, 3),
     "results": (251, 2, 8),

@@ -21,12 +21,13 @@ from grown import sheet as sheet_command
 from hidden_truth import sheet
 
 import vinetrack
+from vinetrack.diagnosis import propose as proposing
 from vinetrack.diagnosis.propose import add, propose
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import catalogue, own_effects
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow, write_experiment
-from vinetrack.pipeline import effects_stage, model_stage
+from vinetrack.pipeline import model_stage
 from vinetrack.pipeline.workflow import command_for_results
 
 # The command line: exit codes, sentences, no tracebacks.
@@ -167,12 +168,12 @@ def test_a_law_is_written_beside_the_experiment_and_added(tmp_path, monkeypatch)
     diagnosis = json.loads((results / "diagnosis.json").read_text())
     assert diagnosis["verdict"] == "unexplained"
     proposals = []
-    monkeypatch.setattr(effects_stage, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
+    monkeypatch.setattr(proposing, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
     succeed("propose", results)
     path = experiment / "proposed_time.py"
     effect = own_effects([path])["proposed_time"]
     assert "4 trials of bench" in effect.text
-    monkeypatch.setattr(effects_stage, "propose", lambda *_: proposals[0])  # the same once more, without the search
+    monkeypatch.setattr(proposing, "propose", lambda *_: proposals[0])  # the same once more, without the search
     again = run("propose", results)
     assert again.exit_code == 1
     assert "exists already" in again.output

@@ -18,8 +18,8 @@ from plain_scene import Plan, plain_scene, write_video
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
-from vinetrack.pipeline.stages import Job, map_unordered
-from vinetrack.pipeline.trials import Kept, analyse_trials, packed, unpacked
+from vinetrack.pipeline.stages import Job, Kept, map_unordered, packed, unpacked
+from vinetrack.pipeline.trials import analyse_trials
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
 from vinetrack.video.track import Tracking, in_metres

@@ -329,7 +329,7 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
     """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines; NaN if there
     are fewer than eight trials (derived), or each vine has only one pressure.
     """
-    from scipy.stats import rankdata
+    from pandas import Series  # which is loaded already: scipy.stats takes a second
 
     ranks, _ = trial_order(trials)
     pairs: list[Floats] = []
@@ -337,7 +337,7 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
         members = [i for i, trial in enumerate(trials) if trial.vine == vine and math.isfinite(trial.pressure_Pa)]
         pressures = np.array([trials[i].pressure_Pa for i in members])
         if len(members) > 1 and np.ptp(pressures) > 0:
-            both = np.array([rankdata(ranks[members]), rankdata(pressures)])
+            both = np.array([Series(values).rank() for values in (ranks[members], pressures)])
             pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
     if sum(pair.shape[1] for pair in pairs) < 8:
         return math.nan

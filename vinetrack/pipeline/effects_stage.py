@@ -10,16 +10,10 @@ from typing import Any
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import TableError, safe_join, write_text
 from vinetrack.core.units import BASE_EFFECTS
-from vinetrack.diagnosis.propose import effect_text, propose, table_text
-from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.dynamics.model import check_needs, make_model
-from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
 from vinetrack.effects import Effect, EffectError, catalogue, explanation, find_effect, listing, own_effects, remember
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.figures.prediction_figures import draw_effect
-from vinetrack.figures.style import check_figure, write_figure
-from vinetrack.narrative.diagnosis_text import proposal_lines
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis
 
 
@@ -27,6 +21,10 @@ def describe_effects(
     name: str | None, experiment: Path | None, figure: Path | None
 ) -> tuple[list[str], list[dict[str, Any]]]:
     """List all effects, or explain one and draw it. Returns lines, and the same for a program."""
+    from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
+    from vinetrack.figures.prediction_figures import draw_effect
+    from vinetrack.figures.style import check_figure, write_figure
+
     own = {} if experiment is None else effects_of(experiment)
     if name is not None:
         effect = find_effect(name, own)
@@ -103,6 +101,10 @@ class WrittenProposal:
 
 def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> WrittenProposal:
     """Write the force law that explains a misfit which no effect of the catalogue explains, or else a learned table."""
+    from vinetrack.diagnosis.propose import effect_text, propose, table_text
+    from vinetrack.diagnosis.result import UNEXPLAINED
+    from vinetrack.narrative.diagnosis_text import proposal_lines
+
     results = Results(folder)
     diagnosis = read_diagnosis(results)
     if diagnosis is None:

@@ -6,17 +6,10 @@ A trial that fails writes its reason and never stops the others.
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import logging
-import os
-import time
 import traceback
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +17,7 @@ import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Track, Trial
-from vinetrack.core.tables import is_disk_full, write_bytes, write_csv, write_json
+from vinetrack.core.tables import is_disk_full, write_csv, write_json
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import load_effect
 from vinetrack.experiment.folder import Experiment
@@ -32,12 +25,11 @@ from vinetrack.experiment.settings import FigureSettings, RunSettings
 from vinetrack.figures.motion_figures import draw_trial_motion
 from vinetrack.figures.overlay import draw_strip
 from vinetrack.figures.registry import describe_trial
-from vinetrack.figures.style import blank, render
+from vinetrack.figures.style import blank
 from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends, mark_left_out
 from vinetrack.kinematics.summary import TrialError, TrialResult, condition_table, summarise_trial
 from vinetrack.narrative.diagnosis_text import damping_headline
-from vinetrack.pipeline.stages import Job, map_unordered
-from vinetrack.pipeline.workflow import code_hash
+from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.results.folder_layout import (
     COUNT_COLUMNS,
     KINEMATICS_COLUMNS,
@@ -54,128 +46,13 @@ from vinetrack.results.folder_layout import (
 )
 from vinetrack.tracks.importers import TrackError, load_track, with_pressure_trace
 from vinetrack.video.axis import askew_trials, slope_deg
-from vinetrack.video.curved_axis import axis_entry, axis_from_entry
+from vinetrack.video.curved_axis import axis_entry
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.point_quality import Ending
 from vinetrack.video.survey import Measurement, exposure_problems, measure_recording, size_problems, tracked_facts
-from vinetrack.video.track import Tracking
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
-
-
-# ------------------------------------------------------------------------------
-# What a run need not make twice: tracks in pixels and figures of trials, kept in the results by their inputs.
-#
-# Snakemake deletes the outputs of a job before it runs it again; what is kept lies beside them, in a folder that it
-# does not know. A file that is replaced, or another version of the program, has another key; what no run asks for in a
-# month is dropped.
-
-SCALARS = (
-    "blur_px", "exposure_frames", "tube_width_px", "tube_width_sigma_px", "seen_exposure_frames", "fast_px_per_frame",
-)  # fmt: skip
-
-
-def identity(path: Path) -> tuple[tuple[str, int, int], ...]:
-    """Name, size and time of modification of a file and of those that share its name, or of all files of a folder."""
-    files = path.rglob("*") if path.is_dir() else path.parent.glob(f"{path.stem}.*")
-    stats = [(file.name, file.stat()) for file in sorted({path, *files}) if file.is_file()]
-    return tuple((name, stat.st_size, stat.st_mtime_ns) for name, stat in stats)
-
-
-class Kept:
-    """The kept files of a results folder; `tracked` is the key of the last track that was asked for."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder / ".kept"
-        self.tracked = ""
-
-    def track(self, inputs: tuple[object, ...], make: Callable[[], Tracking]) -> Tracking:
-        """The tracking in pixels of a recording (the first input is its path), kept or made."""
-        film, *others = inputs
-        assert isinstance(film, Path)
-        libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2", "skimage")]
-        code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
-        self.tracked = _key(code, libraries, film.resolve(), identity(film), others)
-        path = self.folder / f"{self.tracked}.npz"
-        if not (data := _read(path)):
-            data = packed(make())
-            write_bytes(path, data)
-        return unpacked(data)
-
-    def figure(
-        self,
-        inputs: tuple[object, ...],
-        path: Callable[..., Path],
-        settings: FigureSettings,
-        draw: Callable[[], Figure],
-    ) -> None:
-        """Write a figure in every format, kept for these inputs or drawn; `path` gives the path for a suffix."""
-        key = _key(code_hash(), settings.dpi, inputs)
-        found: dict[str, bytes] = {form: _read(self.folder / f"{key}.{form}") for form in settings.formats}
-        if missing := [form for form, data in found.items() if not data]:
-            for form, data in render(draw(), missing, settings.dpi).items():
-                write_bytes(self.folder / f"{key}.{form}", data)
-                found[form] = data
-        for form, data in found.items():
-            write_bytes(path(suffix=f".{form}"), data)
-
-    def forget(self) -> None:
-        """Drop what no run has asked for in a long time."""
-        for path in self.folder.glob("*"):
-            if path.stat().st_mtime < time.time() - 30 * 86400:  # a month (chosen)
-                path.unlink(missing_ok=True)
-
-
-def _key(*inputs: object) -> str:
-    return hashlib.sha256(repr(inputs).encode()).hexdigest()[:32]
-
-
-def _read(path: Path) -> bytes:
-    """Content of a kept file, which counts as asked for now; empty where there is none."""
-    try:
-        os.utime(path, (time.time(), time.time()))
-        return path.read_bytes()
-    except FileNotFoundError:
-        return b""
-
-
-def packed(tracking: Tracking) -> bytes:
-    """A tracking in pixels as a file of arrays without pickled objects."""
-    track, ending = tracking.track, tracking.ending
-    text = {
-        **{name: getattr(tracking, name) for name in SCALARS},
-        "axis": axis_entry(tracking.axis) | {"width_px": tracking.axis.width_px},
-        "notes": track.notes,
-        "ending": vars(ending),
-        "shown": [frame for frame, _ in tracking.pictures],
-    }
-    file = io.BytesIO()
-    np.savez_compressed(
-        file, text=np.array(json.dumps(text)), time_s=track.time_s, edge_px=track.edge_px, flag=track.flag,
-        sigma_px=track.lead_position_sigma_m, systematic_px=np.asarray(track.lead_position_systematic_m),
-        kymograph=tracking.kymograph, shake_px=tracking.shake_px, strip_frames=tracking.strip_rows,
-        pictures=np.stack([picture for _, picture in tracking.pictures]),
-    )  # fmt: skip
-    return file.getvalue()
-
-
-def unpacked(data: bytes) -> Tracking:
-    """Read what `packed` wrote."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        text: dict[str, Any] = json.loads(str(arrays["text"]))
-        track = Track(
-            arrays["time_s"], np.full(len(arrays["time_s"]), np.nan), arrays["sigma_px"], arrays["flag"],
-            arrays["edge_px"], notes=tuple(text["notes"]), lead_position_systematic_m=arrays["systematic_px"],
-        )  # fmt: skip
-        ending = Ending(**text["ending"])
-        return Tracking(
-            track=track, axis=axis_from_entry(text["axis"]), kymograph=arrays["kymograph"],
-            pictures=tuple(zip(text["shown"], arrays["pictures"], strict=True)), shake_px=arrays["shake_px"],
-            strip_frames=arrays["strip_frames"], ending=replace(ending, remarks=tuple(ending.remarks)),
-            **{name: text[name] for name in SCALARS},
-        )  # fmt: skip
 
 
 log = logging.getLogger(__name__)

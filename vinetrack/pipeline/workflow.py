@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import hashlib
 import json
 import math
 import os
@@ -18,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,7 +24,7 @@ from vinetrack.core.problems import ExperimentError, Problem, UserError, format_
 from vinetrack.core.tables import is_readable, write_text
 from vinetrack.core.terminal import waiting
 from vinetrack.figures.registry import figures_of
-from vinetrack.pipeline.stages import COMPILING, STAGES, Stage
+from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -37,9 +35,6 @@ if TYPE_CHECKING:
 
 Say = Callable[[str], None]
 Made = TypeVar("Made")
-
-PACKAGE = Path(__file__).parents[1]
-
 
 # ------------------------------------------------------------------------------
 # The folders of a run: that of the experiment, and that of its results, which belong to one experiment only.
@@ -174,16 +169,6 @@ PAPER_TABLES = (
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 
 TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings of a job take a minute or a few)
-
-
-@lru_cache(maxsize=2)
-def code_hash(*rooms: str) -> str:
-    """Hash of the code of some rooms of the package, or of all of it."""
-    digest = hashlib.sha256()
-    for path in sorted(path for room in rooms or (".",) for path in (PACKAGE / room).rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -426,7 +411,6 @@ def run_paths(folder: Path, base: Path | None) -> RunPaths:
 def check_before_run(paths: RunPaths, say: Say) -> None:
     """Print the problems of an experiment before its run."""
     from vinetrack.experiment.folder import read_experiment
-    from vinetrack.pipeline.trials import Kept
 
     if find_ground_truth(paths.experiment, PACKAGE.parent):
         return  # The recordings of the demonstration do not exist yet: the run makes them.
