@@ -28,7 +28,9 @@ from vinetrack.figures.registry import diagnosis_figures, draw, with_final_model
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
+from vinetrack.narrative.verdict_text import verdict_sentence
 from vinetrack.pipeline import report_stage
+from vinetrack.pipeline.effects_stage import propose_effect
 from vinetrack.pipeline.model_stage import sheet_contradictions, with_contradictions
 from vinetrack.pipeline.predict_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
@@ -220,8 +222,8 @@ def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted
         assert ("air_drag added" in " ".join(chosen.heading)) == bool(added)
 
 
-# What recordings and speeds contradict in the sheet stands beside the verdict, for it passes for physics.
-def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tmp_path):
+# What recordings and speeds contradict in the sheet comes before the verdict, for it passes for physics.
+def test_psi_under_the_name_of_kpa_and_a_wrong_scale_come_before_the_verdict(tmp_path):
     size = {"diameter_m": 0.012, "thickness_m": 1e-4, "length_m": 0.14, "capture_fps": 1000}
     vine = Trial(name="a", pressure_Pa=30e3, yield_pressure_Pa=3e3, **size)
     # A track at the steady speed of F = B·ẋⁿ with the B that tubes of this size have.
@@ -245,7 +247,15 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tm
     assert list(seen) == ["diameter_mm", "pressure_kPa"]
     assert seen["diameter_mm"] == f"a: {narrow['reason']} (and 1 more trial)"
     assert "looks like psi, not kPa" in seen["pressure_kPa"]
-    assert set(seen.values()) <= set(with_contradictions(made, results, pairs).notes)
+    contradicted = with_contradictions(made, results, pairs)
+    assert contradicted.notes[:2] == tuple(seen.values())
+    for first in (str(contradicted).splitlines()[0], verdict_sentence(contradicted)):
+        assert "diameter_mm and pressure_kPa" in first
+        assert "reservoir" not in first
+    assert contradicted.explanation.endswith(made.explanation)
+    write_json(results.diagnosis, contradicted.to_json())
+    with pytest.raises(ResultsError, match="pressure_kPa"):
+        propose_effect(None, tmp_path, None, print)
 
 
 def test_a_figure_is_shown_from_the_files_there_are(tmp_path, monkeypatch):

@@ -464,7 +464,7 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
 
 def to_go_on(diagnosis: Diagnosis) -> str:
     """Return what to do next where no effect of the catalogue explains the trials; blank elsewhere."""
-    if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
+    if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict) or diagnosis.contradicted_columns:
         return ""
     if diagnosis.odd_trials:
         return ODD_MEANING
@@ -480,8 +480,8 @@ def verdict_line(diagnosis: Diagnosis) -> str:
 
 
 def _headline(diagnosis: Diagnosis) -> str:
-    if diagnosis.odd_trials:
-        return verdict_sentence(diagnosis).rstrip(".")
+    if diagnosis.odd_trials or diagnosis.contradicted_columns:
+        return verdict_sentence(diagnosis).rstrip(".").replace("The measurements", "the measurements")
     if diagnosis.verdict == MISSING:
         return joined(list(diagnosis.effects)) + (" is missing" if len(diagnosis.effects) == 1 else " are missing")
     if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:
@@ -578,12 +578,6 @@ def diagnosis_page(diagnosis: Diagnosis) -> str:
     rows = [(fact.question, fact.answer, fact.note) for fact in summary_facts(diagnosis, diagnosis.ladder)]
     title = f"{diagnosis.verdict or 'refused'}: {verdict_sentence(diagnosis)}"
     return html_table(("", "", ""), rows, title, [diagnosis.explanation])
-
-
-def contradicted_in_words(columns: Sequence[str]) -> str:
-    """Return the warning that measurements contradict the sheet in these columns."""
-    named = joined(columns)
-    return f"But the measurements contradict the sheet in {named}: correct that before relying on this verdict."
 
 
 def sentences_of(text: str) -> list[str]:

@@ -147,7 +147,9 @@ def listed_names(names: Sequence[str], last: str = "and") -> str:
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one sentence."""
+    """Return the verdict in one sentence; what contradicts the sheet in its place, since any verdict rests on it."""
+    if diagnosis.contradicted_columns:
+        return f"The measurements contradict the sheet in {joined(diagnosis.contradicted_columns)}: correct that first."
     verdict, answers = diagnosis.verdict, list(diagnosis.answer_set)
     added = list(diagnosis.effects)
     if verdict == MISSING:
@@ -170,6 +172,9 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
 
 def verdict_meaning(diagnosis: Diagnosis) -> str:
     """Return what the verdict means, and the verdict on the model with all added effects."""
+    if diagnosis.contradicted_columns:
+        told = " ".join(f"{str(note).rstrip('.')}." for note in diagnosis.notes[: len(diagnosis.contradicted_columns)])
+        return f"{told} With the sheet as it is, the verdict is {diagnosis.verdict}; correct the sheet and run again."
     if diagnosis.odd_trials:
         return ODD_MEANING
     meanings = {

@@ -274,6 +274,7 @@ class ProposalPanel:
         """Update after a change of the diagnosis, and as time passes."""
         diagnosis = self._page.diagnosis
         unexplained = diagnosis is not None and UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
+        unexplained &= diagnosis is not None and not diagnosis.contradicted_columns
         self.root.visible = self._job is not None or self._outcome is not None or unexplained
         if self._job is not None:
             passed_s = time.monotonic() - self._begun_s

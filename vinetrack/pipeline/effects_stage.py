@@ -104,11 +104,14 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     from vinetrack.diagnosis.propose import effect_text, propose, table_text
     from vinetrack.diagnosis.result import UNEXPLAINED
     from vinetrack.narrative.diagnosis_text import proposal_lines
+    from vinetrack.narrative.verdict_text import verdict_sentence
 
     results = Results(folder)
     diagnosis = read_diagnosis(results)
     if diagnosis is None:
         raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
+    if diagnosis.contradicted_columns:
+        raise ResultsError(f"{folder}: {verdict_sentence(diagnosis)}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         raise ResultsError(
             f"{folder}: its verdict is `{diagnosis.final_verdict}`. A new law is proposed only for a misfit that no"

@@ -48,13 +48,12 @@ from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 from vinetrack.narrative.diagnosis_text import (
     added_in_words,
-    contradicted_in_words,
     power_brief,
     sentences_of,
     to_go_on,
     verdict_line,
 )
-from vinetrack.narrative.verdict_text import settled_rows, summary_facts
+from vinetrack.narrative.verdict_text import settled_rows, summary_facts, verdict_meaning
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
@@ -229,12 +228,9 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
     contradictions = sheet_contradictions(results, pairs)
     if not contradictions:
         return diagnosis
-    return replace(
-        diagnosis,
-        explanation=f"{diagnosis.explanation} {contradicted_in_words(tuple(contradictions))}",
-        contradicted_columns=tuple(contradictions),
-        notes=(*diagnosis.notes, *contradictions.values()),
-    )
+    notes = (*contradictions.values(), *diagnosis.notes)
+    contradicted = replace(diagnosis, contradicted_columns=tuple(contradictions), notes=notes)
+    return replace(contradicted, explanation=f"{verdict_meaning(contradicted)} {diagnosis.explanation}")
 
 
 def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
@@ -339,16 +335,15 @@ def diagnosis_lines(folder: Path, brief: bool = False) -> list[str]:
     if not diagnosis.verdict:
         return [diagnosis.explanation]
     power = power_brief(diagnosis.power) if diagnosis.power is not None else ""
-    columns = diagnosis.contradicted_columns
-    warning = f" {contradicted_in_words(columns)}" if columns else ""
     sizes = [fact.answer for fact in summary_facts(diagnosis, None) if fact.code in ("significance", "size")]
-    headline = verdict_line(diagnosis) + (f" ({'; '.join(sizes)})" if sizes else "")
-    reasons, notes = sentences_of(diagnosis.explanation.removesuffix(warning)), diagnosis.notes
+    told = sizes and not diagnosis.contradicted_columns
+    headline = verdict_line(diagnosis) + (f" ({'; '.join(sizes)})" if told else "")
+    reasons, notes = sentences_of(diagnosis.explanation), diagnosis.notes
     if brief:
         more = [f"… {len(reasons) - 2} more reasons in the report"] if len(reasons) > 2 else []
         reasons, notes, power = [*reasons[:2], *more], notes[:1], ""
     return [
-        f"{headline}.{warning}" if columns else headline,
+        headline,
         *(f"  {line}" for line in reasons),
         *([f"{power[0].upper()}{power[1:]}"] if power and power not in headline else []),
         *_damping_line(diagnosis),

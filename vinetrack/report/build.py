@@ -175,7 +175,7 @@ def diagnosis_section(content: ReportContent) -> dict[str, Any] | None:
     if diagnosis is None:
         return None
     drifting = [str(row["sentence"]) for row in diagnosis.drift if row.get("sentence") and row.get("significant", True)]
-    rounds, named = [], diagnosis.effects or diagnosis.answer_set
+    rounds, named = [], () if diagnosis.contradicted_columns else diagnosis.effects or diagnosis.answer_set
     for entry in diagnosis.rounds:
         untestable = [row for row in entry.ranking if row.status == NOT_TESTABLE]
         blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
