@@ -10,7 +10,7 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from vinetrack.core.records import Trial
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
-from vinetrack.diagnosis.power import Rate, SimulatedRates
+from vinetrack.diagnosis.power import SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.score_test import testable
 from vinetrack.dynamics.model import Model, host_for
@@ -114,30 +114,14 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark
 # Simulated campaigns of a design, diagnosed in full as measured ones are: a check on linear theory.
 
 
-@dataclass(frozen=True)
-class SimulatedDiagnosis:
-    """Result of the diagnosis of one simulated campaign; `failed` is the reason why there is no verdict."""
+class SimulatedDiagnosis(NamedTuple):
+    """What the diagnosis of one simulated campaign named, blank for nothing; whether the effect was among it or was
+    added later; and the reason why there is no verdict.
+    """
 
-    effect: str
-    verdict: str = ""
-    answer_set: tuple[str, ...] = ()
-    effects: tuple[str, ...] = ()
+    named: str = ""
+    found: bool = False
     failed: str = ""
-
-    @property
-    def alarm(self) -> bool:
-        """Whether anything was called missing or a fault of the measurement."""
-        return bool(self.verdict) and self.verdict != ADEQUATE
-
-    @property
-    def is_found(self) -> bool:
-        """Whether the effect is in the answer set, or was added later."""
-        return self.alarm and self.effect in (*self.answer_set, *self.effects)
-
-    @property
-    def named(self) -> str:
-        """What was named: the members of the answer set, else the verdict."""
-        return " or ".join(self.answer_set) or self.verdict
 
 
 def simulated_diagnosis(design: CampaignDesign, effect: str, values: Sequence[float], seed: int) -> SimulatedDiagnosis:
@@ -158,20 +142,24 @@ def simulated_diagnosis(design: CampaignDesign, effect: str, values: Sequence[fl
                 user_effects=design.model.user_effects,
             )  # fmt: skip
     except (FitError, SimulationError, EffectError, np.linalg.LinAlgError) as error:
-        return SimulatedDiagnosis(effect, failed=f"{type(error).__name__}: {error}")
-    return SimulatedDiagnosis(effect, diagnosis.verdict, diagnosis.answer_set, diagnosis.effects)
+        return SimulatedDiagnosis(failed=f"{type(error).__name__}: {error}")
+    if diagnosis.verdict == ADEQUATE:
+        return SimulatedDiagnosis()
+    named = " or ".join(diagnosis.answer_set) or diagnosis.verdict
+    return SimulatedDiagnosis(named, effect in (*diagnosis.answer_set, *diagnosis.effects))
 
 
-def rates_of(diagnoses: Sequence[SimulatedDiagnosis], value: float, promised: float) -> SimulatedRates:
-    """Count the outcomes of campaigns with the same effect, of this size."""
-    completed = [diagnosis for diagnosis in diagnoses if not diagnosis.failed]
-    named = Counter(diagnosis.named for diagnosis in completed if diagnosis.alarm)
+def rates_of(effect: str, diagnoses: Sequence[SimulatedDiagnosis], value: float, promised: float) -> SimulatedRates:
+    """Count the outcomes of campaigns with one effect, of this size; with none where it is blank."""
+    named = Counter(diagnosis.named for diagnosis in diagnoses if diagnosis.named)
+    failed = sum(bool(diagnosis.failed) for diagnosis in diagnoses)
     return SimulatedRates(
-        effect=diagnoses[0].effect,
+        effect=effect,
         value=value,
         promised=promised,
-        alarms=Rate(sum(diagnosis.alarm for diagnosis in completed), len(completed)),
-        detections=Rate(sum(diagnosis.is_found for diagnosis in completed), len(completed)),
+        alarms=named.total(),
+        count=sum(diagnosis.found for diagnosis in diagnoses) if effect else named.total(),
+        campaigns=len(diagnoses) - failed,
         named=tuple(named.most_common()),
-        failed=len(diagnoses) - len(completed),
+        failed=failed,
     )

@@ -39,19 +39,20 @@ from vinetrack.planning.discriminating_design import (
     OTHER_RIG,
     SAME_RIG,
     Condition,
+    Hypothesis,
     RefitTerms,
     best_design,
     best_new_vines,
     conditions_by_effort,
+    exchanged,
     extend,
     feasible_conditions,
     growth_courses,
     refit_terms,
-    sampling_of,
     worth,
 )
 from vinetrack.planning.predictive_inputs import prior_ratio
-from vinetrack.planning.simulated_campaigns import DesignProblem, simulated_rises
+from vinetrack.planning.simulated_campaigns import simulated_rises
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
@@ -63,9 +64,6 @@ from vinetrack.planning.simulated_campaigns import DesignProblem, simulated_rise
 # separation is predicted by refitting simulated trials; as a check, the trials are simulated again with the true
 # parameters and all noise drawn anew. Where no trials help, or only measurements are in question, the advice is what to
 # measure instead.
-
-# Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended (chosen)
-SUFFICIENT_SEPARATION = 8.0
 
 NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
 
@@ -82,7 +80,6 @@ class NextExperiment:
     separation_sigma: Mapping[str, float] = field(default_factory=dict)
     if_true_sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     simulated_sigma: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    alternatives: tuple[Mapping[str, Any], ...] = ()
     measurement: Remark = field(default_factory=Remark)
 
     @property
@@ -98,7 +95,6 @@ class NextExperiment:
             "separation_sigma": self.separation_sigma,
             "if_true_sigma": self.if_true_sigma,
             "simulated_sigma": {pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()},
-            "alternatives": self.alternatives,
             "calibration": str(self.measurement) or None,
         }
 
@@ -107,7 +103,7 @@ class NextExperiment:
 class _Option:
     """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `simulated_rises`."""
 
-    design: tuple[int, ...]
+    design: Sequence[int]
     rises: Floats
 
     @property
@@ -117,12 +113,16 @@ class _Option:
         return np.asarray(np.sqrt(np.maximum(np.nansum(self.rises, axis=0) / count, 0.0)))
 
     @property
-    def worth(self) -> float:
-        return float(worth(self.separations[None])[0])
+    def by_pair(self) -> dict[tuple[int, int], float]:
+        """The smaller separation of the two directions, by pair."""
+        pairs = itertools.combinations(range(len(self.separations)), 2)
+        return {(a, b): float(min(self.separations[a, b], self.separations[b, a])) for a, b in pairs}
 
     @property
-    def weakest(self) -> float:
-        return min(_by_pair(self.separations).values())
+    def is_sufficient(self) -> bool:
+        # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
+        # recommended (chosen)
+        return min(self.by_pair.values()) >= 8.0
 
 
 @in_one_blas_thread
@@ -135,18 +135,21 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
         raise FitError("The fits to separate are not of the same trials: fit all hypotheses to the same trials.")
     # 5: most hypotheses that a design separates (chosen)
     tied = list(tied)[:5]
-    names = _hypothesis_names(tied)
-    measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
+    # Each is named by the effects that not all of them have, numbered where that is ambiguous.
     common = set.intersection(*(set(fit.model.names) for fit in tied))
+    names = [" + ".join(name for name in fit.model.names if name not in common) or NO_FURTHER_EFFECT for fit in tied]
+    names = [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
+    measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
     differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
     if differ and all(effect.kind == "measurement" for effect in differ):
         faults = [name for name in names if name != NO_FURTHER_EFFECT]
         return NextExperiment(remark("measure_first", faults=faults, measurement=measurement), measurement=measurement)
-    bench, terms = _feasible_trials(tied, names, limits)
-    options = _options(bench, terms, limits, seed)
-    if not options:
+    terms = _feasible_trials(tied, names, limits)
+    if not terms:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
-    return _recommendation(bench, options, seed)
+    return _recommendation(
+        [of_hypothesis.hypothesis for of_hypothesis in terms], _best_option(terms, limits, seed), seed
+    )
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -170,132 +173,88 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
     return Remark("deciding_measurements", {**facts, "faults_only": bool(measured)})
 
 
-def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
-    """Each hypothesis named by the effects that not all of them have, numbered where that is ambiguous."""
-    common = set.intersection(*(set(fit.model.names) for fit in tied))
-    names = [" + ".join(name for name in fit.model.names if name not in common) or NO_FURTHER_EFFECT for fit in tied]
-    return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
-
-
-def _feasible_trials(
-    tied: Sequence[Fit], names: Sequence[str], limits: Limits
-) -> tuple[DesignProblem, list[RefitTerms]]:
-    """The hypotheses and conditions that can be simulated, and the quadratic forms of −2 ln L of a trial of each."""
-    data = tied[0].predictor.data
-    feasible = feasible_conditions([trial_data.trial for trial_data in data], limits)
-    if not feasible:
-        return DesignProblem((), (), ()), []
-    cameras = [sampling_of(data, condition.like) for condition in feasible]
-    runs = growth_courses(
-        [extend(fit, name, feasible) for fit, name in zip(tied, names, strict=True)], feasible, cameras
-    )
-    usable = [
-        (condition, camera, run)
-        for condition, camera, run in zip(feasible, cameras, runs, strict=True)
-        if run is not None
-    ]
+def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[RefitTerms]:
+    """The quadratic forms of −2 ln L of all hypotheses with the conditions that can be filmed; none without any."""
+    conditions = feasible_conditions([trial_data.trial for trial_data in tied[0].predictor.data], limits)
+    if not conditions:
+        return []
+    courses = growth_courses([extend(fit, name, conditions) for fit, name in zip(tied, names, strict=True)])
+    usable = [(condition, course) for condition, course in zip(conditions, courses, strict=True) if course is not None]
     if not usable:
-        return DesignProblem((), (), ()), []
-    chosen, samplings, courses = (list(column) for column in zip(*usable, strict=True))
+        return []
+    chosen = [condition for condition, _ in usable]
     hypotheses = [extend(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
     try:
-        return DesignProblem(hypotheses, chosen, samplings), refit_terms(hypotheses, chosen, samplings, courses)
+        return refit_terms(hypotheses, [course for _, course in usable])
     except SimulationError as error:
         raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
 
 
-def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
-    """The best set of trials for each level of effort that gains over the lower ones, with its expected separation. One
-    level beyond a sufficient one is computed as well, for comparison.
-    """
+def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> _Option:
+    """The best set of trials of the least effort that is sufficient, else of all, with its expected separation."""
+    hypotheses = [of_hypothesis.hypothesis for of_hypothesis in terms]
     options: list[_Option] = []
     before = -math.inf
 
     def best_vines(places: NDArray[np.intp]) -> list[str]:
         # 2: new vines that are tried, at most (chosen)
-        return best_new_vines(terms, bench.conditions, places, limits.trials, 2 if len(terms) == 2 else 1)
+        return best_new_vines(terms, places, limits.trials, 2 if len(terms) == 2 else 1)
 
-    for _, allowed in conditions_by_effort(bench.conditions, best_vines):
-        if any(option.weakest >= SUFFICIENT_SEPARATION for option in options[:-1]):
-            break
+    for _, allowed in conditions_by_effort(hypotheses[0].conditions, best_vines):
         design, predicted = best_design(terms, allowed, limits.trials)
         # 1.01: factor by which the worth of a design must exceed that with less effort for it to be
         # considered (chosen)
         if predicted > 1.01 * before:
             before = predicted
-            options.append(_Option(tuple(design.tolist()), simulated_rises(bench, design.tolist(), [0], seed)))
-    return options
+            options.append(_Option(design, simulated_rises(hypotheses, design, [0], seed)))
+            if options[-1].is_sufficient:
+                return options[-1]
+    return max(options, key=lambda option: float(worth(option.separations[None])[0]))
 
 
-def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
-    """The smaller separation of the two directions, by pair."""
-    return {
-        (a, b): float(min(separations[a, b], separations[b, a]))
-        for a, b in itertools.combinations(range(len(separations)), 2)
-    }
-
-
-def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int) -> NextExperiment:
+def _recommendation(hypotheses: Sequence[Hypothesis], best: _Option, seed: int) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    # The option of least effort that is sufficient, else the best.
-    sufficient = (option for option in options if option.weakest >= SUFFICIENT_SEPARATION)
-    best = next(sufficient, None) or max(options, key=lambda option: option.worth)
-    best = _Option(best.design, np.concatenate([best.rises, simulated_rises(bench, best.design, [1], seed)]))
-    names = [hypothesis.name for hypothesis in bench.hypotheses]
-    expected_sigma = _by_pair(best.separations)
-    worth_it = max(expected_sigma.values()) >= least_separation
+    best = _Option(best.design, np.concatenate([best.rises, simulated_rises(hypotheses, best.design, [1], seed)]))
+    expected = best.by_pair
+    names = [hypothesis.name for hypothesis in hypotheses]
+    pair_names = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
+    worth_it = max(expected.values()) >= least_separation
     # Draws of the check by number of hypotheses, otherwise one; one less beyond 20 standard deviations (chosen)
-    draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected_sigma.values()) > 20.0), 1)
+    draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected.values()) > 20.0), 1)
     simulated = {}
     if worth_it:
-        simulated = _simulated_separations(simulated_rises(bench, best.design, range(draws), seed, thorough=True))
+        simulated = _simulated_separations(simulated_rises(hypotheses, best.design, range(draws), seed, thorough=True))
     unresolved = [
-        pair
-        for pair, sigma in expected_sigma.items()
-        if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
+        pair for pair, sigma in expected.items() if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
     ]
-    worth_it = worth_it and len(unresolved) < len(expected_sigma)
-    fits = [hypothesis.fit for hypothesis in bench.hypotheses]
-    pairs = [(fits[a], fits[b]) for a, b in unresolved or _separable_by_measurement(fits)]
-    measurement = _deciding_measurements(pairs)
-    sigmas = {_pair_name(names, pair): sigma for pair, sigma in expected_sigma.items()}
-    simulated_by_name = {_pair_name(names, pair): mean_and_sd for pair, mean_and_sd in simulated.items()}
-    trials = trial_entries(bench.conditions, best.design)
+    worth_it = worth_it and len(unresolved) < len(expected)
+    fits = [hypothesis.fit for hypothesis in hypotheses]
+    # Where all pairs are resolved: those that a measurement would decide as well, with an effect of it in only one.
+    kinds = [{effect.kind for effect in fit.model} for fit in fits]
+    pairs = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
+    measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in pairs])
+    trials = trial_entries(hypotheses[0].conditions, best.design)
     if_true = {
-        _pair_name(names, (a, b)): {names[a]: float(best.separations[a, b]), names[b]: float(best.separations[b, a])}
-        for a, b in expected_sigma
+        pair: {names[a]: float(best.separations[a, b]), names[b]: float(best.separations[b, a])}
+        for (a, b), pair in pair_names.items()
     }
+    simulated_by_name = {pair_names[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()}
     return NextExperiment(
         advice=remark(
             "trials_to_make" if worth_it else "no_trials_separate",
             trials=trials,
             if_true=if_true,
             simulated=simulated_by_name,
-            unresolved=[_pair_name(names, pair) for pair in unresolved],
+            unresolved=[pair_names[pair] for pair in unresolved],
             measurement=measurement,
             least_sigma=least_separation,
         ),
         trials=trials if worth_it else (),
-        separation_sigma=sigmas,
+        separation_sigma={pair_names[pair]: sigma for pair, sigma in expected.items()},
         if_true_sigma=if_true,
         simulated_sigma=simulated_by_name,
-        alternatives=tuple(
-            {
-                "trials": [dict(entry) for entry in trial_entries(bench.conditions, option.design)],
-                "separation_sigma": {_pair_name(names, p): s for p, s in _by_pair(option.separations).items()},
-            }
-            for option in sorted(options, key=lambda ranked: -ranked.worth)
-            if option.design != best.design
-        ),
         measurement=measurement,
     )
-
-
-def _separable_by_measurement(fits: Sequence[Fit]) -> list[tuple[int, int]]:
-    """Pairs that a measurement would decide as well as trials: those with a measurement effect in only one of them."""
-    kinds = [{effect.kind for effect in fit.model} for fit in fits]
-    pairs = itertools.combinations(range(len(fits)), 2)
-    return [(a, b) for a, b in pairs if "measurement" in kinds[a] ^ kinds[b]]
 
 
 def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
@@ -309,10 +268,6 @@ def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, 
             least = min(directions, key=lambda draws: float(np.mean(draws)))
             simulated[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
     return simulated
-
-
-def _pair_name(names: Sequence[str], pair: tuple[int, int]) -> str:
-    return f"{names[pair[0]]} | {names[pair[1]]}"
 
 
 def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
@@ -349,8 +304,6 @@ REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
 UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
 
-Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products, shape
-
 
 class DesignInformation:
     """Information of designs about the sizes of some effects with everything else free. `conditions` are those that can
@@ -384,25 +337,6 @@ class DesignInformation:
         cross = totals[:, :-count, -count:]
         solved = np.linalg.solve(totals[:, :-count, :-count], cross)
         return np.asarray(totals[:, -count:, -count:] - np.swapaxes(cross, 1, 2) @ solved)
-
-    def exchanged(self, chosen: Sequence[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
-        """The same number of groups, each exchanged for a better one until none gains."""
-        chosen = list(chosen)
-        now = float(worth(self.total(chosen)[None])[0])
-        # 3, 1.002: most passes of the exchange, and the ratio of worth from which a trial is exchanged (chosen)
-        for _ in range(3):
-            before = now
-            for k in range(len(chosen)):
-                others = worth(self.total(chosen[:k] + chosen[k + 1 :]) + self.each[allowed])
-                if np.max(others) > 1.002 * now:
-                    chosen[k], now = int(allowed[int(np.argmax(others))]), float(np.max(others))
-            if now <= before:
-                break
-        return chosen
-
-    def first_information(self, totals: Floats) -> Floats:
-        """Information about the first effect alone, shape (n_designs,)."""
-        return np.asarray(np.maximum(self.information_of(totals)[:, 0, 0], 0.0))
 
 
 def tests_with_conditions(
@@ -513,28 +447,30 @@ def further_trials(
 class _Search(DesignInformation):
     """The smallest design that has the wanted information about one effect."""
 
+    def first_information(self, totals: Floats) -> Floats:
+        """Information about the first effect alone, shape (n_designs,)."""
+        return np.asarray(np.maximum(self.information_of(totals)[:, 0, 0], 0.0))
+
     def information(self, chosen: Sequence[int]) -> float:
         """Information about the size from these trials and those so far."""
         return float(self.first_information(self.total(chosen)[None])[0])
 
     def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
         """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
+
+        def cost(chosen: Sequence[int]) -> tuple[float, float]:
+            information = self.information(chosen)
+            return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
+
         options: dict[str, list[int]] = {}
         effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
         for effort, allowed in conditions_by_effort(self.conditions, self._best_new_vines):
             words, chosen = effort_words[effort], self._design(allowed, wanted, most)
-            options[words] = min(options.get(words, chosen), chosen, key=lambda design: self._cost(design, wanted))
-        if not options:
-            return [], {}
-        words = min(options, key=lambda name: self._cost(options[name], wanted))
+            options[words] = min(options.get(words, chosen), chosen, key=cost)
         reached = {
-            name: REPLICATES * len(chosen) for name, chosen in options.items() if self.information(chosen) >= wanted
+            words: REPLICATES * len(chosen) for words, chosen in options.items() if self.information(chosen) >= wanted
         }
-        return options[words], reached
-
-    def _cost(self, chosen: Sequence[int], wanted: float) -> tuple[float, float]:
-        information = self.information(chosen)
-        return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
+        return min(options.values(), key=cost, default=[]), reached
 
     def _best_new_vines(self, places: NDArray[np.intp]) -> list[str]:
         """The new vines with the largest information in unlimited trials of all their conditions."""
@@ -545,7 +481,16 @@ class _Search(DesignInformation):
         return [new[k] for k in np.argsort(-self.first_information(np.stack(unlimited)))[:2]]
 
     def _design(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
-        """Pairs added one by one up to the wanted information, exchanged, and removed where not needed."""
+        """Pairs added one by one up to the wanted information, exchanged, and removed where not needed; the most
+        informative first.
+        """
+
+        def improved(chosen: list[int]) -> list[int]:
+            def worth_with(others: list[int]) -> Floats:
+                return self.first_information(self.total(others) + self.each[allowed])
+
+            return exchanged(chosen, self.information(chosen), allowed, worth_with)[0]
+
         pairs_per_step = (1, 2)  # Pairs of one condition that are added at a time; the best gain a pair counts (chosen)
         chosen: list[int] = []
         information = self.information(())
@@ -560,22 +505,17 @@ class _Search(DesignInformation):
                 break
             chosen += [int(allowed[index])] * min(pairs_per_step[step], most - len(chosen))
             information = self.information(chosen)
-        chosen = self.exchanged(chosen, allowed, self.first_information)
+        chosen = improved(chosen)
         while len(chosen) > 1:
             least = int(np.argmax(self.first_information(self.total(chosen) - self.each[chosen])))
-            fewer = self.exchanged(chosen[:least] + chosen[least + 1 :], allowed, self.first_information)
+            fewer = improved(chosen[:least] + chosen[least + 1 :])
             if self.information(fewer) < wanted:
                 break
             chosen = fewer
-        return self._most_informative_first(chosen)
-
-    def _most_informative_first(self, chosen: Sequence[int]) -> list[int]:
-        """The same trials, in order of the information they add."""
-        remaining: list[int] = list(chosen)
         order: list[int] = []
-        while remaining:
-            gains = self.first_information(self.total(order) + self.each[remaining])
-            order.append(remaining.pop(int(np.argmax(gains))))
+        while chosen:
+            gains_of = self.first_information(self.total(order) + self.each[chosen])
+            order.append(chosen.pop(int(np.argmax(gains_of))))
         return order
 
 
@@ -643,43 +583,31 @@ def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | No
     feasible = feasible_conditions(design.trials, limits.model_copy(update={"new_vines": False}))
     if not feasible or not power.effects:
         return None
-    search = _InformativeTrialsSearch(design, feasible, power)
+    search = DesignInformation(design, feasible, [entry.effect for entry in power.effects])
     if not search.conditions or not search.effects:
         return None
-    chosen = search.best(max(limits.trials // REPLICATES, 1))
-    before, after = search.total(())[None], search.total(chosen)[None]
-    if not search.expected_discoveries(after)[0] > search.expected_discoveries(before)[0]:
+    largest = np.array([abs(power[name].largest - power[name].zero) for name in search.effects])
+
+    def expected_discoveries(totals: Floats) -> Floats:
+        """Expected numbers of effects that are detected, and that are told from all others, added up."""
+        information = np.stack(_alone_and_distinct(search.information_of(totals)))
+        scores = SIZES[:, None, None, None] * largest * np.sqrt(information)
+        return np.asarray(ndtr(scores - power.threshold).mean(axis=0).sum(axis=(0, 2)))
+
+    def worth_with(others: list[int]) -> Floats:
+        return expected_discoveries(search.total(others) + search.each)
+
+    every = np.arange(len(search.conditions))
+    chosen: list[int] = []
+    for _ in range(max(limits.trials // REPLICATES, 1)):
+        chosen.append(int(np.argmax(worth_with(chosen))))
+    chosen, best = exchanged(chosen, float(expected_discoveries(search.total(chosen)[None])[0]), every, worth_with)
+    if not best > expected_discoveries(search.total(())[None])[0]:
         return None
     groups = [k for k in chosen for _ in range(min(REPLICATES, limits.trials))]
     added = [search.conditions[k] for k in groups]
     then = power_of(tests_of_designs(design, added)(added), nonlinear=True)
     return InformativeTrials(trial_entries(search.conditions, groups), power, then)
-
-
-class _InformativeTrialsSearch(DesignInformation):
-    """The design that is worth most."""
-
-    def __init__(self, design: CampaignDesign, every: Sequence[Condition], power: Power) -> None:
-        super().__init__(design, every, [entry.effect for entry in power.effects])
-        self.largest = np.array([abs(power[name].largest - power[name].zero) for name in self.effects])
-        self.required = power.threshold
-
-    def expected_discoveries(self, totals: Floats) -> Floats:
-        """Expected numbers of effects that are detected, and that are told from all others, added up."""
-        alone, distinct = _alone_and_distinct(self.information_of(totals))
-        return self._expected(alone) + self._expected(distinct)
-
-    def _expected(self, information: Floats) -> Floats:
-        """Expected number of effects detected with this information about each, shape (n_designs,)."""
-        scores = SIZES[:, None, None] * self.largest * np.sqrt(information)
-        return np.asarray(ndtr(scores - self.required).mean(axis=0).sum(axis=1))
-
-    def best(self, count: int) -> list[int]:
-        """As many groups of trials, added one by one and exchanged."""
-        chosen: list[int] = []
-        for _ in range(count):
-            chosen.append(int(np.argmax(self.expected_discoveries(self.total(chosen) + self.each))))
-        return self.exchanged(chosen, np.arange(len(self.conditions)), self.expected_discoveries)
 
 
 def _alone_and_distinct(information: Floats) -> tuple[Floats, Floats]:

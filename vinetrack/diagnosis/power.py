@@ -108,22 +108,26 @@ class PowerInput:
 
 
 @dataclass(frozen=True)
-class Rate:
-    """How often something happened in simulated campaigns, with the exact binomial 95 % interval. Clopper & Pearson,
-    Biometrika 26, 404 (1934).
+class SimulatedRates:
+    """Outcomes of complete diagnoses of simulated campaigns with one effect; with none where `effect` is blank. `count`
+    of `campaigns` are those in which the effect was found (where nothing is missing: anything); `promised` is its
+    probability by linear theory (that of a false alarm); `named` counts what was named, most frequent first.
     """
 
+    effect: str
+    value: float
+    promised: float
     count: int
+    alarms: int
     campaigns: int
-
-    @property
-    def value(self) -> float:
-        """Observed rate; NaN where there is no campaign."""
-        return self.count / self.campaigns if self.campaigns else math.nan
+    named: tuple[tuple[str, int], ...]
+    failed: int
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Ends of the 95 % interval; 0 and 1 where there is no campaign."""
+        """Exact binomial 95 % interval of the rate; 0 and 1 where there is no campaign. Clopper & Pearson, Biometrika
+        26, 404 (1934).
+        """
         from scipy.stats import binomtest
 
         if not self.campaigns:
@@ -132,33 +136,16 @@ class Rate:
         exact = binomtest(self.count, self.campaigns).proportion_ci(0.95, method="exact")
         return float(exact.low), float(exact.high)
 
-
-@dataclass(frozen=True)
-class SimulatedRates:
-    """Outcomes of complete diagnoses of simulated campaigns with one effect; with none where `effect` is blank.
-    `detections` counts those in which the effect was found; `promised` is its probability by linear theory (that of a
-    false alarm, where nothing is missing); `named` counts what was named, most frequent first.
-    """
-
-    effect: str
-    value: float
-    promised: float
-    alarms: Rate
-    detections: Rate
-    named: tuple[tuple[str, int], ...]
-    failed: int
-
     def to_json(self) -> dict[str, object]:
         """As an entry of `simulated`."""
-        counted = self.detections if self.effect else self.alarms
         return {
             "effect": self.effect,
             "value": None if math.isnan(self.value) else self.value,
             "promised": self.promised,
-            "rate": counted.value,
-            "interval_95": list(counted.interval),
-            "campaigns": counted.campaigns,
-            "alarms": self.alarms.count,
+            "rate": self.count / self.campaigns if self.campaigns else math.nan,
+            "interval_95": list(self.interval),
+            "campaigns": self.campaigns,
+            "alarms": self.alarms,
             "named": dict(self.named),
             "failed": self.failed,
         }

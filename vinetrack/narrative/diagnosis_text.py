@@ -223,9 +223,8 @@ def simulated_lines(power: Power) -> list[str]:
     """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory."""
     lines = []
     for rates in power.simulated:
-        counted = rates.detections if rates.effect else rates.alarms
-        low, high = map(percent, counted.interval)
-        rate = f"{counted.count} of {counted.campaigns} ({low} to {high} with 95 % confidence)"
+        low, high = map(percent, rates.interval)
+        rate = f"{rates.count} of {rates.campaigns} ({low} to {high} with 95 % confidence)"
         if rates.effect:
             entry = power[rates.effect]
             size = f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}"

@@ -28,7 +28,7 @@ from vinetrack.diagnosis.campaign_power import (
 from vinetrack.diagnosis.further_trials import exploratory_trials, further_trials
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
+from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS
@@ -70,27 +70,27 @@ class PowerRequest:
     recommend: bool = False
     experiment: Path | None = None
 
-    def assumptions(
-        self, noise: tuple[float, float], spreads: Sequence[float], otherwise: tuple[str, str]
-    ) -> tuple[tuple[float, float], tuple[float, float], list[PowerInput]]:
-        """Noise of a position, m, with its correlation, and standard deviations between trials of pressure and B: as
-        stated, else those given, which have the origins `otherwise`. Returns noise, spreads, and both in words.
-        """
-        pairs, origins = [], []
-        for stated, other, origin in (
-            ((self.noise_mm / 1e3, self.noise_correlation), noise, otherwise[0]),
-            ((self.spread_P, self.spread_B), spreads, otherwise[1]),
-        ):
-            first, second = np.where(np.isnan(stated), other, stated).tolist()
-            pairs.append((first, second))
-            origins.append(origin if np.isnan(stated).all() else "stated")
-        (noise_m, correlation), (pressure, damping) = pairs
-        words = (
-            ("noise of a position", f"{1e3 * noise_m:.3g} mm, correlation {correlation:.2f}", origins[0]),
-            ("spread of pressure from trial to trial", f"{100 * pressure:.2g} %", origins[1]),
-            ("spread of B from trial to trial", f"{100 * damping:.2g} %", origins[1]),
-        )
-        return pairs[0], pairs[1], [PowerInput(*row) for row in words]
+
+def _assumptions(
+    request: PowerRequest, noise: tuple[float, float], spreads: Sequence[float], otherwise: tuple[str, str]
+) -> tuple[tuple[float, float], tuple[float, float], list[PowerInput]]:
+    """Noise of a position, m, with its correlation, and standard deviations between trials of pressure and B: as
+    stated, else those given, which have the origins `otherwise`. Returns noise, spreads, and both in words.
+    """
+    noise_stated = np.array([request.noise_mm / 1e3, request.noise_correlation])
+    spreads_stated = np.array([request.spread_P, request.spread_B])
+    noise_m, correlation = np.where(np.isnan(noise_stated), noise, noise_stated).tolist()
+    pressure, damping = np.where(np.isnan(spreads_stated), spreads, spreads_stated).tolist()
+    of_noise, of_spreads = (
+        origin if np.isnan(stated).all() else "stated"
+        for origin, stated in zip(otherwise, (noise_stated, spreads_stated), strict=True)
+    )
+    words = [
+        PowerInput("noise of a position", f"{1e3 * noise_m:.3g} mm, correlation {correlation:.2f}", of_noise),
+        PowerInput("spread of pressure from trial to trial", f"{100 * pressure:.2g} %", of_spreads),
+        PowerInput("spread of B from trial to trial", f"{100 * damping:.2g} %", of_spreads),
+    ]
+    return (noise_m, correlation), (pressure, damping), words
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,8 @@ def _measured_campaign(
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
     fitted = fit(model, pairs, host=host, profile=False, thorough=False)
-    noise, spreads, inputs = request.assumptions(
-        (fitted.noise_m, fitted.noise_correlation), fitted.state.spread, ("fit", "fit")
+    noise, spreads, inputs = _assumptions(
+        request, (fitted.noise_m, fitted.noise_correlation), fitted.state.spread, ("fit", "fit")
     )
     noise_stated, spreads_stated = (row.origin == "stated" for row in inputs[:2])
     if noise_stated or spreads_stated:
@@ -152,8 +152,8 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     vines = dict.fromkeys(trial.vine for trial in planned.trials)
     by_vine = {vine: predictive_inputs(first_of_vine[vine], stated) for vine in vines}
     first = next(iter(by_vine.values()))
-    noise, spreads, inputs = request.assumptions(
-        (default_noise_m, 0.0), first.spreads, ("guess", "guess: a usual batch of vines")
+    noise, spreads, inputs = _assumptions(
+        request, (default_noise_m, 0.0), first.spreads, ("guess", "guess: a usual batch of vines")
     )
     systematic_m, systematic_origin = _planned_systematic(request, planned)
     trials, cameras = [], []
@@ -203,39 +203,46 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
             campaign = PowerCampaign(power_of(tests, not_testable, nonlinear=True), design_of_fit(given))
         else:
             campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
-    names = [text.partition("=")[0] for text in request.effects]
+    asked = [_asked(text, campaign.power) for text in request.effects]
     power = campaign.power
-    for name in names:
-        if name not in power.not_testable and name not in {entry.effect for entry in power.effects}:
-            candidates = [*(entry.effect for entry in power.effects), *power.not_testable]
-            close = difflib.get_close_matches(name, candidates, 1, 0.6)
-            remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(sorted(candidates))}"
-            in_model = name in power.model
-            message = "is in the model already" if in_model else "is not a candidate for these trials"
-            raise _refusal(message, name, remedy)
     if request.simulate:
-        power = replace(power, simulated=tuple(_simulated_rates(request, campaign)))
+        power = replace(power, simulated=tuple(_simulated_rates(request, campaign, asked)))
     if request.recommend:
         with waiting("searching for the trials to make next"):
             recommended = exploratory_trials(campaign.design, campaign.power, campaign.limits)
         power = replace(power, recommended=recommended)
     if math.isfinite(request.reach):
-        power = replace(power, further=tuple(_further_trials(request, campaign)))
-    return power.of_effects(names)
+        for text, (name, value) in zip(request.effects, asked, strict=True):
+            if name in power.not_testable:
+                raise _refusal("cannot be tested with the columns of these trials", text, str(power.not_testable[name]))
+            if not math.isfinite(value):
+                raise _refusal("needs a size", text, "write the size to detect, such as leak=0.5")
+            with waiting(f"searching for trials that detect {name}"):
+                plan = further_trials(campaign.design, power[name], value, request.reach, campaign.limits)
+            power = replace(power, further=(*power.further, plan))
+    return power.of_effects([name for name, _ in asked])
 
 
-def _further_trials(request: PowerRequest, campaign: PowerCampaign) -> Iterator[FurtherTrials]:
-    """Determine the fewest further trials that detect each requested effect of given size."""
-    for text in request.effects:
-        name, _, size = text.partition("=")
-        if not size:
-            raise _refusal("needs a size", text, "write the size to detect, such as leak=0.5")
-        if name in campaign.power.not_testable:
-            why = str(campaign.power.not_testable[name])
-            raise _refusal("cannot be tested with the columns of these trials", text, why)
-        value = _size_of(text, campaign.power[name])
-        with waiting(f"searching for trials that detect {name}"):
-            yield further_trials(campaign.design, campaign.power[name], value, request.reach, campaign.limits)
+def _asked(text: str, power: Power) -> tuple[str, float]:
+    """Read `name` or `name=size`: the effect, and its size in SI, NaN where none is given."""
+    name, _, size = text.partition("=")
+    if name in power.not_testable:
+        return name, math.nan
+    known = {entry.effect: entry for entry in power.effects}
+    if name not in known:
+        candidates = sorted([*known, *power.not_testable])
+        close = difflib.get_close_matches(name, candidates, 1, 0.6)
+        remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(candidates)}"
+        in_model = name in power.model
+        message = "is in the model already" if in_model else "is not a candidate for these trials"
+        raise _refusal(message, name, remedy)
+    if not size:
+        return name, math.nan
+    unit, factor = display_unit(known[name].unit)
+    try:
+        return name, float(size) / factor
+    except ValueError:
+        raise _refusal("is not a size", text, f"write a number in {unit or 'the unit of the parameter'}") from None
 
 
 def _refusal(message: str, value: str, remedy: str) -> ExperimentError:
@@ -254,24 +261,16 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
     ]
 
 
-def _size_of(text: str, entry: EffectPower) -> float:
-    """Read the size in `name=size`; return it in SI."""
-    unit, factor = display_unit(entry.unit)
-    try:
-        return float(text.partition("=")[2]) / factor
-    except ValueError:
-        raise _refusal("is not a size", text, f"write a number in {unit or 'the unit of the parameter'}") from None
-
-
-def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator[SimulatedRates]:
+def _simulated_rates(
+    request: PowerRequest, campaign: PowerCampaign, asked: Sequence[tuple[str, float]]
+) -> Iterator[SimulatedRates]:
     """Simulate campaigns of the design and diagnose each in full; yield the rate of each kind, the null first."""
     power = campaign.power
     wanted: list[tuple[str, tuple[float, ...], float]] = [("", (math.nan,), power.false_alarm_rate)]
-    for text in request.effects:
-        name, _, size = text.partition("=")
+    for name, size in asked:
         if name not in power.not_testable:
             entry = power[name]
-            sizes = [_size_of(text, entry)] if size else [entry.size_at(0.5), entry.size_at(0.9)]
+            sizes = [size] if math.isfinite(size) else [entry.size_at(0.5), entry.size_at(0.9)]
             known = filter(math.isfinite, sizes)
             wanted += [(name, (value, *entry.other_values), entry.probability_at(value)) for value in known]
     seeds = range(request.first_seed, request.first_seed + request.simulate)
@@ -283,4 +282,4 @@ def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator
             for answer in map_unordered(work, seeds, request.jobs):
                 diagnoses.append(answer)
                 bar.advance()
-            yield rates_of(diagnoses, values[0], predicted_rate)
+            yield rates_of(effect, diagnoses, values[0], predicted_rate)

@@ -72,26 +72,29 @@ class Condition:
 
 def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
     """Return every candidate trial; empty where the limits exclude all."""
-    typical = _typical_trials(trials)
-    if not typical:
+    vines = [(trials[k], k) for k in _typical_trials(trials)]
+    if not vines:
         return []
     used = [trial for trial in trials if trial.travel_ratio != 1]
-    vines = [(trials[k], k) for k in typical]
-    feasible = []
-    for vine, k in vines:
-        if _allowed(vine, limits):
-            for effort, rig in _rigs(vine, used, limits):
-                feasible += _loads(rig, k, effort, used, limits)
-    for vine, k in _new_vines(vines, limits) if limits.new_vines else []:
-        rigs = _rigs(vine, used, limits)
-        least = min((effort for effort, _ in rigs), default=SAME_RIG)
-        for effort, rig in rigs:
-            if effort == least:
-                feasible += _loads(rig, k, NEW_VINE, used, limits)
-    named = [replace(condition.trial, name=f"next_{number}") for number, condition in enumerate(feasible, 1)]
+    rigs = [
+        (rig, like, effort)
+        for vine, like in vines
+        if _allowed(vine, limits)
+        for effort, rig in _rigs(vine, used, limits)
+    ]
+    for vine, like in _new_vines(vines, limits) if limits.new_vines else []:
+        of_vine = _rigs(vine, used, limits)
+        least = min((effort for effort, _ in of_vine), default=SAME_RIG)
+        rigs += [(rig, like, NEW_VINE) for effort, rig in of_vine if effort == least]
+    loaded = [
+        (replace(rig, pressure_Pa=pressure, pressure_sigma_Pa=sigma, payload_kg=payload), like, effort)
+        for rig, like, effort in rigs
+        for payload in _payloads(used, limits)
+        for pressure, sigma in _pressures(rig, payload, used, limits)
+    ]
     return [
-        replace(condition, trial=trial, changed=_changed(trial, trials[condition.like]))
-        for condition, trial in zip(feasible, named, strict=True)
+        Condition(replace(trial, name=f"next_{number}"), like, effort, _changed(trial, trials[like]))
+        for number, (trial, like, effort) in enumerate(loaded, 1)
     ]
 
 
@@ -109,6 +112,27 @@ def conditions_by_effort(
     for vine in best_new_vines(new) if new.size else ():
         vines = np.array([condition.trial.vine for condition in conditions])
         yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
+
+
+def exchanged(
+    design: Sequence[int],
+    best: float,
+    allowed: NDArray[np.intp],
+    worth_with: Callable[[list[int]], Floats],
+) -> tuple[list[int], float]:
+    """Exchange the trials of a design one at a time until none gains (Fedorov 1972, Theory of Optimal Experiments).
+    `best` is its worth; `worth_with`, shape (n_allowed,), gives that of other trials with one of each `allowed` added.
+    """
+    design = list(design)
+    for _ in range(4):
+        before = best
+        for k in range(len(design)):
+            values = worth_with(design[:k] + design[k + 1 :])
+            if np.max(values) > 1.005 * best:  # a gain, not rounding
+                design[k], best = int(allowed[int(np.argmax(values))]), float(np.max(values))
+        if best <= before:
+            break
+    return design, best
 
 
 def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
@@ -169,15 +193,6 @@ def _choices(
     values = [now, *(value for value in dict.fromkeys(used) if math.isfinite(value))]
     values += [_rounded(now * factor) for factor in factors]
     return [value for i, value in enumerate(values) if not _is_among(value, values[:i])]
-
-
-def _loads(rig: Trial, like: int, effort: int, used: Sequence[Trial], limits: Limits) -> list[Condition]:
-    """Every pressure and payload for one vine on one rig."""
-    return [
-        Condition(replace(rig, pressure_Pa=pressure, pressure_sigma_Pa=sigma, payload_kg=payload), like, effort)
-        for payload in _payloads(used, limits)
-        for pressure, sigma in _pressures(rig, payload, used, limits)
-    ]
 
 
 def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
@@ -280,33 +295,39 @@ def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Tri
 
 
 @dataclass(frozen=True)
-class ScatterLevel:
-    """Likelihood of the trials so far near the best values, for one assumed pair of between-trial standard deviations.
-    `information`, shape (n_free, n_free), and `gradient`, shape (n_free,), of half the sum of squares at the best
-    values; the gradient is not zero at a bound.
+class ScatterLevels:
+    """Likelihood of the trials so far near the best values, for several assumed pairs of between-trial standard
+    deviations, along the first axis. `spread` and `factors` (on the fitted pair), shape (n_levels, 2); `information`,
+    (n_levels, n_free, n_free), and `gradient`, (n_levels, n_free), of half the sum of squares at the best values (not
+    zero at a bound); `rise` of −2 ln L, (n_levels,).
     """
 
-    spread: tuple[float, float]
-    factors: tuple[float, float]
+    spread: Floats
+    factors: Floats
     information: Floats
     gradient: Floats
-    rise: float
+    rise: Floats
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """One of the tied fits, extended to further conditions. `layout` maps the free parameters to the trials of the
     conditions: those of the fit first, then those of new vines. All are scaled as in the fit; `theta`, shape (n_free,),
-    are their best values.
+    are their best values. The experiment films `rest_frames` before release, `frames_behind_end` of the growth, and
+    `longest_s` of motion.
     """
 
     name: str
     fit: Fit
+    conditions: Sequence[Condition]
     layout: ParameterMap
     theta: Floats
-    scatter_levels: tuple[ScatterLevel, ...]
+    levels: ScatterLevels
     sd_of_new: Floats
     variance: float
+    rest_frames: int
+    frames_behind_end: int
+    longest_s: float
 
     @property
     def room(self) -> tuple[Floats, Floats]:
@@ -314,8 +335,31 @@ class Hypothesis:
         lower, upper = self.layout.bounds
         return np.minimum(lower - self.theta, 0.0), np.maximum(upper - self.theta, 0.0)
 
-    def predictor(self, places: Sequence[int], items: Sequence[FitTrial]) -> Predictor:
-        """Return a predictor of these trials, one for each of the conditions at `places`."""
+    def frame_s(self, place: int) -> float:
+        """Frame interval of a condition: that of the trial it is modelled on."""
+        return self.fit.predictor.data[self.conditions[place].like].frame_s
+
+    def predictor(self, places: Sequence[int], times_s: Sequence[Floats]) -> Predictor:
+        """Return a predictor of trials at the conditions at `places`, at these times; a recorded pressure is constant.
+        Their measured positions are placeholders.
+        """
+        items = []
+        for place, time_s in zip(places, times_s, strict=True):
+            condition = self.conditions[place]
+            like = self.fit.predictor.data[condition.like]
+            constant = (np.array([-1e3, 1e3]), np.full(2, condition.trial.pressure_Pa))
+            items.append(
+                FitTrial(
+                    trial=condition.trial,
+                    time_s=time_s,
+                    lead_position_m=time_s,
+                    first=np.arange(time_s.size) == 0,
+                    n_rest=int(np.count_nonzero(time_s <= 0)),
+                    noise_m=like.noise_m,
+                    correlation=like.correlation,
+                    trace=None if like.trace is None else constant,
+                )
+            )
         rows = list(places)
         layout = replace(self.layout, index=self.layout.index[rows], base=self.layout.base[rows])
         predictor = Predictor(layout, items, self.fit.predictor.host)
@@ -325,12 +369,12 @@ class Hypothesis:
 
 def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     """Extend a fit to further conditions; new vines add parameters with priors."""
-    old, state, names = fit.predictor.layout, fit.solution.state, fit.model.parameter_names
+    old, state, names, data = fit.predictor.layout, fit.solution.state, fit.model.parameter_names, fit.predictor.data
     fitted_rows, _ = old.rows(state.theta)
     numbers, index, base = list(old.free), [], []
     places: dict[tuple[str, str], int] = {}
     for condition in conditions:
-        trial, like = condition.trial, fit.predictor.data[condition.like].trial
+        trial, like = condition.trial, data[condition.like].trial
         row, values = old.index[condition.like].copy(), np.array(fitted_rows[condition.like])
         is_new = trial.vine != like.vine
         if is_new and fit.predictor.damping_column >= 0:
@@ -351,67 +395,41 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     precision_of_new = np.array([1 / 1.0**2 + (number.scale / number.prior_sd) ** 2 for number in added])
     stated_sd = [number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0 for number in added]
     sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
+    everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
+    moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
     return Hypothesis(
         name=name,
         fit=fit,
+        conditions=conditions,
         layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index), np.array(base)),
         theta=np.concatenate([state.theta, [number.to_scaled(number.start) for number in added]]),
-        scatter_levels=_scatter_levels(fit, precision_of_new),
+        levels=_scatter_levels(fit, precision_of_new),
         sd_of_new=np.array(sd_of_new),
         variance=float(np.exp(np.mean(np.log(state.variance)))),
+        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
+        frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
+        longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
     )
 
 
-def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, ...]:
+def _scatter_levels(fit: Fit, precision_of_new: Floats) -> ScatterLevels:
     """Likelihood of the trials so far at every scatter that a refit may estimate; new parameters have only priors."""
     state, problem = fit.solution.state, fit.solution.problem
     reduced = marginal(fit.solution.cross_products, problem, state)
     fitted = np.maximum(state.spread, LEAST_BETWEEN_TRIAL_SD)
     may_grow = np.array(fit.solution.estimable) & (np.array(state.spread) > LEAST_BETWEEN_TRIAL_SD)
-    levels: dict[tuple[float, float], ScatterLevel] = {}
-    as_fitted = 0.0
     # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
-    for factors in ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)):
-        pressure, damping = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted).tolist()
-        pair = (pressure, damping)
-        if pair in levels:
-            continue
-        of_old, gradient_of_old, square, log_det = normal_equations(reduced, problem, state, pair)
-        old, size = gradient_of_old.size, gradient_of_old.size + precision_of_new.size
-        information = np.zeros((size, size))
-        information[:old, :old] = of_old
-        information[range(old, size), range(old, size)] = precision_of_new
-        as_fitted = as_fitted if levels else square + log_det
-        ratios = (pressure / float(fitted[0]), damping / float(fitted[1]))
-        gradient = np.concatenate([gradient_of_old, np.zeros(size - old)])
-        levels[pair] = ScatterLevel(pair, ratios, information, gradient, square + log_det - as_fitted)
-    return tuple(levels.values())
-
-
-# ------------------------------------------------------------------------------
-# Simulated tracks of candidate trials, sampled as the camera of the experiment would.
-
-
-@dataclass(frozen=True)
-class TrackSampling:
-    """How the experiment films: frame interval, frames at rest, frames after the end of growth, longest motion."""
-
-    frame_s: float
-    rest_frames: int
-    frames_behind_end: int
-    longest_s: float
-
-
-def sampling_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
-    """Return how the experiment films, at the frame rate of the trial at `like`."""
-    everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
-    moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
-    return TrackSampling(
-        frame_s=data[like].frame_s,
-        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
-        frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
-        longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
-    )
+    factors = np.array([(1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)])
+    spreads = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted)
+    pairs: list[tuple[float, float]] = list(dict.fromkeys(map(tuple, spreads.tolist())))
+    n_old = state.theta.size
+    of_new = np.diag(np.concatenate([np.zeros(n_old), precision_of_new]))
+    information, gradient = np.stack([of_new] * len(pairs)), np.zeros((len(pairs), len(of_new)))
+    level = np.zeros(len(pairs))
+    for k, pair in enumerate(pairs):
+        of_old, gradient[k, :n_old], square, log_det = normal_equations(reduced, problem, state, pair)
+        information[k, :n_old, :n_old], level[k] = of_old, square + log_det
+    return ScatterLevels(np.array(pairs), np.array(pairs) / fitted, information, gradient, level - level[0])
 
 
 def _behind_end(trial_data: FitTrial) -> int:
@@ -425,68 +443,41 @@ def _behind_end(trial_data: FitTrial) -> int:
     return y.size - last if left_out and still else 0
 
 
-@dataclass(frozen=True)
-class GrowthCourse:
-    """Course of growth of a condition: when the first hypothesis nears the end, and when the last one has ended.
-    `ends_s` is infinite where one of them does not end in time.
+# ------------------------------------------------------------------------------
+# Simulated tracks of candidate trials, sampled as the camera of the experiment would.
+
+
+def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float] | None]:
+    """Return when the first hypothesis nears the end of the growth, and when the last has ended it (infinite where one
+    does not in time), for every condition; None where it is not worth filming or the model is in doubt.
     """
-
-    near_end_s: float
-    ends_s: float
-
-
-def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
-    """Return the data of a candidate trial at these times; a recorded pressure is constant. Shapes: time_s,
-    lead_position_m (n_points,).
-    """
-    like = data[condition.like]
-    constant = (np.array([-1e3, 1e3]), np.full(2, condition.trial.pressure_Pa))
-    return FitTrial(
-        trial=condition.trial,
-        time_s=time_s,
-        lead_position_m=lead_position_m,
-        first=np.arange(time_s.size) == 0,
-        n_rest=int(np.count_nonzero(time_s <= 0)),
-        noise_m=like.noise_m,
-        correlation=like.correlation,
-        trace=None if like.trace is None else constant,
-    )
-
-
-def growth_courses(
-    hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
-) -> list[GrowthCourse | None]:
-    """Return the course of growth of every condition; None where it is not worth filming or the model is in doubt."""
-    data = hypotheses[0].fit.predictor.data
-    times = [np.linspace(0.0, camera.longest_s, 400) for camera in cameras]
-    items = [blank_trial(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
-    trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
-    runs: list[list[Trajectory | None]] = []
-    jobs: list[Job] = []
-    for hypothesis in hypotheses:
-        predictor = hypothesis.predictor(range(len(conditions)), items)
-        jobs = predictor.jobs(hypothesis.theta, trial_effects)
-        runs.append(_simulated(predictor, jobs))
+    last = hypotheses[-1]
+    every, longest_s = range(len(last.conditions)), last.longest_s
+    trial_effects = np.zeros((len(every), N_TRIAL_EFFECTS))
+    times = [np.linspace(0.0, longest_s, 400)] * len(every)
+    predictors = [hypothesis.predictor(every, times) for hypothesis in hypotheses]
+    jobs_of = [p.jobs(hypothesis.theta, trial_effects) for p, hypothesis in zip(predictors, hypotheses, strict=True)]
+    runs = [_simulated(predictor, jobs) for predictor, jobs in zip(predictors, jobs_of, strict=True)]
     # 1.05: ratio of tail speed to steady speed at the same pressure above which the model predicts compression in
     # the tail (chosen)
-    largest_ratio = max(1.05, _largest_speed_ratio(hypotheses[-1].fit))
-    growth: list[GrowthCourse | None] = []
-    for i, condition in enumerate(conditions):
+    largest_ratio = max(1.05, _largest_speed_ratio(last.fit))
+    growth: list[tuple[float, float] | None] = []
+    for i, condition in enumerate(last.conditions):
         trajectories = [trajectory for trajectory in (run[i] for run in runs) if trajectory is not None]
         if len(trajectories) < len(runs):
             growth.append(None)
             continue
         length_m = condition.trial.length_m
-        near_m, longest_s = np.nan_to_num(END_FRACTION * length_m, nan=math.inf), cameras[i].longest_s
+        near_m = np.nan_to_num(END_FRACTION * length_m, nan=math.inf)
         near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in trajectories)
         grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in trajectories)
-        ratio = _speed_ratio(hypotheses[-1].fit, condition.trial, jobs[i], trajectories[-1].tail_velocity_m_s)
+        ratio = _speed_ratio(last.fit, condition.trial, jobs_of[-1][i], trajectories[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
         grows_enough = grown_m > 0.3 * (length_m if math.isfinite(length_m) else 0.0)
         is_compressed = condition.trial.tail_slack != "free" and ratio > largest_ratio
-        ends = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
-        is_worth_it = grows_enough and not is_compressed and near_s > 8 * cameras[i].frame_s
-        growth.append(GrowthCourse(near_s, ends) if is_worth_it else None)
+        ends_s = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
+        is_worth_it = grows_enough and not is_compressed and near_s > 8 * last.frame_s(i)
+        growth.append((near_s, ends_s) if is_worth_it else None)
     return growth
 
 
@@ -526,96 +517,61 @@ def _largest_speed_ratio(fit: Fit) -> float:
 
 
 def film_trials(
-    truth: Hypothesis,
-    places: Sequence[int],
-    conditions: Sequence[Condition],
-    cameras: Sequence[TrackSampling],
-    theta: Floats,
-    deviations: Floats,
-    rng: np.random.Generator,
+    truth: Hypothesis, places: Sequence[int], theta: Floats, deviations: Floats, rng: np.random.Generator
 ) -> list[FitTrial | None]:
     """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise, and
     select usable points as for a fit; None where there are too few. Shapes: theta (n_free,); deviations (n_places, 2).
     """
-    chosen, of_chosen = [conditions[k] for k in places], [cameras[k] for k in places]
-    data, rho = truth.fit.predictor.data, truth.fit.solution.state.rho
-    times = [
-        camera.frame_s * np.arange(camera.rest_frames + math.ceil(camera.longest_s / camera.frame_s), dtype=float)
-        for camera in of_chosen
-    ]
-    items = [blank_trial(condition, t, data, t) for condition, t in zip(chosen, times, strict=True)]
-    predictor = truth.predictor(places, items)
-    trial_effects = np.zeros((len(chosen), N_TRIAL_EFFECTS))
-    trial_effects[:, RELEASE] = [(camera.rest_frames - 1 + rng.uniform()) * camera.frame_s for camera in of_chosen]
-    trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
+    rho, frames_s = truth.fit.solution.state.rho, [truth.frame_s(place) for place in places]
+    times = [s * np.arange(truth.rest_frames + math.ceil(truth.longest_s / s), dtype=float) for s in frames_s]
+    predictor = truth.predictor(places, times)
+    trial_effects = np.zeros((len(places), N_TRIAL_EFFECTS))
+    trial_effects[:, RELEASE] = [(truth.rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
+    trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(places))
     trial_effects[:, PRESSURE] = np.where(predictor.has_pressure_deviation, deviations[:, 0], 0.0)
     trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.has_damping_deviation, deviations[:, 1], 0.0)
     tracks: list[FitTrial | None] = []
-    for i, moved in enumerate(predictor.run(predictor.jobs(theta, trial_effects))):
-        stop = times[i].size
+    for i, (blank, moved) in enumerate(
+        zip(predictor.data, predictor.run(predictor.jobs(theta, trial_effects)), strict=True)
+    ):
+        stop = blank.time_s.size
         if moved.status == "ended":
             last_s = trial_effects[i, RELEASE] + moved.end_time_s
-            stop = min(stop, int(np.searchsorted(times[i], last_s)) + of_chosen[i].frames_behind_end)
+            stop = min(stop, int(np.searchsorted(blank.time_s, last_s)) + truth.frames_behind_end)
         noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - rho**2)), rho, rng)
         position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
-        pressure_Pa = None if items[i].trace is None else np.full(stop, chosen[i].trial.pressure_Pa)
+        pressure_Pa = None if blank.trace is None else np.full(stop, blank.trial.pressure_Pa)
         try:
-            track = plain_track(times[i][:stop], position_m, pressure_Pa=pressure_Pa)
-            tracks.append(prepare_trial(chosen[i].trial, track))
+            track = plain_track(blank.time_s[:stop], position_m, pressure_Pa=pressure_Pa)
+            tracks.append(prepare_trial(blank.trial, track))
         except FitError:
             tracks.append(None)
     return tracks
 
 
+# ------------------------------------------------------------------------------
+# Separation of hypotheses by designs, to first order.
+
+
 @dataclass(frozen=True)
 class RefitTerms:
-    """Quadratic form of −2 ln L of one hypothesis refitted to the trials so far and one trial of every condition. The
-    first axis is that of the scatter levels. From the trials so far: `old_information`, shape (n_levels, n_free,
-    n_free), `old_gradient`, (n_levels, n_free), and `old_rise`, (n_levels,).
+    """Quadratic form of −2 ln L of one hypothesis, refitted to one trial of every condition; beside the information of
+    the trials so far in its `levels`, which are the first axis here too. `information`, shape (n_levels, n_conditions,
+    n_free, n_free); `gradient`, (n_levels, n_conditions, n_free, n_hypotheses), if each hypothesis is true.
     """
 
-    old_information: Floats
-    old_gradient: Floats
-    old_rise: Floats
+    hypothesis: Hypothesis
     information: Floats
     gradient: Floats
     misfit: Floats
     scatter_rise: Floats
-    down: Floats
-    up: Floats
-
-    def narrowed(self, allowed: NDArray[np.int_]) -> RefitTerms:
-        """Keep some of the conditions, and the parameters about which they or the trials so far have information.
-        Shapes: allowed (n_allowed,).
-        """
-        has_new = np.any(self.information[0][allowed].diagonal(axis1=1, axis2=2) > 0, axis=0)
-        has_old = (np.abs(self.old_gradient[0]) > 0) | (np.count_nonzero(self.old_information[0], axis=0) > 1)
-        use = np.flatnonzero(has_new | has_old)
-        return RefitTerms(
-            self.old_information[:, use][:, :, use],
-            self.old_gradient[:, use],
-            self.old_rise,
-            self.information[:, allowed][:, :, use][:, :, :, use],
-            self.gradient[:, allowed][:, :, use],
-            self.misfit[:, allowed],
-            self.scatter_rise[:, allowed],
-            self.down[use],
-            self.up[use],
-        )
 
 
-def refit_terms(
-    hypotheses: Sequence[Hypothesis],
-    conditions: Sequence[Condition],
-    cameras: Sequence[TrackSampling],
-    runs: Sequence[GrowthCourse],
-) -> list[RefitTerms]:
+def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[RefitTerms]:
     """Return the quadratic form of each hypothesis, with one trial of each condition, at its best values so far."""
-    data = hypotheses[0].fit.predictor.data
-    times, weights = zip(*(_times(camera, run) for camera, run in zip(cameras, runs, strict=True)), strict=True)
-    placeholders = [blank_trial(condition, t, data, 1e-3 * t) for condition, t in zip(conditions, times, strict=True)]
-    trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
-    predictors = [hypothesis.predictor(range(len(conditions)), placeholders) for hypothesis in hypotheses]
+    times, weights = zip(*(_times(hypotheses[0], k, *course) for k, course in enumerate(courses)), strict=True)
+    trial_effects = np.zeros((len(courses), N_TRIAL_EFFECTS))
+    predictors = [hypothesis.predictor(range(len(courses)), times) for hypothesis in hypotheses]
     columns = [
         np.stack(p.linearise(hypothesis.theta, trial_effects))
         for p, hypothesis in zip(predictors, hypotheses, strict=True)
@@ -625,57 +581,38 @@ def refit_terms(
     motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
     terms = []
     for k, (hypothesis, sensitivities, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
-        has_deviations = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
-        differences = (motions - motions[:, :, [k]]) * root_weights
-        terms.append(_terms_of(hypothesis, sensitivities * root_weights, differences, has_deviations))
+        # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
+        scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
+        differences = motions - motions[:, :, [k]]
+        both = scale * root_weights * np.concatenate([sensitivities[:, :, :-1], differences], axis=2)
+        products = np.swapaxes(both, 1, 2) @ both
+        levels = hypothesis.levels
+        by_level = [_without_trial_effects(hypothesis, spread, products) for spread in levels.spread]
+        information, gradient, misfit = (np.stack(part) for part in zip(*by_level, strict=True))
+        has_deviations = np.stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
+        scatter_rise = (2 * np.log(levels.factors) + 1 / levels.factors**2 - 1) @ has_deviations.astype(float)
+        terms.append(RefitTerms(hypothesis, information, gradient, misfit, scatter_rise))
     return terms
 
 
-def _times(camera: TrackSampling, run: GrowthCourse) -> tuple[Floats, Floats]:
+def _times(hypothesis: Hypothesis, place: int, near_end_s: float, ends_s: float) -> tuple[Floats, Floats]:
     """Times since release at which a condition is evaluated, and the number of frames that each represents. The first
     represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
     """
     points = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
-    step_s = run.near_end_s / points
+    frame_s, step_s = hypothesis.frame_s(place), near_end_s / points
     moving = (np.arange(points) + 0.5) * step_s
-    ends_filmed = np.isfinite(run.ends_s) and camera.frames_behind_end > 0
-    last_s = 1.05 * run.ends_s if ends_filmed else moving[-1] + step_s  # just past the end
-    weights = np.full(points + 2, step_s / camera.frame_s)
-    weights[0], weights[-1] = camera.rest_frames, camera.frames_behind_end if ends_filmed else 0.0
-    return np.concatenate([[-camera.frame_s], moving, [last_s]]), weights
+    ends_filmed = np.isfinite(ends_s) and hypothesis.frames_behind_end > 0
+    last_s = 1.05 * ends_s if ends_filmed else moving[-1] + step_s  # just past the end
+    weights = np.full(points + 2, step_s / frame_s)
+    weights[0], weights[-1] = hypothesis.rest_frames, hypothesis.frames_behind_end if ends_filmed else 0.0
+    return np.concatenate([[-frame_s], moving, [last_s]]), weights
 
 
-def _terms_of(
-    hypothesis: Hypothesis, columns: Floats, differences: Floats, has_deviations: NDArray[np.bool_]
-) -> RefitTerms:
-    # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
-    scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
-    both = scale * np.concatenate([columns[:, :, :-1], differences], axis=2)
-    products = np.swapaxes(both, 1, 2) @ both
-    levels = hypothesis.scatter_levels
-    by_level = [_without_trial_effects(hypothesis, level, products) for level in levels]
-    information, gradient, misfit = (np.stack(part) for part in zip(*by_level, strict=True))
-    factors = np.array([level.factors for level in levels])
-    down, up = hypothesis.room
-    return RefitTerms(
-        old_information=np.stack([level.information for level in levels]),
-        old_gradient=np.stack([level.gradient for level in levels]),
-        old_rise=np.array([level.rise for level in levels]),
-        information=information,
-        gradient=gradient,
-        misfit=misfit,
-        scatter_rise=(2 * np.log(factors) + 1 / factors**2 - 1) @ has_deviations.T.astype(float),
-        down=down,
-        up=up,
-    )
-
-
-def _without_trial_effects(
-    hypothesis: Hypothesis, level: ScatterLevel, products: Floats
-) -> tuple[Floats, Floats, Floats]:
+def _without_trial_effects(hypothesis: Hypothesis, spread: Floats, products: Floats) -> tuple[Floats, Floats, Floats]:
     """Information, gradient and misfit over all free parameters, trial effects eliminated (Schur complement)."""
     precision = np.full(N_TRIAL_EFFECTS, 1e-9)
-    precision[list(DEVIATION_COLUMNS)] = 1 / np.array(level.spread) ** 2
+    precision[list(DEVIATION_COLUMNS)] = 1 / spread**2
     within_trial = products[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + np.diag(precision)
     reduced = products[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - products[
         :, N_TRIAL_EFFECTS:, :N_TRIAL_EFFECTS
@@ -690,22 +627,28 @@ def _without_trial_effects(
     return information[:, :size, :size], gradient[:, :size], np.einsum("nkk->nk", reduced[:, keys:, keys:])
 
 
-def separations(terms: Sequence[RefitTerms], designs: NDArray[np.int_]) -> Floats:
+def separations(terms: Sequence[RefitTerms], designs: Sequence[Sequence[int]] | NDArray[np.int_]) -> Floats:
     """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal. Shapes:
     designs (n_designs, n_trials) → (n_designs, n, n).
     """
-    n = len(terms)
+    n, designs = len(terms), np.asarray(designs)
+    conditions = np.unique(designs)
     squares = np.zeros((len(designs), n, n))
     for b, refitted in enumerate(terms):
-        for level in range(len(refitted.old_rise)):
-            information = refitted.old_information[level] + _over_trials(refitted.information[level], designs)
-            gradient = refitted.old_gradient[level][:, None] + _over_trials(refitted.gradient[level], designs)
-            misfit = _over_trials(refitted.misfit[level], designs) + refitted.old_rise[level]
+        levels, (down, up) = refitted.hypothesis.levels, refitted.hypothesis.room
+        # Parameters about which these conditions or the trials so far have information
+        has_new = np.any(refitted.information[0][conditions].diagonal(axis1=1, axis2=2) > 0, axis=0)
+        has_old = (np.abs(levels.gradient[0]) > 0) | (np.count_nonzero(levels.information[0], axis=0) > 1)
+        use = np.flatnonzero(has_new | has_old)
+        for level, old_rise in enumerate(levels.rise):
+            information = _over_trials(refitted.information[level][:, use[:, None], use], designs)
+            information += levels.information[level][use[:, None], use]
+            gradient = levels.gradient[level][use, None] + _over_trials(refitted.gradient[level][:, use], designs)
+            misfit = _over_trials(refitted.misfit[level], designs) + old_rise
             misfit += _over_trials(refitted.scatter_rise[level], designs)[:, None]
             for a in range(n):
                 if a != b:
-                    gain = _largest_gain(information, gradient[:, :, a], refitted.down, refitted.up)
-                    square = misfit[:, a] - gain
+                    square = misfit[:, a] - _largest_gain(information, gradient[:, :, a], down[use], up[use])
                     squares[:, a, b] = square if level == 0 else np.minimum(squares[:, a, b], square)
     return np.sqrt(np.maximum(squares, 0.0))
 
@@ -747,32 +690,26 @@ def worth(between: Floats) -> Floats:
     return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
 
 
-def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.int_], trials: int) -> tuple[NDArray[np.int_], float]:
-    """Find the trials that separate best, by exchange of one trial at a time (Fedorov 1972). Returns design (indices
-    among all conditions, increasing), worth (see `worth`). Shape (trials,).
+def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.intp], trials: int) -> tuple[list[int], float]:
+    """Find the trials that separate best: replicates of one condition, exchanged one at a time. Returns design
+    (indices among all conditions, increasing), worth (see `worth`).
     """
-    of_allowed = [of_hypothesis.narrowed(allowed) for of_hypothesis in terms]
-    replicates = np.repeat(np.arange(allowed.size)[:, None], trials, axis=1)
-    values = worth(separations(of_allowed, replicates))
-    design, best = replicates[int(np.argmax(values))].copy(), float(np.max(values))
-    for _ in range(4):
-        before = best
-        for exchanged in range(trials):
-            designs = np.repeat(design[None], allowed.size, axis=0)
-            designs[:, exchanged] = np.arange(allowed.size)
-            values = worth(separations(of_allowed, designs))
-            if np.max(values) > 1.005 * best:  # a gain, not rounding
-                design, best = designs[int(np.argmax(values))], float(np.max(values))
-        if best <= before:
-            break
-    return np.sort(allowed[design]), best
+
+    def worth_with(others: list[int]) -> Floats:
+        return worth(separations(terms, [[*others, k] for k in allowed]))
+
+    values = _worth_of_replicates(terms, allowed, trials)
+    start = [int(allowed[int(np.argmax(values))])] * trials
+    design, best = exchanged(start, float(np.max(values)), allowed, worth_with)
+    return sorted(design), best
 
 
-def best_new_vines(
-    terms: Sequence[RefitTerms], conditions: Sequence[Condition], places: NDArray[np.int_], trials: int, most: int
-) -> list[str]:
+def best_new_vines(terms: Sequence[RefitTerms], places: NDArray[np.intp], trials: int, most: int) -> list[str]:
     """Return the new vines in order of the worth of replicates at their best condition, best first."""
-    of_new_vines = [of_hypothesis.narrowed(places) for of_hypothesis in terms]
-    replicates = np.repeat(np.arange(places.size)[:, None], trials, axis=1)
-    order = np.argsort(-worth(separations(of_new_vines, replicates)))
+    conditions = terms[0].hypothesis.conditions
+    order = np.argsort(-_worth_of_replicates(terms, places, trials))
     return list(dict.fromkeys(conditions[places[k]].trial.vine for k in order))[:most]
+
+
+def _worth_of_replicates(terms: Sequence[RefitTerms], places: NDArray[np.intp], trials: int) -> Floats:
+    return worth(separations(terms, np.repeat(places[:, None], trials, axis=1)))

@@ -17,10 +17,9 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import SimulationError, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import DAMPING, ParameterMap
-from vinetrack.inference.marginal_likelihood import FitState
 from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
 from vinetrack.inference.sensitivity import Predictor, align, initial_trial_effects
-from vinetrack.planning.discriminating_design import Condition, Hypothesis, TrackSampling, film_trials
+from vinetrack.planning.discriminating_design import Hypothesis, film_trials
 from vinetrack.tracks.position_noise import ar1_noise
 
 
@@ -147,43 +146,32 @@ class PartlyLinear(Predictor):
         return [of_fit[:, -1] - of_fit[:, :-1] @ step for of_fit, step in zip(self.old_columns, steps, strict=True)]
 
 
-@dataclass(frozen=True)
-class DesignProblem:
-    """A design problem: the hypotheses, the candidate conditions and the camera of each."""
-
-    hypotheses: Sequence[Hypothesis]
-    conditions: Sequence[Condition]
-    cameras: Sequence[TrackSampling]
-
-
 def simulated_rises(
-    bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
+    hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
 ) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
     values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
     average. If `thorough`, both are random and every trajectory is simulated: only where the pressure was recorded do
     the old trials stay linear, for to simulate those takes a hundred times as long. Shape (n_draws, n, n).
     """
-    n = len(bench.hypotheses)
+    n = len(hypotheses)
     # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
     alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
     rises = np.full((len(draws), n, n), math.nan)
-    before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in bench.hypotheses])
+    before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in hypotheses])
     for k, a in np.ndindex(len(draws), n):
         rng = np.random.default_rng([seed, int(thorough), draws[k], a])
-        truth = bench.hypotheses[a]
+        truth = hypotheses[a]
         theta = draw_parameters(truth, rng) if thorough else truth.theta
         in_turn = alternating[(np.arange(len(design)) + draws[k]) % 4]
         deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
         try:
-            filmed = film_trials(
-                truth, design, bench.conditions, bench.cameras, theta, deviations * truth.fit.solution.state.spread, rng
-            )
+            filmed = film_trials(truth, design, theta, deviations * truth.fit.solution.state.spread, rng)
         except SimulationError:
             continue
         new = [(place, trial_data) for place, trial_data in zip(design, filmed, strict=True) if trial_data is not None]
         if new:
-            after = np.array([_refitted(hypothesis, new, thorough=thorough) for hypothesis in bench.hypotheses])
+            after = np.array([_refitted(hypothesis, new, thorough=thorough) for hypothesis in hypotheses])
             rises[k, a] = after - before - (after[a] - before[a])
     return rises
 
@@ -194,7 +182,7 @@ def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
     """
     furthest_draw = 2.0  # Standard deviations at which draws are clipped: the linearised fit holds no further (chosen)
     old = hypothesis.fit.predictor.layout.start.size
-    values, vectors = np.linalg.eigh(hypothesis.scatter_levels[0].information[:old, :old])
+    values, vectors = np.linalg.eigh(hypothesis.levels.information[0, :old, :old])
     is_determined = values > 1e-9 * values[-1]
     sd = np.where(is_determined, 1 / np.sqrt(np.where(is_determined, values, 1.0)), 0.0)
     normal = np.clip(rng.standard_normal(old), -furthest_draw, furthest_draw)
@@ -205,12 +193,21 @@ def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
 
 def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, thorough: bool) -> float:
     """−2 ln L of a hypothesis fitted to old and new trials; NaN where the fit fails."""
-    data = [trial_data for _, trial_data in new]
     most = 20  # Iterations of a refit, at most (chosen)
-    layout, old = _extended_layout(hypothesis, [place for place, _ in new]), hypothesis.fit.solution
+    places, data = [place for place, _ in new], [trial_data for _, trial_data in new]
+    layout, old = _extended_layout(hypothesis, places), hypothesis.fit.solution
     quick = PartlyLinear(layout, hypothesis.fit.predictor, old, data)
     try:
-        state = _extended_state(hypothesis, quick, data)
+        # New releases are aligned, and the noise of the new trials is that of the old.
+        theta = layout.start
+        theta[: old.state.theta.size] = old.state.theta
+        aligned, _ = align(data, quick.new, theta, initial_trial_effects(data))
+        state = replace(
+            old.state,
+            theta=theta,
+            trial_effects=np.concatenate([old.state.trial_effects, aligned]),
+            variance=np.concatenate([old.state.variance, np.full(len(data), hypothesis.variance)]),
+        )
         problem, before = make_problem(quick, state.trial_effects), old.problem.release_origin_mean
         means = np.concatenate([before, problem.release_origin_mean[len(before) :]])
         problem = replace(problem, release_origin_mean=means)
@@ -241,16 +238,4 @@ def _extended_layout(hypothesis: Hypothesis, places: Sequence[int]) -> Parameter
         wide.keys,
         np.concatenate([before.index, index]),
         np.concatenate([before.base, wide.base[list(places)]]),
-    )
-
-
-def _extended_state(hypothesis: Hypothesis, predictor: PartlyLinear, data: Sequence[FitTrial]) -> FitState:
-    """State of the fit, extended by the new trials: their releases aligned, their noise that of the old trials."""
-    before = hypothesis.fit.solution.state
-    theta = predictor.layout.start
-    theta[: before.theta.size] = before.theta
-    trial_effects, _ = align(predictor.new.data, predictor.new, theta, initial_trial_effects(data))
-    variance = np.concatenate([before.variance, np.full(len(data), hypothesis.variance)])
-    return replace(
-        before, theta=theta, trial_effects=np.concatenate([before.trial_effects, trial_effects]), variance=variance
     )
