@@ -14,7 +14,7 @@ from own_effect import write_effect
 import vinetrack as vt
 from vinetrack.core.tables import write_json
 from vinetrack.inference.fit_summary import summary_of
-from vinetrack.pipeline.predict_stage import PredictionRequest, read_basis, read_range
+from vinetrack.pipeline.predict_stage import read_basis, read_range
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 # `vinetrack predict`: what it says, what it writes, and how it refuses.
@@ -88,7 +88,7 @@ def test_a_fit_is_believed_with_its_numbers_and_an_effect_of_an_experiments_own_
     write_json(results / "fit.json", content | {"model": [*content["model"], "spring_line"]})
     write_json(results / "provenance.json", {"experiment": experiment.as_posix()})
     values = dict(zip((name[2:].replace("-", "_") for name in FAST[::2]), map(str, FAST[1::2]), strict=True))
-    (inputs,) = read_basis(PredictionRequest(cells=values, results=results)).inputs
+    (inputs,) = read_basis(cells=values, results=results).inputs
     assert inputs.model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
     assert run("predict", *FAST, "--fit", results).exit_code == 1

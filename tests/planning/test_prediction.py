@@ -17,7 +17,7 @@ from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TAIL, TENSION, TIME, design_checks, neglected, run
-from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, Size, damping_prior
+from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, damping_prior
 
 FAST = {name: str(value) for name, value in published.FAST_VINE.items()}
 SIZES = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
@@ -175,9 +175,9 @@ def test_a_fit_from_python_is_believed_as_its_file_is():
     ("text", "sizes"),
     [
         ("air_drag", {}),
-        ("air_drag=0.8", {"air_drag.C_D": Size(0.8, 0.8)}),
-        ("reservoir_depletion=1.4:1", {"reservoir_depletion.gamma": Size(1.0, 1.4)}),
-        ("supply_refill=0.1, 1:1.4", {"supply_refill.tau": Size(0.1, 0.1), "supply_refill.gamma": Size(1.0, 1.4)}),
+        ("air_drag=0.8", {"air_drag.C_D": (0.8, 0.8)}),
+        ("reservoir_depletion=1.4:1", {"reservoir_depletion.gamma": (1.0, 1.4)}),
+        ("supply_refill=0.1, 1:1.4", {"supply_refill.tau": (0.1, 0.1), "supply_refill.gamma": (1.0, 1.4)}),
     ],
 )
 def test_sizes_of_effects_are_numbers_or_ranges(text, sizes):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,27 +67,19 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 # After any other verdict there is no prediction, unless the user insists with `--anyway`.
 
 
-@dataclass(frozen=True)
-class ChosenFit:
-    """Content of a fit file, and the heading for everything predicted from it."""
-
-    content: Mapping[str, Any]
-    heading: tuple[str, ...]
-
-
-def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
-    """Choose the fit of a results folder to predict from."""
+def choose_fit(folder: Path, anyway: bool = False) -> tuple[Mapping[str, Any], tuple[str, ...]]:
+    """Choose the fit of a results folder to predict from. Returns its content, heading (over all predicted from it)."""
     results = Results(folder)
     in_use = read_json(results.fit)
     diagnosis = read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
-        return ChosenFit(in_use, (f"! {remark('fit_not_diagnosed', folder=folder)}",))
+        return in_use, (f"! {remark('fit_not_diagnosed', folder=folder)}",)
     if diagnosis.verdict == ADEQUATE:
-        return ChosenFit(in_use, ())
+        return in_use, ()
     final = read_json(results.final_fit) if results.final_fit.exists() else None
     added = " + ".join(diagnosis.effects)
     if diagnosis.final_verdict == ADEQUATE and final is not None:
-        return ChosenFit(final, (str(remark("from_final_model", added=added)),))
+        return final, (str(remark("from_final_model", added=added)),)
     verdict = f"{diagnosis.final_verdict or diagnosis.verdict}: {diagnosis.explanation}"
     if not anyway:
         reason = (
@@ -97,29 +89,11 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
         )
         raise ResultsError(f"{folder}: no prediction, {reason}; or predict from it with --anyway. {verdict}")
     caution = remark("from_refuted_model", model=f"the model with {added} added" if final else "the model in use")
-    return ChosenFit(final or in_use, (f"! {verdict}", f"! {caution}"))
+    return final or in_use, (f"! {verdict}", f"! {caution}")
 
 
 # ------------------------------------------------------------------------------
 # Inputs of the commands about new vines: options or a sheet, a fit, effects; and formatting of their output.
-
-
-@dataclass(frozen=True)
-class PredictionRequest:
-    """Options of a command about new vines; NaN and None for those not given. `cells` are texts by column of the sheet,
-    for the columns that were given. `B_error` is relative. `anyway` allows a fit whose model was refuted.
-    """
-
-    cells: Mapping[str, str] = field(default_factory=dict)
-    sheet: Path | None = None
-    results: Path | None = None
-    anyway: bool = False
-    effects: tuple[str, ...] = ()
-    tail_slack: str | None = None
-    B: float = math.nan
-    B_error: float = 0.0
-    n: float = math.nan
-    n_error: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -137,39 +111,46 @@ class PredictionBasis:
         return [predictive_inputs(trial, self.stated, self.fit) for trial in self.planned.trials]
 
 
-def read_basis(request: PredictionRequest, needed: Sequence[str] = REQUIRED_FOR_PREDICTION) -> PredictionBasis:
-    """Read the sheet or the options, the fit, and the requested effects."""
-    chosen = None if request.results is None else choose_fit(request.results, request.anyway)
-    if request.sheet is None:
-        planned = planned_trial(request.cells, ExperimentSettings(), needed)
+def read_basis(
+    needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
+    *,
+    cells: Mapping[str, str] | None = None,
+    sheet: Path | None = None,
+    results: Path | None = None,
+    anyway: bool = False,
+    effects: Sequence[str] = (),
+    tail_slack: str | None = None,
+    **numbers: Any,
+) -> PredictionBasis:
+    """Read the sheet or the options, the fit, and the requested effects. `cells` are texts by column of the sheet, for
+    the columns that were given; `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
+    """
+    fit: FitNumbers | None = None
+    user_effects: Mapping[str, Effect] | None = None
+    heading: tuple[str, ...] = ()
+    if results is not None:
+        content, heading = choose_fit(results, anyway)
+        fit, user_effects = _read_fit(results, content)
+    if sheet is None:
+        planned = planned_trial(cells or {}, ExperimentSettings(), needed)
     else:
-        planned = planned_sheet(request.sheet)
-        message, remedy = "is given in addition to a sheet", "write it in the sheet"
-        problems = [
-            Problem(message=message, column=option(name), value=text, remedy=remedy)
-            for name, text in request.cells.items()
-        ]
-        if problems:
-            raise ExperimentError(problems)
-    if request.tail_slack is not None:
-        trials = tuple(replace(trial, tail_slack=request.tail_slack) for trial in planned.trials)
-        planned = replace(planned, trials=trials)
-    if request.results is None or chosen is None:
-        fit, user_effects = None, effects_of_plan(planned)
-    else:
-        fit, user_effects = _read_fit(request.results, chosen)
-    sizes = [read_sizes(text, user_effects) for text in request.effects]
+        planned = planned_sheet(sheet)
+        said: dict[str, Any] = {"message": "is given in addition to a sheet", "remedy": "write it in the sheet"}
+        if cells:
+            raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
+    if tail_slack is not None:
+        planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
+    if user_effects is None:
+        user_effects = effects_of_plan(planned)
+    sizes = [read_sizes(text, user_effects) for text in effects]
     stated = StatedValues(
-        B=request.B,
-        B_error=request.B_error,
-        n=request.n,
-        n_error=request.n_error,
+        **numbers,
         model=planned.settings.model,
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
         user_effects=user_effects,
     )
-    return PredictionBasis(planned, stated, fit, () if chosen is None else chosen.heading)
+    return PredictionBasis(planned, stated, fit, heading)
 
 
 def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
@@ -177,11 +158,11 @@ def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def _read_fit(results: Path, chosen: ChosenFit) -> tuple[FitNumbers, Mapping[str, Effect]]:
+def _read_fit(results: Path, content: Mapping[str, Any]) -> tuple[FitNumbers, Mapping[str, Effect]]:
     """Read a fit of a results folder, and the user's own effects if its model contains any."""
     with planning_errors():
-        fit = fit_numbers(FitSummary.from_json(chosen.content), results.as_posix())
-    own_names = [name for name in fit.model if name not in catalogue()]
+        fit = fit_numbers(FitSummary.from_json(content), results.as_posix())
+    own_names = [name for name in fit.fit.names if name not in catalogue()]
     if not own_names:
         return fit, {}
     experiment = Path(str(read_json(Results(results).provenance).get("experiment", "")))
@@ -211,19 +192,7 @@ def planning_errors() -> Iterator[None]:
         raise ResultsError(str(error)) from None
 
 
-def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
-    """Return rows of a table of inputs: symbol, median, 90 % band, unit, origin; constants of nature are left out."""
-    rows = []
-    for entry in inputs:
-        if entry.origin.code != "constant":
-            low, median, high = (value_in_unit(value, entry.unit) for value in (entry.low, entry.median, entry.high))
-            band = "–" if entry.low == entry.high else f"{low} to {high}"
-            rows.append((entry.symbol, median, band, display_unit(entry.unit, PREDICTION_UNITS)[0], str(entry.origin)))
-    return rows
-
-
-@dataclass(frozen=True)
-class ConditionPrediction:
+class ConditionPrediction(NamedTuple):
     """Prediction of one condition, its design checks (`hazards`), and the influence of neglected effects."""
 
     prediction: VinePrediction
@@ -232,19 +201,13 @@ class ConditionPrediction:
 
 
 def predict_conditions(
-    request: PredictionRequest,
-    *,
-    samples: int,
-    seed: int,
-    at_fraction: float,
-    figure: Path | None = None,
-    csv: Path | None = None,
+    *, samples: int, seed: int, at_fraction: float, figure: Path | None = None, csv: Path | None = None, **given: Any
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Predict all conditions; write figure and curves if requested. Returns lines, and JSON content."""
+    """Predict all conditions, see `read_basis`; write figure and curves if requested. Returns lines, JSON content."""
     import pandas as pd
 
     check_figure(figure)
-    basis = read_basis(request)
+    basis = read_basis(**given)
     entries = []
     with planning_errors():
         for inputs in progress(basis.inputs, "predicting", unit="condition"):
@@ -269,14 +232,26 @@ def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
     inputs = prediction.inputs
     yield f"{trial_text(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
-    yield from table(input_rows(inputs.bands()), ("input", "median", "90 % band", "unit", "from"), align="<><<<")
+    rows = []
+    for one in inputs.bands():
+        if one.origin.code != "constant":  # constants of nature are left out
+            low, median, high = (value_in_unit(value, one.unit) for value in (one.low, one.median, one.high))
+            band = "–" if one.low == one.high else f"{low} to {high}"
+            rows.append((one.symbol, median, band, display_unit(one.unit, PREDICTION_UNITS)[0], str(one.origin)))
+    yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
-    rows = [_quantity_row(quantity) for quantity in prediction.quantities]
-    yield from table(rows, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
+    quantities = [_quantity_row(quantity) for quantity in prediction.quantities]
+    yield from table(quantities, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
     yield from table([(share.name, speed_band_text(share), str(share.why)) for share in prediction.shares], head)
-    yield from _left_out(entry)
+    # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
+    listed = [omitted for omitted in entry.neglected if abs(omitted.change) >= 0.005]
+    speeds = [" → ".join(value_in_unit(m_s, "m/s") for m_s in (one.without_m_s, one.final_m_s)) for one in listed]
+    if listed:
+        yield ""
+        changes = [(o.effect, o.size, f"{m_s} m/s", f"{o.change:+.1%}") for o, m_s in zip(listed, speeds, strict=True)]
+        yield from table(changes, ("not in the model", "at the size", "final speed", "change"))
     yield ""
     yield from (f"! {warning}" for warning in entry.hazards)
 
@@ -294,24 +269,6 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
         texts, unit = [value_in_unit(value, unit) for value in values], display_unit(unit, PREDICTION_UNITS)[0]
     no_band = quantity.low == quantity.high or math.isnan(quantity.median)
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
-
-
-def _left_out(entry: ConditionPrediction) -> Iterator[str]:
-    """Yield a table of neglected effects that every vine has, with their influence on the final speed."""
-    # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
-    rows = [
-        (
-            omitted.effect,
-            omitted.size,
-            f"{value_in_unit(omitted.without_m_s, 'm/s')} → {value_in_unit(omitted.final_m_s, 'm/s')} m/s",
-            f"{omitted.change:+.1%}",
-        )
-        for omitted in entry.neglected
-        if abs(omitted.change) >= 0.005
-    ]
-    if rows:
-        yield ""
-        yield from table(rows, ("not in the model", "at the size", "final speed", "change"))
 
 
 def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
@@ -355,10 +312,7 @@ def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
             {"name": s.name, "words": str(s.why), "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
             for s in prediction.shares
         ],
-        "left_out": [
-            {"effect": n.effect, "size": n.size, "final_m_s": n.final_m_s, "without_m_s": n.without_m_s}
-            for n in entry.neglected
-        ],
+        "left_out": [asdict(omitted) for omitted in entry.neglected],
         "arrives": prediction.arrives,
         "slack": prediction.slack,
         "warnings": list(entry.hazards),
@@ -401,7 +355,6 @@ def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "
 
 
 def design_vine(
-    request: PredictionRequest,
     *,
     films: str,
     diameter: str,
@@ -412,10 +365,11 @@ def design_vine(
     seed: int,
     at_fraction: float,
     figure: Path | None = None,
+    **given: Any,
 ) -> tuple[list[str], dict[str, Any]]:
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
     check_figure(figure)
-    basis = read_basis(request, needed=("pressure_kPa",))
+    basis = read_basis(("pressure_kPa",), **given)
     room = Room(
         films_m=tuple(dict.fromkeys(_cell("thickness_um", part, FILMS) for part in films.split(",") if part.strip())),
         diameter_m=read_range("diameter_mm", diameter),
@@ -439,13 +393,18 @@ def design_vine(
     if figure is not None:
         write_figure(draw_choice(choices), figure)
         lines.append(f"Figure: {figure}")
-    entries = []
-    for choice in choices:
-        trial, final = choice.prediction.inputs.trial, choice.prediction.final
-        entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION}
-        speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
-        chosen = {"fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)}
-        entries.append({**entry, "final_speed_m_s": speed, **chosen})
+    entries = [
+        {
+            **{name: COLUMNS[name].of_trial(choice.prediction.inputs.trial) for name in REQUIRED_FOR_PREDICTION},
+            "final_speed_m_s": {
+                "y_over_L": (final := choice.prediction.final).y_over_L,
+                **{key: value for key, value in _band(final).items() if key not in ("name", "unit")},
+            },
+            "fastest_in_share_of_draws": choice.odds,
+            "limited_by": list(choice.limits),
+        }
+        for choice in choices
+    ]
     return lines, {"warnings": basis.heading, "films": entries}
 
 
@@ -493,16 +452,11 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
 
 
 def design_reservoir(
-    request: PredictionRequest,
-    *,
-    within_percent: float,
-    supply_s: float,
-    at_fraction: float,
-    figure: Path | None = None,
+    *, within_percent: float, supply_s: float, at_fraction: float, figure: Path | None = None, **given: Any
 ) -> tuple[list[str], dict[str, Any]]:
     """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
     check_figure(figure)
-    basis = read_basis(request, needed=("diameter_mm", "length_mm", "pressure_kPa"))
+    basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
     trial = basis.planned.trials[0]
     loss = within_percent / 100
     with planning_errors(), waiting("simulating"):
