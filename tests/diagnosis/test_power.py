@@ -12,7 +12,7 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis import campaign_power, linear_power
-from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
+from vinetrack.diagnosis.campaign_power import CampaignDesign, FilmingPlan, make, planned_tests
 from vinetrack.diagnosis.further_trials import (
     NextExperiment,
     _alone_and_distinct,
@@ -25,7 +25,6 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
-from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
 

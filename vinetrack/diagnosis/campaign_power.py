@@ -1,6 +1,8 @@
 """Power of a campaign: of trials that were fitted, or of a planned design.
 
-A planned campaign is simulated without noise, and tested with the noise and between-trial scatter expected of it.
+A planned campaign is simulated without noise, and tested with the noise and between-trial scatter expected of it. As a
+check, campaigns are simulated with all of these and diagnosed in full: every trial has its own pressure and B, every
+vine a misread yield pressure, release falls between frames and positions are noisy; the truth may have one effect more.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vinetrack.core.problems import Remark
-from vinetrack.core.records import Trial
+from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
@@ -23,13 +25,80 @@ from vinetrack.diagnosis.power import SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.score_test import testable
 from vinetrack.dynamics.model import Model, host_for
-from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.dynamics.simulate import SimulationError, simulate_many
 from vinetrack.effects import EffectError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit
-from vinetrack.planning.simulated_campaigns import FilmingPlan, make
+from vinetrack.inference.fit_result import DAMPING, Fit
+from vinetrack.tracks.position_noise import ar1_noise
+
+
+@dataclass(frozen=True)
+class FilmingPlan:
+    """How a trial is filmed: frames per second, noise of a position, m, and its lag-one correlation. A recording ends
+    with the growth, at twice `longest_s` where the growth does not end, and at the latest `stops_s` after release.
+    `slow_error_m` is the slow error that its tracker states, NaN for positions measured elsewhere; `has_trace` says
+    whether its pressure is measured.
+    """
+
+    capture_fps: float
+    noise_m: float
+    noise_correlation: float = 0.0
+    longest_s: float = 4.0
+    stops_s: float = math.inf
+    slow_error_m: float = math.nan
+    has_trace: bool = False
+
+
+def make(
+    model: Model,
+    trials: Sequence[Trial],
+    cameras: Sequence[FilmingPlan],
+    spreads: tuple[float, float],
+    draw: np.random.Generator,
+    host: Model | None = None,
+) -> list[tuple[Trial, Track]]:
+    """Simulate one campaign: its trials as the sheet states them, and their tracks. The camera counts as calibrated:
+    positions have no systematic error unless the sheet states one.
+    """
+    rest_frames = 20  # Frames at rest before release (chosen)
+    count = len(trials)
+    pressure_factors = 1 + spreads[0] * draw.standard_normal(count)
+    misread = {vine: draw.standard_normal() for vine in dict.fromkeys(trial.vine for trial in trials)}
+    true_trials = [
+        replace(
+            trial,
+            pressure_Pa=trial.pressure_Pa * float(factor),
+            yield_pressure_Pa=max(trial.yield_pressure_Pa + trial.yield_pressure_sigma_Pa * misread[trial.vine], 0.0),
+        )
+        for trial, factor in zip(trials, pressure_factors, strict=True)
+    ]
+    theta = np.array([model.parameters_of(trial) for trial in trials])
+    theta[:, model.parameter_names.index(DAMPING)] *= np.exp(spreads[1] * draw.standard_normal(count))
+    until_longest = [np.array([0.0, 2 * camera.longest_s]) for camera in cameras]
+    ends = simulate_many(model, true_trials, until_longest, parameters=theta, host=host)
+    release_frames = rest_frames - draw.uniform(size=count)
+    times, since_release = [], []
+    for end, camera, release in zip(ends, cameras, release_frames.tolist(), strict=True):
+        stop_s = min(end.end_time_s if end.status == "ended" else 2 * camera.longest_s, camera.stops_s)
+        times.append(np.arange(rest_frames + int(stop_s * camera.capture_fps)) / camera.capture_fps)
+        since_release.append(times[-1] - release / camera.capture_fps)
+    moved = simulate_many(model, true_trials, since_release, parameters=theta, host=host)
+    pairs = []
+    for trial, time_s, trajectory, camera in zip(trials, times, moved, cameras, strict=True):
+        noise_m = ar1_noise(time_s.size, camera.noise_m, camera.noise_correlation, draw)
+        position_m = trajectory.observed_position_m + noise_m + draw.uniform(-0.05, 0.05)
+        pressure_Pa = np.full(time_s.size, trial.pressure_Pa) if camera.has_trace else None
+        track = plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
+        systematic_m = trial.position_systematic_m if math.isfinite(trial.position_systematic_m) else 0.0
+        pairs.append(
+            (
+                replace(trial, position_systematic_m=systematic_m),
+                replace(track, lead_position_systematic_m=np.full(time_s.size, camera.slow_error_m)),
+            )
+        )
+    return pairs
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_sha
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials, Power
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
-from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.experiment.schema import COLUMNS, LIMITED
@@ -49,10 +48,10 @@ from vinetrack.planning.discriminating_design import (
     feasible_conditions,
     growth_courses,
     refit_terms,
+    simulated_rises,
     worth,
 )
 from vinetrack.planning.predictive_inputs import prior_ratio
-from vinetrack.planning.simulated_campaigns import simulated_rises
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
@@ -99,30 +98,16 @@ class NextExperiment:
         }
 
 
-@dataclass(frozen=True)
-class _Option:
-    """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `simulated_rises`."""
+def _separations(rises: Floats) -> Floats:
+    """Root of the mean rise over the draws, shape (n, n); 0 where a wrong hypothesis fits better."""
+    count = np.maximum(np.isfinite(rises).sum(axis=0), 1)
+    return np.asarray(np.sqrt(np.maximum(np.nansum(rises, axis=0) / count, 0.0)))
 
-    design: Sequence[int]
-    rises: Floats
 
-    @property
-    def separations(self) -> Floats:
-        """Root of the mean rise over the draws, shape (n, n); 0 where a wrong hypothesis fits better."""
-        count = np.maximum(np.isfinite(self.rises).sum(axis=0), 1)
-        return np.asarray(np.sqrt(np.maximum(np.nansum(self.rises, axis=0) / count, 0.0)))
-
-    @property
-    def by_pair(self) -> dict[tuple[int, int], float]:
-        """The smaller separation of the two directions, by pair."""
-        pairs = itertools.combinations(range(len(self.separations)), 2)
-        return {(a, b): float(min(self.separations[a, b], self.separations[b, a])) for a, b in pairs}
-
-    @property
-    def is_sufficient(self) -> bool:
-        # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
-        # recommended (chosen)
-        return min(self.by_pair.values()) >= 8.0
+def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
+    """The smaller separation of the two directions, by pair."""
+    pairs = itertools.combinations(range(len(separations)), 2)
+    return {(a, b): float(min(separations[a, b], separations[b, a])) for a, b in pairs}
 
 
 @in_one_blas_thread
@@ -147,9 +132,8 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     terms = _feasible_trials(tied, names, limits)
     if not terms:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
-    return _recommendation(
-        [of_hypothesis.hypothesis for of_hypothesis in terms], _best_option(terms, limits, seed), seed
-    )
+    design, rises = _best_option(terms, limits, seed)
+    return _recommendation([of_hypothesis.hypothesis for of_hypothesis in terms], design, rises, seed)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -190,10 +174,12 @@ def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) 
         raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
 
 
-def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> _Option:
-    """The best set of trials of the least effort that is sufficient, else of all, with its expected separation."""
+def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> tuple[list[int], Floats]:
+    """The best set of trials of the least effort that is sufficient, else of all. Returns design (indices of
+    conditions, one a trial), rises (see `simulated_rises`).
+    """
     hypotheses = [of_hypothesis.hypothesis for of_hypothesis in terms]
-    options: list[_Option] = []
+    options: list[tuple[list[int], Floats]] = []
     before = -math.inf
 
     def best_vines(places: NDArray[np.intp]) -> list[str]:
@@ -206,16 +192,18 @@ def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> _Option:
         # considered (chosen)
         if predicted > 1.01 * before:
             before = predicted
-            options.append(_Option(design, simulated_rises(hypotheses, design, [0], seed)))
-            if options[-1].is_sufficient:
+            options.append((design, simulated_rises(hypotheses, design, [0], seed)))
+            # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
+            # recommended (chosen)
+            if min(_by_pair(_separations(options[-1][1])).values()) >= 8.0:
                 return options[-1]
-    return max(options, key=lambda option: float(worth(option.separations[None])[0]))
+    return max(options, key=lambda option: float(worth(_separations(option[1])[None])[0]))
 
 
-def _recommendation(hypotheses: Sequence[Hypothesis], best: _Option, seed: int) -> NextExperiment:
+def _recommendation(hypotheses: Sequence[Hypothesis], design: list[int], rises: Floats, seed: int) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    best = _Option(best.design, np.concatenate([best.rises, simulated_rises(hypotheses, best.design, [1], seed)]))
-    expected = best.by_pair
+    separations = _separations(np.concatenate([rises, simulated_rises(hypotheses, design, [1], seed)]))
+    expected = _by_pair(separations)
     names = [hypothesis.name for hypothesis in hypotheses]
     pair_names = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
     worth_it = max(expected.values()) >= least_separation
@@ -223,7 +211,7 @@ def _recommendation(hypotheses: Sequence[Hypothesis], best: _Option, seed: int) 
     draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected.values()) > 20.0), 1)
     simulated = {}
     if worth_it:
-        simulated = _simulated_separations(simulated_rises(hypotheses, best.design, range(draws), seed, thorough=True))
+        simulated = _simulated_separations(simulated_rises(hypotheses, design, range(draws), seed, thorough=True))
     unresolved = [
         pair for pair, sigma in expected.items() if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
     ]
@@ -233,9 +221,9 @@ def _recommendation(hypotheses: Sequence[Hypothesis], best: _Option, seed: int) 
     kinds = [{effect.kind for effect in fit.model} for fit in fits]
     pairs = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
     measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in pairs])
-    trials = trial_entries(hypotheses[0].conditions, best.design)
+    trials = trial_entries(hypotheses[0].conditions, design)
     if_true = {
-        pair: {names[a]: float(best.separations[a, b]), names[b]: float(best.separations[b, a])}
+        pair: {names[a]: float(separations[a, b]), names[b]: float(separations[b, a])}
         for (a, b), pair in pair_names.items()
     }
     simulated_by_name = {pair_names[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()}
@@ -262,10 +250,9 @@ def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, 
     sigma = np.sqrt(np.maximum(rises, 0.0))
     simulated = {}
     for a, b in itertools.combinations(range(rises.shape[1]), 2):
-        directions = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
-        directions = [draws for draws in directions if draws.size]
-        if directions:
-            least = min(directions, key=lambda draws: float(np.mean(draws)))
+        known = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
+        least = min((draws for draws in known if draws.size), key=lambda draws: float(np.mean(draws)), default=None)
+        if least is not None:
             simulated[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
     return simulated
 
@@ -304,6 +291,8 @@ REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
 UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
 
+Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products
+
 
 class DesignInformation:
     """Information of designs about the sizes of some effects with everything else free. `conditions` are those that can
@@ -338,33 +327,40 @@ class DesignInformation:
         solved = np.linalg.solve(totals[:, :-count, :-count], cross)
         return np.asarray(totals[:, -count:, -count:] - np.swapaxes(cross, 1, 2) @ solved)
 
+    def grown(self, allowed: NDArray[np.intp], worth: Worth, most: int, wanted: float = math.inf) -> list[int]:
+        """Groups of trials added one by one, up to the `wanted` worth or `most` groups, and exchanged."""
+        chosen: list[int] = []
+        now = float(worth(self.so_far[None])[0])
+        while now < wanted and len(chosen) < most:
+            values = worth(self.total(chosen) + self.each[allowed])
+            if not np.max(values) > now:
+                break
+            chosen.append(int(allowed[int(np.argmax(values))]))
+            now = float(np.max(values))
+        return self.improved(chosen, allowed, worth)
+
+    def improved(self, chosen: list[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
+        """The same number of groups, exchanged."""
+        now = float(worth(self.total(chosen)[None])[0])
+        return exchanged(chosen, now, allowed, lambda others: worth(self.total(others) + self.each[allowed]))[0]
+
 
 def tests_with_conditions(
     design: CampaignDesign, added: Sequence[Condition], candidates: Sequence[str] | None
 ) -> MisfitTests:
     """Misfit tests of a noise-free design with one trial of each condition added."""
     longest_s = max(camera.longest_s for camera in design.cameras)
-    values: dict[str, Value] = {}
-    stated_B = design.model.values.get(DAMPING)
-    new = {c.trial.vine: c for c in added if c.trial.vine not in {trial.vine for trial in design.trials}}
-    if new and stated_B is not None:
-        B = (
-            dict(stated_B)
-            if isinstance(stated_B, Mapping)
-            else {trial.vine: float(stated_B) for trial in design.trials}
-        )
-        for vine, condition in new.items():
-            like = design.trials[condition.like]
-            B[vine] = B[like.vine] * prior_ratio(condition.trial, like)
-        values = {DAMPING: B}
+    column = design.model.parameter_names.index(DAMPING)
+    B = {trial.vine: float(design.model.parameters_of(trial)[column]) for trial in design.trials}
+    for condition in added:
+        like = design.trials[condition.like]
+        B.setdefault(condition.trial.vine, B[like.vine] * prior_ratio(condition.trial, like))
+    cameras = [replace(design.cameras[c.like], stops_s=math.inf, longest_s=longest_s) for c in added]
     extended = replace(
         design,
-        model=design.model.with_values(values),
+        model=design.model.with_values({DAMPING: B}),
         trials=(*design.trials, *(condition.trial for condition in added)),
-        cameras=(
-            *design.cameras,
-            *(replace(design.cameras[c.like], stops_s=math.inf, longest_s=longest_s) for c in added),
-        ),
+        cameras=(*design.cameras, *cameras),
         candidates=candidates,
     )
     return planned_tests(extended)[0]
@@ -484,31 +480,10 @@ class _Search(DesignInformation):
         """Pairs added one by one up to the wanted information, exchanged, and removed where not needed; the most
         informative first.
         """
-
-        def improved(chosen: list[int]) -> list[int]:
-            def worth_with(others: list[int]) -> Floats:
-                return self.first_information(self.total(others) + self.each[allowed])
-
-            return exchanged(chosen, self.information(chosen), allowed, worth_with)[0]
-
-        pairs_per_step = (1, 2)  # Pairs of one condition that are added at a time; the best gain a pair counts (chosen)
-        chosen: list[int] = []
-        information = self.information(())
-        while information < wanted and len(chosen) < most:
-            total = self.total(chosen)
-            gains = [
-                (self.first_information(total + count * self.each[allowed]) - information) / count
-                for count in pairs_per_step
-            ]
-            step, index = np.unravel_index(int(np.argmax(gains)), (len(pairs_per_step), allowed.size))
-            if not gains[step][index] > 0:
-                break
-            chosen += [int(allowed[index])] * min(pairs_per_step[step], most - len(chosen))
-            information = self.information(chosen)
-        chosen = improved(chosen)
+        chosen = self.grown(allowed, self.first_information, most, wanted)
         while len(chosen) > 1:
             least = int(np.argmax(self.first_information(self.total(chosen) - self.each[chosen])))
-            fewer = improved(chosen[:least] + chosen[least + 1 :])
+            fewer = self.improved(chosen[:least] + chosen[least + 1 :], allowed, self.first_information)
             if self.information(fewer) < wanted:
                 break
             chosen = fewer
@@ -594,15 +569,9 @@ def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | No
         scores = SIZES[:, None, None, None] * largest * np.sqrt(information)
         return np.asarray(ndtr(scores - power.threshold).mean(axis=0).sum(axis=(0, 2)))
 
-    def worth_with(others: list[int]) -> Floats:
-        return expected_discoveries(search.total(others) + search.each)
-
     every = np.arange(len(search.conditions))
-    chosen: list[int] = []
-    for _ in range(max(limits.trials // REPLICATES, 1)):
-        chosen.append(int(np.argmax(worth_with(chosen))))
-    chosen, best = exchanged(chosen, float(expected_discoveries(search.total(chosen)[None])[0]), every, worth_with)
-    if not best > expected_discoveries(search.total(())[None])[0]:
+    chosen = search.grown(every, expected_discoveries, max(limits.trials // REPLICATES, 1))
+    if not chosen:
         return None
     groups = [k for k in chosen for _ in range(min(REPLICATES, limits.trials))]
     added = [search.conditions[k] for k in groups]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.campaign_power import (
     CampaignDesign,
+    FilmingPlan,
     design_of_fit,
     fitted_tests,
     planned_tests,
@@ -42,7 +43,6 @@ from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.pipeline.predict_stage import effects_of_plan
 from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
-from vinetrack.planning.simulated_campaigns import FilmingPlan
 from vinetrack.results.folder_layout import Results, measured_trials, read_diagnosis, read_source_experiment
 
 
@@ -71,38 +71,27 @@ class PowerRequest:
     experiment: Path | None = None
 
 
-def _assumptions(
-    request: PowerRequest, noise: tuple[float, float], spreads: Sequence[float], otherwise: tuple[str, str]
-) -> tuple[tuple[float, float], tuple[float, float], list[PowerInput]]:
-    """Noise of a position, m, with its correlation, and standard deviations between trials of pressure and B: as
-    stated, else those given, which have the origins `otherwise`. Returns noise, spreads, and both in words.
-    """
-    noise_stated = np.array([request.noise_mm / 1e3, request.noise_correlation])
-    spreads_stated = np.array([request.spread_P, request.spread_B])
-    noise_m, correlation = np.where(np.isnan(noise_stated), noise, noise_stated).tolist()
-    pressure, damping = np.where(np.isnan(spreads_stated), spreads, spreads_stated).tolist()
-    of_noise, of_spreads = (
-        origin if np.isnan(stated).all() else "stated"
-        for origin, stated in zip(otherwise, (noise_stated, spreads_stated), strict=True)
-    )
-    words = [
-        PowerInput("noise of a position", f"{1e3 * noise_m:.3g} mm, correlation {correlation:.2f}", of_noise),
-        PowerInput("spread of pressure from trial to trial", f"{100 * pressure:.2g} %", of_spreads),
-        PowerInput("spread of B from trial to trial", f"{100 * damping:.2g} %", of_spreads),
+def _assumed(stated: tuple[float, float], otherwise: Sequence[float], origin: str) -> tuple[tuple[float, float], str]:
+    """A pair of numbers, each as stated, else as given otherwise; and where they come from."""
+    first, second = np.where(np.isnan(stated), otherwise, stated).tolist()
+    return (first, second), origin if np.isnan(stated).all() else "stated"
+
+
+def _inputs_in_words(
+    noise: tuple[float, float], of_noise: str, spreads: tuple[float, float], of_spreads: str
+) -> list[PowerInput]:
+    """Noise of a position, m, with its correlation, and standard deviations between trials of pressure and B."""
+    return [
+        PowerInput("noise of a position", f"{1e3 * noise[0]:.3g} mm, correlation {noise[1]:.2f}", of_noise),
+        PowerInput("spread of pressure from trial to trial", f"{100 * spreads[0]:.2g} %", of_spreads),
+        PowerInput("spread of B from trial to trial", f"{100 * spreads[1]:.2g} %", of_spreads),
     ]
-    return (noise_m, correlation), (pressure, damping), words
 
 
-@dataclass(frozen=True)
-class PowerCampaign:
-    """The power of a campaign by linear theory, its design for simulations, and constraints on further trials."""
-
-    power: Power
-    design: CampaignDesign
-    limits: Limits = field(default_factory=Limits)
+Campaign = tuple[Power, CampaignDesign, Limits]  # Power by linear theory, design, and constraints on further trials
 
 
-def campaign_of_target(request: PowerRequest) -> PowerCampaign:
+def _campaign_of_target(request: PowerRequest) -> Campaign:
     """Return the campaign of the measured trials of a results folder or an experiment; without any, of the planned."""
     target = request.target
     experiment: Experiment | None
@@ -127,34 +116,35 @@ def campaign_of_target(request: PowerRequest) -> PowerCampaign:
 
 def _measured_campaign(
     request: PowerRequest, model: Model, pairs: Pairs, candidates: Sequence[str] | None, limits: Limits
-) -> PowerCampaign:
+) -> Campaign:
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
     fitted = fit(model, pairs, host=host, profile=False, thorough=False)
-    noise, spreads, inputs = _assumptions(
-        request, (fitted.noise_m, fitted.noise_correlation), fitted.state.spread, ("fit", "fit")
-    )
-    noise_stated, spreads_stated = (row.origin == "stated" for row in inputs[:2])
-    if noise_stated or spreads_stated:
-        of_trials, of_points = spreads if spreads_stated else None, noise if noise_stated else None
+    otherwise = fitted.noise_m, fitted.noise_correlation
+    noise, of_noise = _assumed((request.noise_mm / 1e3, request.noise_correlation), otherwise, "fit")
+    spreads, of_spreads = _assumed((request.spread_P, request.spread_B), fitted.state.spread, "fit")
+    inputs: Sequence[PowerInput] = ()
+    if "stated" in (of_noise, of_spreads):
+        of_trials, of_points = spreads if of_spreads == "stated" else None, noise if of_noise == "stated" else None
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False, thorough=False)
-    tests, not_testable = fitted_tests(fitted, candidates)
-    power = power_of(tests, not_testable, inputs if noise_stated or spreads_stated else (), nonlinear=True)
-    return PowerCampaign(power, design_of_fit(fitted, candidates), limits)
+        inputs = _inputs_in_words(noise, of_noise, spreads, of_spreads)
+    power = power_of(*fitted_tests(fitted, candidates), inputs, nonlinear=True)
+    return power, design_of_fit(fitted, candidates), limits
 
 
-def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCampaign:
+def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
-    default_noise_m, default_capture_fps = 1e-4, 1069.0  # Noise of a position, and frame rate, where not given (chosen)
+    default_noise, default_capture_fps = (1e-4, 0.0), 1069.0  # Noise of a position, and frame rate (chosen)
     settings = planned.settings
     stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=effects_of_plan(planned))
     first_of_vine = {trial.vine: trial for trial in reversed(planned.trials)}
-    vines = dict.fromkeys(trial.vine for trial in planned.trials)
-    by_vine = {vine: predictive_inputs(first_of_vine[vine], stated) for vine in vines}
+    by_vine = {
+        vine: predictive_inputs(first_of_vine[vine], stated) for vine in dict.fromkeys(t.vine for t in planned.trials)
+    }
     first = next(iter(by_vine.values()))
-    noise, spreads, inputs = _assumptions(
-        request, (default_noise_m, 0.0), first.spreads, ("guess", "guess: a usual batch of vines")
-    )
+    noise, of_noise = _assumed((request.noise_mm / 1e3, request.noise_correlation), default_noise, "guess")
+    usual = "guess: a usual batch of vines"
+    spreads, of_spreads = _assumed((request.spread_P, request.spread_B), first.spreads, usual)
     systematic_m, systematic_origin = _planned_systematic(request, planned)
     trials, cameras = [], []
     for trial in planned.trials:
@@ -163,10 +153,11 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
             trial = replace(trial, yield_pressure_Pa=assumed_Pa, yield_pressure_sigma_Pa=1e3 * YIELD_SIGMA_KPA)
         trials.append(replace(trial, position_systematic_m=systematic_m))
         rates = (request.capture_fps, trial.capture_fps, default_capture_fps)
-        cameras.append(FilmingPlan(next(fps for fps in rates if math.isfinite(fps)), *noise))
+        cameras.append(FilmingPlan(next(filter(math.isfinite, rates)), *noise))
     is_in_sheet = all(math.isfinite(trial.capture_fps) for trial in trials)
     fps_origin = "stated" if math.isfinite(request.capture_fps) else "sheet" if is_in_sheet else "guess"
-    inputs += [
+    inputs = [
+        *_inputs_in_words(noise, of_noise, spreads, of_spreads),
         PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
         PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", fps_origin),
         *(
@@ -177,8 +168,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
     design = CampaignDesign(model, tuple(trials), tuple(cameras), spreads, settings.candidates)
-    tests, not_testable = planned_tests(design)
-    return PowerCampaign(power_of(tests, not_testable, inputs, nonlinear=True), design, settings.limits)
+    return power_of(*planned_tests(design), inputs, nonlinear=True), design, settings.limits
 
 
 def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[float, str]:
@@ -197,20 +187,17 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
     with waiting("calculating the power of the trials"):
         if given is None:
-            campaign = campaign_of_target(request)
+            now, design, limits = _campaign_of_target(request)
         elif isinstance(given, Fit):
-            tests, not_testable = fitted_tests(given)
-            campaign = PowerCampaign(power_of(tests, not_testable, nonlinear=True), design_of_fit(given))
+            now, design, limits = power_of(*fitted_tests(given), nonlinear=True), design_of_fit(given), Limits()
         else:
-            campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
-    asked = [_asked(text, campaign.power) for text in request.effects]
-    power = campaign.power
+            now, design, limits = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
+    power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
-        power = replace(power, simulated=tuple(_simulated_rates(request, campaign, asked)))
+        power = replace(power, simulated=tuple(_simulated_rates(request, design, now, asked)))
     if request.recommend:
         with waiting("searching for the trials to make next"):
-            recommended = exploratory_trials(campaign.design, campaign.power, campaign.limits)
-        power = replace(power, recommended=recommended)
+            power = replace(power, recommended=exploratory_trials(design, now, limits))
     if math.isfinite(request.reach):
         for text, (name, value) in zip(request.effects, asked, strict=True):
             if name in power.not_testable:
@@ -218,7 +205,7 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
             if not math.isfinite(value):
                 raise _refusal("needs a size", text, "write the size to detect, such as leak=0.5")
             with waiting(f"searching for trials that detect {name}"):
-                plan = further_trials(campaign.design, power[name], value, request.reach, campaign.limits)
+                plan = further_trials(design, power[name], value, request.reach, limits)
             power = replace(power, further=(*power.further, plan))
     return power.of_effects([name for name, _ in asked])
 
@@ -262,10 +249,9 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
 
 
 def _simulated_rates(
-    request: PowerRequest, campaign: PowerCampaign, asked: Sequence[tuple[str, float]]
+    request: PowerRequest, design: CampaignDesign, power: Power, asked: Sequence[tuple[str, float]]
 ) -> Iterator[SimulatedRates]:
     """Simulate campaigns of the design and diagnose each in full; yield the rate of each kind, the null first."""
-    power = campaign.power
     wanted: list[tuple[str, tuple[float, ...], float]] = [("", (math.nan,), power.false_alarm_rate)]
     for name, size in asked:
         if name not in power.not_testable:
@@ -278,7 +264,7 @@ def _simulated_rates(
     with progress(len(wanted) * len(seeds), "simulating", unit="campaign") as bar:
         for effect, values, predicted_rate in wanted:
             diagnoses = []
-            work = partial(simulated_diagnosis, campaign.design, effect, values)
+            work = partial(simulated_diagnosis, design, effect, values)
             for answer in map_unordered(work, seeds, request.jobs):
                 diagnoses.append(answer)
                 bar.advance()

@@ -20,7 +20,7 @@ from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.experiment.schema import COLUMNS, CellError, option, read_cell
+from vinetrack.experiment.schema import COLUMNS, CellError, option, read_range
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
@@ -326,32 +326,18 @@ def _band(one: Input | Quantity) -> dict[str, Any]:
 # ------------------------------------------------------------------------------
 # Designs: the fastest vine within limits, and the chamber that it needs.
 
-FILMS = "--films-um"
 
-
-def read_range(column: str, text: str) -> tuple[float, float]:
+def read_si_range(column: str, text: str, name: str = "") -> tuple[float, float]:
     """Read `low:high` or one number, each checked like a cell of the column; return both in SI."""
-    values = [_cell(column, part) for part in text.split(":")]
-    if len(values) > 2:
-        raise _refusal(column, text, "is not a range", "write low:high, such as 5:25")
-    if values[0] > values[-1]:
-        raise _refusal(column, text, "ends before it begins", "write the lower value first")
-    return values[0], values[-1]
-
-
-def _cell(column: str, text: str, name: str = "") -> float:
-    """Read one number of a column; return it in SI."""
     try:
-        value = read_cell(COLUMNS[column], text.strip())
+        low, high = read_range(COLUMNS[column], text if ":" in text else (text, text))
     except CellError as error:
-        raise _refusal(column, text, error.message, error.remedy, error.allowed, name) from None
-    assert isinstance(value, float)
-    return COLUMNS[column].to_si(value)
+        raise _refusal(name or option(column), text, error.message, error.remedy, error.allowed) from None
+    return COLUMNS[column].to_si(low), COLUMNS[column].to_si(high)
 
 
-def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "", name: str = "") -> ExperimentError:
-    problem = Problem(message=message, column=name or option(column), value=text, allowed=allowed, remedy=remedy)
-    return ExperimentError([problem])
+def _refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
+    return ExperimentError([Problem(message=message, column=name, value=text, allowed=allowed, remedy=remedy)])
 
 
 def design_vine(
@@ -370,10 +356,11 @@ def design_vine(
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
     check_figure(figure)
     basis = read_basis(("pressure_kPa",), **given)
+    films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",") if part.strip()]
     room = Room(
-        films_m=tuple(dict.fromkeys(_cell("thickness_um", part, FILMS) for part in films.split(",") if part.strip())),
-        diameter_m=read_range("diameter_mm", diameter),
-        length_m=read_range("length_mm", length),
+        films_m=tuple(dict.fromkeys(films_m)),
+        diameter_m=read_si_range("diameter_mm", diameter),
+        length_m=read_si_range("length_mm", length),
         pressure_Pa=basis.planned.trials[0].pressure_Pa,
         rig=basis.planned.trials[0],
         burst_share=burst_share,
@@ -381,11 +368,11 @@ def design_vine(
     )
     max_films = 12  # Largest number of films (chosen)
     if not 0 < len(room.films_m) <= max_films:
-        raise _refusal("thickness_um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}", name=FILMS)
+        raise _refusal("--films-um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}")
     thickest_m = max(room.films_m)
     if thickest_m > room.diameter_m[0] / 4:
         message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"
-        raise _refusal("diameter_mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
+        raise _refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with planning_errors(), waiting("looking for the fastest vine"):
         choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     _refuse_standstill(room, choices)
@@ -419,7 +406,7 @@ def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
     if highest_Pa < 0.995 * room.pressure_Pa:
         message += f": their walls may carry at most {highest_Pa / 1e3:.3g} kPa"
         remedy = "raise --burst-fraction, or allow thicker films or smaller diameters"
-    raise _refusal("pressure_kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
+    raise _refusal("--pressure-kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
@@ -470,21 +457,20 @@ def design_reservoir(
     if figure is not None:
         swept = swept_m3(trial)
         drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
-        losses = {
-            law: np.array([gauge_loss(trial, volume_m3, gamma) for volume_m3 in drawn_m3.tolist()])
-            for law, gamma in GAMMAS.items()
-        }
+        drawn = [_losses(trial, volume_m3) for volume_m3 in drawn_m3.tolist()]
+        losses = {law: np.array([one[law] for one in drawn]) for law in GAMMAS}
         write_figure(draw_reservoir(drawn_m3, losses, loss, swept, trial.chamber_m3), figure)
         lines.append(f"Figure: {figure}")
     entries = [
-        {
-            "chamber": name,
-            "volume_l": 1e3 * volume_m3,
-            "loss_of_gauge_pressure": {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()},
-        }
+        {"chamber": name, "volume_l": 1e3 * volume_m3, "loss_of_gauge_pressure": _losses(trial, volume_m3)}
         for name, volume_m3 in chambers(trial, loss).items()
     ]
     return lines, {"warnings": basis.heading, "chambers": entries}
+
+
+def _losses(trial: Trial, volume_m3: float) -> dict[str, float]:
+    """Fraction of the gauge pressure that a chamber loses, by the gas law."""
+    return {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()}
 
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
@@ -495,7 +481,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
     for name, volume_m3 in chambers(trial, loss).items():
         cells = [name, volume_text(volume_m3)]
-        cells += [f"{100 * gauge_loss(trial, volume_m3, gamma):.1f}" for gamma in GAMMAS.values()]
+        cells += [f"{100 * lost:.1f}" for lost in _losses(trial, volume_m3).values()]
         if inputs is not None:
             finals = [final_with(inputs, volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
             cells += [value_in_unit(final, "m/s") for final in finals]

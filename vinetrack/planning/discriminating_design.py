@@ -17,6 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from vinetrack.inference.marginal_likelihood import (
     normal_equations,
     solve_per_trial,
 )
+from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -43,6 +45,8 @@ from vinetrack.inference.sensitivity import (
     RELEASE,
     Job,
     Predictor,
+    align,
+    initial_trial_effects,
 )
 from vinetrack.planning.predictive_inputs import damping_scatter, hoop_stress_Pa, prior_ratio
 from vinetrack.tracks.position_noise import ar1_noise
@@ -142,23 +146,27 @@ def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
 def _typical_trials(trials: Sequence[Trial]) -> list[int]:
     """Index of a typical trial of each everting vine: the first with its commonest rig and yield pressure."""
     shown = ("vine", "yield_pressure_Pa", "bends", *RIG.values())
-    rigs = [tuple(getattr(trial, name) for name in shown) for trial in trials]
-    texts = [repr(rig) for rig in rigs]
+    texts = [repr([getattr(trial, name) for name in shown]) for trial in trials]
     places = []
     for vine in dict.fromkeys(trial.vine for trial in trials if trial.travel_ratio != 1):
-        of_vine = [texts[i] for i, rig in enumerate(rigs) if rig[0] == vine]
-        places.append(texts.index(Counter(of_vine).most_common(1)[0][0]))
+        of_vine = Counter(text for text, trial in zip(texts, trials, strict=True) if trial.vine == vine)
+        places.append(texts.index(of_vine.most_common(1)[0][0]))
     return places
+
+
+def _stated(limits: Limits, column: str) -> list[float] | None:
+    """Values of a column that the user allows, SI; None for any."""
+    values = getattr(limits, column)
+    return None if values is None else [COLUMNS[column].to_si(value) for value in values]
 
 
 def _allowed(vine: Trial, limits: Limits) -> bool:
     """Whether the user's lists of sizes, where given, contain this vine."""
-    sizes = (
-        (vine.diameter_m * 1e3, limits.diameter_mm),
-        (vine.thickness_m * 1e6, limits.thickness_um),
-        (vine.length_m * 1e3, limits.length_mm),
-    )
-    return all(values is None or not math.isfinite(size) or _is_among(size, values) for size, values in sizes)
+    for column in ("diameter_mm", "thickness_um", "length_mm"):
+        size, values = getattr(vine, COLUMNS[column].field), _stated(limits, column)
+        if values is not None and math.isfinite(size) and not _is_among(size, values):
+            return False
+    return True
 
 
 def _is_among(value: float, values: Iterable[float]) -> bool:
@@ -167,31 +175,29 @@ def _is_among(value: float, values: Iterable[float]) -> bool:
 
 def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
     """The vine on every rig; chamber, connector and angle change one at a time unless the limits require more."""
-    half, twice = math.sqrt(0.5), math.sqrt(2.0)
-    chambers = _choices(vine.chamber_m3, [t.chamber_m3 for t in used], limits.chamber_l, 1e-3, (0.5, 2.0))
-    inlets = _choices(vine.inlet_m, [t.inlet_m for t in used], limits.inlet_mm, 1e-3, (half, twice))
-    angles = _choices(vine.growth_angle_rad, [t.growth_angle_rad for t in used], limits.growth_angle_deg, math.pi / 180)
+    factors_of = {"chamber_l": (0.5, 2.0), "inlet_mm": (math.sqrt(0.5), math.sqrt(2.0)), "growth_angle_deg": ()}
     rigs: list[tuple[int, int, Trial]] = []
-    for chamber, inlet, angle in itertools.product(chambers, inlets, angles):
-        rig = replace(vine, chamber_m3=chamber, inlet_m=inlet, growth_angle_rad=angle)
+    for parts in itertools.product(*(_choices(vine, used, limits, *part) for part in factors_of.items())):
+        changed: dict[str, Any] = {COLUMNS[column].field: part for column, part in zip(factors_of, parts, strict=True)}
+        rig = replace(vine, **changed)
         changes = len(_changed(rig, vine))
-        if changes == 0 or not inlet > vine.diameter_m:
+        if changes == 0 or not rig.inlet_m > vine.diameter_m:
             at_hand = any(_alike(rig, trial, tuple(RIG.values())) for trial in used)
             rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
-    fewest = min((changed for changed, _, _ in rigs), default=0)
-    return [(effort, rig) for changed, effort, rig in rigs if changed <= max(1, fewest)]
+    fewest = min((changes for changes, _, _ in rigs), default=0)
+    return [(effort, rig) for changes, effort, rig in rigs if changes <= max(1, fewest)]
 
 
-def _choices(
-    now: float, used: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float] = ()
-) -> list[float]:
+def _choices(vine: Trial, used: Sequence[Trial], limits: Limits, column: str, factors: Sequence[float]) -> list[float]:
     """Values of one part of the rig: the user's, else those used and multiples of the present one; NaN stays."""
+    field, stated = COLUMNS[column].field, _stated(limits, column)
+    now = getattr(vine, field)
     if not math.isfinite(now):
         return [now]
-    if given is not None:
-        return [value * unit for value in given]
-    values = [now, *(value for value in dict.fromkeys(used) if math.isfinite(value))]
-    values += [_rounded(now * factor) for factor in factors]
+    if stated is not None:
+        return stated
+    before = dict.fromkeys(getattr(trial, field) for trial in used)
+    values = [now, *filter(math.isfinite, before), *(_rounded(now * factor) for factor in factors)]
     return [value for i, value in enumerate(values) if not _is_among(value, values[:i])]
 
 
@@ -199,7 +205,7 @@ def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
     """No payload (or the lightest allowed), the heaviest, and those used in between."""
     payloads = {trial.payload_kg for trial in used}
     heaviest = max(payloads) if max(payloads) > 0 else 0.05  # kg, where none was used yet
-    low, high = (0.0, heaviest) if limits.payload_g is None else (1e-3 * g for g in limits.payload_g)
+    low, high = _stated(limits, "payload_g") or (0.0, heaviest)
     return sorted({low, high, *(payload for payload in payloads if low <= payload <= high)})
 
 
@@ -209,9 +215,8 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
     pressures = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
     if not pressures:
         return []
-    low, high = min(pressures), 1.25 * max(pressures)  # a quarter above the highest used
-    if limits.pressure_kPa is not None:
-        low, high = (1e3 * kPa for kPa in limits.pressure_kPa)
+    # 1.25: a quarter above the highest used
+    low, high = _stated(limits, "pressure_kPa") or (min(pressures), 1.25 * max(pressures))
     stress_Pa = hoop_stress_Pa(1.0, rig.diameter_m, rig.thickness_m)
     if math.isfinite(stress_Pa):
         # The default strength of film must not exclude pressures that this vine has held; a stated strength may.
@@ -235,33 +240,36 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
 def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tuple[Trial, int]]:
     """Vines that could be made, each with the index of the trial whose vine is nearest in size."""
     vines = [trial for trial, _ in models]
-    diameters = _sizes([v.diameter_m for v in vines], limits.diameter_mm, 1e-3, (0.5, 0.75, 1.5))
-    walls = _sizes([v.thickness_m for v in vines], limits.thickness_um, 1e-6, (0.5, 2.0))
+    diameters = _sizes(vines, limits, "diameter_mm", (0.5, 0.75, 1.5))
     new_vines: list[tuple[Trial, int]] = []
-    for diameter, wall in itertools.product(diameters, walls):
+    for diameter, wall in itertools.product(diameters, _sizes(vines, limits, "thickness_um", (0.5, 2.0))):
         if wall > diameter / 4 or not COLUMNS["diameter_mm"].low <= 1e3 * diameter <= COLUMNS["diameter_mm"].high:
             continue
         distances = [math.hypot(math.log(v.diameter_m / diameter), math.log(v.thickness_m / wall)) for v in vines]
         near, like = models[int(np.argmin(distances))]
-        lengths = [near.length_m] if limits.length_mm is None else [1e-3 * mm for mm in limits.length_mm]
-        for length in lengths:
-            unfilmed = replace(near, video=None, track=None, pressure_trace=None)
+        unfilmed = replace(near, video=None, track=None, pressure_trace=None)
+        for length in _stated(limits, "length_mm") or [near.length_m]:
             sized = replace(unfilmed, diameter_m=diameter, thickness_m=wall, length_m=length)
             if not any(_alike(sized, vine) for vine in vines):
                 new_vines.append((with_names([sized])[0], like))
-    # 10: new vines considered, at most; those of the most different sizes are taken (chosen)
-    return _most_different(new_vines, 10)
+    most = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
+    if len(new_vines) <= most:
+        return new_vines
+    # Farthest-point sampling
+    sizes = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in new_vines])
+    chosen = [int(np.argmax(np.linalg.norm(sizes - sizes.mean(axis=0), axis=1)))]
+    while len(chosen) < most:
+        distance = np.linalg.norm(sizes[:, None] - sizes[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return [new_vines[k] for k in sorted(chosen)]
 
 
-def _sizes(
-    before: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float]
-) -> list[float]:
+def _sizes(vines: Sequence[Trial], limits: Limits, column: str, factors: Sequence[float]) -> list[float]:
     """Candidate sizes: the user's, else those used and multiples of the smallest and largest."""
-    if given is not None:
-        return [size * unit for size in given]
-    used = {size for size in before if math.isfinite(size)}
-    if not used:
-        return []
+    stated = _stated(limits, column)
+    used = {size for vine in vines if math.isfinite(size := getattr(vine, COLUMNS[column].field))}
+    if stated is not None or not used:
+        return stated or []
     return sorted(used | {_rounded(f * (min(used) if f < 1 else max(used))) for f in factors})
 
 
@@ -273,18 +281,6 @@ def _rounded(value: float) -> float:
 def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "thickness_m", "length_m")) -> bool:
     pairs = [(getattr(trial, name), getattr(other, name)) for name in names]
     return all(_is_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
-
-
-def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Trial, int]]:
-    """At most so many vines, by farthest-point sampling in ln diameter, ln thickness and ln length."""
-    if len(vines) <= most:
-        return vines
-    sizes = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in vines])
-    chosen = [int(np.argmax(np.linalg.norm(sizes - sizes.mean(axis=0), axis=1)))]
-    while len(chosen) < most:
-        distance = np.linalg.norm(sizes[:, None] - sizes[chosen], axis=2).min(axis=1)
-        chosen.append(int(np.argmax(distance)))
-    return [vines[k] for k in sorted(chosen)]
 
 
 # ------------------------------------------------------------------------------
@@ -547,6 +543,157 @@ def film_trials(
         except FitError:
             tracks.append(None)
     return tracks
+
+
+# ------------------------------------------------------------------------------
+# Separation by further trials, found by simulating them and refitting the hypotheses to old and new trials.
+#
+# Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
+# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials;
+# between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can explain
+# part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
+#
+# There are two levels of detail. The quick one sets the truth to the best values and treats the old trials as linear in
+# the parameters, which is fast enough to compare designs. The thorough one draws the truth from its distribution given
+# the old trials and simulates every trajectory anew, as a check.
+
+
+class PartlyLinear(Predictor):
+    """Predictor that simulates new trials and treats the old ones as linear, with the sensitivities of their fit."""
+
+    separable = False
+
+    def __init__(self, layout: ParameterMap, old: Predictor, solution: Solution, new: Sequence[FitTrial]) -> None:
+        super().__init__(layout, [*old.data, *new], old.host)
+        self.n_old, self.expansion_point, self.old_columns = len(old.data), solution.state, solution.columns
+        new_layout = replace(layout, index=layout.index[self.n_old :], base=layout.base[self.n_old :])
+        self.new = Predictor(new_layout, new, old.host)
+        self.new.steps = old.steps.copy()
+
+    def linearise(
+        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
+    ) -> list[Floats]:
+        """Sensitivities and residuals, as `Predictor.linearise`; the sensitivities of the old trials are constant.
+        Shapes: theta (n_free,); trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points, n_columns + 1).
+        """
+        residuals = self.residuals_of_old(theta, trial_effects)
+        columns = [np.column_stack([of_fit[:, :-1], r]) for of_fit, r in zip(self.old_columns, residuals, strict=True)]
+        return columns + self.new.linearise(
+            theta, trial_effects[self.n_old :], trial_effects_only=trial_effects_only, past_end=past_end
+        )
+
+    def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
+        """Measured minus predicted positions of all trials, m, for several sets of trial effects. Shapes: theta
+        (n_free,); effect_sets (n_trials, N_TRIAL_EFFECTS) → (n_points,).
+        """
+        return [
+            self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
+            for trial_effects in effect_sets
+        ]
+
+    def residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
+        """Measured minus predicted positions of the old trials, m, to first order. Shapes: theta (n_free,);
+        trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points,).
+        """
+        at = self.expansion_point
+        change = np.append(theta[: at.theta.size] - at.theta, np.zeros(theta.size - at.theta.size + 1))
+        steps = np.hstack([trial_effects[: self.n_old] - at.trial_effects, change[self.layout.index[: self.n_old]]])
+        return [of_fit[:, -1] - of_fit[:, :-1] @ step for of_fit, step in zip(self.old_columns, steps, strict=True)]
+
+
+def simulated_rises(
+    hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
+) -> Floats:
+    """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
+    values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
+    average. If `thorough`, both are random and every trajectory is simulated: only where the pressure was recorded do
+    the old trials stay linear, for to simulate those takes a hundred times as long. Shape (n_draws, n, n).
+    """
+    n = len(hypotheses)
+    # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
+    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    rises = np.full((len(draws), n, n), math.nan)
+    before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in hypotheses])
+    for k, a in np.ndindex(len(draws), n):
+        rng = np.random.default_rng([seed, int(thorough), draws[k], a])
+        truth = hypotheses[a]
+        theta = draw_parameters(truth, rng) if thorough else truth.theta
+        in_turn = alternating[(np.arange(len(design)) + draws[k]) % 4]
+        deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
+        try:
+            filmed = film_trials(truth, design, theta, deviations * truth.fit.solution.state.spread, rng)
+        except SimulationError:
+            continue
+        new = [(place, trial_data) for place, trial_data in zip(design, filmed, strict=True) if trial_data is not None]
+        if new:
+            after = np.array([_refitted(hypothesis, new, thorough=thorough) for hypothesis in hypotheses])
+            rises[k, a] = after - before - (after[a] - before[a])
+    return rises
+
+
+def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
+    """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
+    Returns free parameters, scaled, within their bounds. Shape (n_free,).
+    """
+    furthest_draw = 2.0  # Standard deviations at which draws are clipped: the linearised fit holds no further (chosen)
+    old = hypothesis.fit.predictor.layout.start.size
+    values, vectors = np.linalg.eigh(hypothesis.levels.information[0, :old, :old])
+    is_determined = values > 1e-9 * values[-1]
+    sd = np.where(is_determined, 1 / np.sqrt(np.where(is_determined, values, 1.0)), 0.0)
+    normal = np.clip(rng.standard_normal(old), -furthest_draw, furthest_draw)
+    of_new = rng.standard_normal(hypothesis.sd_of_new.size) * hypothesis.sd_of_new
+    down, up = hypothesis.room
+    return np.asarray(hypothesis.theta + np.clip(np.concatenate([vectors @ (sd * normal), of_new]), down, up))
+
+
+def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, thorough: bool) -> float:
+    """−2 ln L of a hypothesis fitted to old and new trials; NaN where the fit fails."""
+    most = 20  # Iterations of a refit, at most (chosen)
+    places, data = [place for place, _ in new], [trial_data for _, trial_data in new]
+    layout, old = _extended_layout(hypothesis, places), hypothesis.fit.solution
+    quick = PartlyLinear(layout, hypothesis.fit.predictor, old, data)
+    try:
+        # New releases are aligned, and the noise of the new trials is that of the old.
+        theta = layout.start
+        theta[: old.state.theta.size] = old.state.theta
+        aligned, _ = align(data, quick.new, theta, initial_trial_effects(data))
+        state = replace(
+            old.state,
+            theta=theta,
+            trial_effects=np.concatenate([old.state.trial_effects, aligned]),
+            variance=np.concatenate([old.state.variance, np.full(len(data), hypothesis.variance)]),
+        )
+        problem, before = make_problem(quick, state.trial_effects), old.problem.release_origin_mean
+        means = np.concatenate([before, problem.release_origin_mean[len(before) :]])
+        problem = replace(problem, release_origin_mean=means)
+        # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
+        fixed = FixedTerms(state.spread, (state.rho, state.variance))
+        solution = solve(quick, problem, state, fixed, warm=True, most_iterations=most)
+        whole: Predictor = quick
+        if thorough and all(trial_data.trace is None for trial_data in quick.data[: quick.n_old]):
+            whole = Predictor(layout, quick.data, quick.host)
+            whole.steps = quick.new.steps.copy()
+        solution = solve(whole, problem, solution.state, warm=True, most_iterations=most)
+    except SimulationError:
+        return math.nan
+    return -2 * solution.log_likelihood()
+
+
+def _extended_layout(hypothesis: Hypothesis, places: Sequence[int]) -> ParameterMap:
+    """Parameter map of old and new trials; of the new parameters only those that the new trials depend on are free."""
+    before, wide = hypothesis.fit.predictor.layout, hypothesis.layout
+    old = len(before.free)
+    needed = np.unique(wide.index[list(places)])
+    used = [*range(old), *needed[needed >= old].tolist()]
+    order = {place: k for k, place in enumerate(used)} | {-1: -1}
+    index = np.vectorize(order.__getitem__, otypes=[int])(wide.index[list(places)])
+    return ParameterMap(
+        wide.model,
+        tuple(wide.free[k] for k in used),
+        wide.keys,
+        np.concatenate([before.index, index]),
+        np.concatenate([before.base, wide.base[list(places)]]),
+    )
 
 
 # ------------------------------------------------------------------------------

@@ -437,8 +437,7 @@ class Room:
 
     def bearable_Pa(self, diameter_m: float, thickness_m: float) -> float:
         """Return the highest pressure that the wall allows, f · 2tσ/D, Pa."""
-        burst_Pa = burst_pressure_Pa(diameter_m, thickness_m) * self.burst_stress_Pa / BURST_STRESS_PA
-        return self.burst_share * burst_Pa
+        return self.burst_share * burst_pressure_Pa(diameter_m, thickness_m, self.burst_stress_Pa)
 
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
         """Return the trial with a vine of this size at the highest pressure allowed."""

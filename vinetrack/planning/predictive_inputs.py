@@ -102,9 +102,9 @@ def exponent_sigma() -> float:
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
-def burst_pressure_Pa(diameter_m: float, thickness_m: float) -> float:
-    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; a guess from one vine."""
-    return 2 * thickness_m * BURST_STRESS_PA / diameter_m
+def burst_pressure_Pa(diameter_m: float, thickness_m: float, stress_Pa: float = BURST_STRESS_PA) -> float:
+    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; by default a guess from one vine."""
+    return 2 * thickness_m * stress_Pa / diameter_m
 
 
 def hoop_stress_Pa(pressure_Pa: float, diameter_m: float, thickness_m: float) -> float:
