@@ -158,14 +158,15 @@ def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_c
     design, power = few
     further = further_trials(design, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
     assert further.before < 0.9 <= further.after
-    made = with_trials(design, [added.trial for added in further.trials])
-    again = linear_power.effect_power(planned_tests(made)[0], "leak")
+    pressures = [1e3 * added["pressure_kPa"] for added in further.trials]
+    like = design.trials[0]
+    made = [replace(like, name=f"a{k}", pressure_Pa=P, pressure_sigma_Pa=0.01 * P) for k, P in enumerate(pressures)]
+    again = linear_power.effect_power(planned_tests(with_trials(design, made))[0], "leak")
     assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
-    fewer = [added.probability for added in further.trials if added.probability < further.target]
+    fewer = [added for added in further.trials if added["probability"] < further.target]
     assert len(fewer) == len(further.trials) - 2
-    pressures = [added.trial.pressure_Pa for added in further.trials]
     assert all(14e3 <= pressure <= 40e3 for pressure in pressures)
-    assert not any(added.new_vine for added in further.trials)
+    assert not any(added["new_vine"] for added in further.trials)
     assert all(count % 2 == 0 for count in np.unique(pressures, return_counts=True)[1])
 
 

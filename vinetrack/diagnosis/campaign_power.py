@@ -59,9 +59,7 @@ def make(
     draw: np.random.Generator,
     host: Model | None = None,
 ) -> list[tuple[Trial, Track]]:
-    """Simulate one campaign: its trials as the sheet states them, and their tracks. The camera counts as calibrated:
-    positions have no systematic error unless the sheet states one.
-    """
+    """Simulate one campaign: its trials as the sheet states them, and their tracks."""
     rest_frames = 20  # Frames at rest before release (chosen)
     count = len(trials)
     pressure_factors = 1 + spreads[0] * draw.standard_normal(count)
@@ -91,13 +89,7 @@ def make(
         position_m = trajectory.observed_position_m + noise_m + draw.uniform(-0.05, 0.05)
         pressure_Pa = np.full(time_s.size, trial.pressure_Pa) if camera.has_trace else None
         track = plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
-        systematic_m = trial.position_systematic_m if math.isfinite(trial.position_systematic_m) else 0.0
-        pairs.append(
-            (
-                replace(trial, position_systematic_m=systematic_m),
-                replace(track, lead_position_systematic_m=np.full(time_s.size, camera.slow_error_m)),
-            )
-        )
+        pairs.append((trial, replace(track, lead_position_systematic_m=np.full(time_s.size, camera.slow_error_m))))
     return pairs
 
 
@@ -116,9 +108,8 @@ class CampaignDesign:
     @property
     def to_fit(self) -> Model:
         """The model without the values that a fit estimates."""
-        held = [f"{effect.name}.{parameter.name}" for effect in self.model for parameter in effect.parameters
-                if parameter.held]  # fmt: skip
-        return replace(self.model, values={key: self.model.values[key] for key in held if key in self.model.values})
+        held = {f"{effect.name}.{p.name}" for effect in self.model for p in effect.parameters if p.held}
+        return replace(self.model, values={key: value for key, value in self.model.values.items() if key in held})
 
 
 def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> CampaignDesign:
@@ -168,11 +159,8 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark
     simulated = make(
         design.model, [exact[k] for k in first], [cameras[k] for k in first], (0.0, 0.0), np.random.default_rng(0), host
     )
-    track_of = dict(zip(dict.fromkeys(signatures), simulated, strict=True))
-    pairs = []
-    for planned, signature in zip(design.trials, signatures, strict=True):
-        trial, track = track_of[signature]
-        pairs.append((replace(planned, position_systematic_m=trial.position_systematic_m), track))
+    track_of = {signature: track for signature, (_, track) in zip(dict.fromkeys(signatures), simulated, strict=True)}
+    pairs = [(trial, track_of[signature]) for trial, signature in zip(design.trials, signatures, strict=True)]
     noise_m = math.sqrt(float(np.mean([camera.noise_m**2 for camera in design.cameras])))
     noise = (noise_m, design.cameras[0].noise_correlation)
     fitted = fit(design.to_fit, pairs, spreads=design.spreads, noise=noise, host=host, profile=False, thorough=False)

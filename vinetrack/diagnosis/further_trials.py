@@ -24,11 +24,11 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials, Power
+from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
-from vinetrack.experiment.schema import COLUMNS, LIMITED
+from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, Fit
@@ -259,20 +259,19 @@ def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, 
 
 def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
     """Return the trials of a design as entries of `next_experiment`, one for each condition."""
-    entries = []
-    for index, replicates in zip(*np.unique(np.array(design), return_counts=True), strict=True):
-        condition = every[index]
-        cells = {name: COLUMNS[name].of_trial(condition.trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
-        entries.append(
-            {
-                **{name: float(f"{value:.6g}") for name, value in cells.items()},
-                "replicates": int(replicates),
-                "vine": condition.trial.vine,
-                "new_vine": condition.effort == NEW_VINE,
-                "changed": list(condition.changed),
-            }
-        )
-    return tuple(entries)
+    counted = zip(*np.unique(np.array(design), return_counts=True), strict=True)
+    return tuple({**_entry(every[index]), "replicates": int(replicates)} for index, replicates in counted)
+
+
+def _entry(condition: Condition, *more: str) -> dict[str, Any]:
+    """The cells of the sheet that may be chosen, and `more` of them, NaN where blank; and what is new about a trial."""
+    names = [*(name for name, column in COLUMNS.items() if column.limit), *more]
+    return {
+        **{name: float(f"{COLUMNS[name].of_trial(condition.trial):.6g}") for name in names},
+        "vine": condition.trial.vine,
+        "new_vine": condition.effort == NEW_VINE,
+        "changed": list(condition.changed),
+    }
 
 
 # ------------------------------------------------------------------------------
@@ -511,14 +510,15 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
     """The plan with as many of these trials as needed, and the power after each."""
     conditions = [search.conditions[k] for k in chosen for _ in range(REPLICATES)]
     tests_with = tests_of_designs(design, conditions)
-    trials: list[AddedTrial] = []
+    trials: list[dict[str, Any]] = []
     power, probability = plan.power, plan.before
     while len(trials) < len(conditions) and probability < plan.target:
         power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), power.effect) or power
         probability = power.probability_at(plan.value)
         for condition in conditions[len(trials) : len(trials) + REPLICATES]:
-            trial = replace(condition.trial, name=f"added_{len(trials) + 1}")
-            trials.append(AddedTrial(trial, condition.changed, condition.effort == NEW_VINE, probability))
+            cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
+            known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
+            trials.append({**known, "probability": probability})
     endless = search.first_information((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
     ratio = math.sqrt(endless / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
     unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))

@@ -24,7 +24,7 @@ from scipy.stats import norm, t
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import END_FRACTION, Floats
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
-from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.score_test import (
     CandidateShape,
@@ -260,7 +260,6 @@ def power_of(
     inputs: Sequence[PowerInput] = (),
     *,
     nonlinear: bool = False,
-    first_round: MisfitTests | None = None,
     only: str = "",
 ) -> Power:
     """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
@@ -278,7 +277,7 @@ def power_of(
     return Power(
         n_trials=len(tests.fit.trials),
         threshold=tests.family.single_shape_threshold,
-        false_alarms=_false_alarms(first_round or tests),
+        false_alarms=_false_alarms(tests.fit),
         effects=tuple(effects),
         not_testable={**(not_testable or {}), **silent},
         numbers=_interval_widths(tests.fit),
@@ -515,9 +514,9 @@ def _largest_by_effect(tests: MisfitTests, values: Floats) -> tuple[Floats, list
     return np.stack([values[:, effect_of_shape == k].max(axis=1) for k in range(len(names))], axis=1), names
 
 
-def _false_alarms(tests: MisfitTests) -> dict[str, float]:
-    """False-alarm rate of every test of a round, as `misfit_tests` and `selection` set their levels."""
-    level = tests.level
+def _false_alarms(fit: Fit) -> dict[str, float]:
+    """False-alarm rate of every test of the first round, as `misfit_tests` and `selection` set their levels."""
+    level = FALSE_ALARM_LEVEL_FIRST_ROUND
     rates = {
         "scores of all candidates": level,
         "any smooth force": 0.1 * level,
@@ -525,7 +524,7 @@ def _false_alarms(tests: MisfitTests) -> dict[str, float]:
         "replicates that err alike": 0.1 * level,
         "noise that is larger in motion": 0.1 * level,
     }
-    trials = [trial.trial for trial in tests.fit.trials]
+    trials = [trial.trial for trial in fit.trials]
     if any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials):
         rates["specimens, days or the order of trials"] = level
     return rates

@@ -16,10 +16,8 @@ from pydantic import Field
 
 from vinetrack.core.notebook import plot
 from vinetrack.core.problems import Remark, in_words, remark
-from vinetrack.core.records import Trial
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import or_nan
-from vinetrack.experiment.schema import COLUMNS
 from vinetrack.inference.fit_result import OrNaN, or_open
 
 if TYPE_CHECKING:
@@ -152,20 +150,12 @@ class SimulatedRates:
 
 
 @dataclass(frozen=True)
-class AddedTrial:
-    """A trial to make, what changes on the rig for it, and the power once it is made as well."""
-
-    trial: Trial
-    changed: tuple[str, ...]
-    new_vine: bool
-    probability: float
-
-
-@dataclass(frozen=True)
 class FurtherTrials:
     """Further trials that bring the power for an effect of one size to a target. `power` is that with these trials,
     `before` the probability with the trials so far, `unlimited` that with unlimited replicates of all trials within the
-    limits; `n_conditions` counts the conditions considered.
+    limits; `n_conditions` counts the conditions considered. `trials` has an entry for each trial to make: its cells of
+    the sheet without blank ones, `vine`, `new_vine`, what is `changed` on the rig, and the `probability` once it is
+    made as well.
     """
 
     power: EffectPower
@@ -174,13 +164,13 @@ class FurtherTrials:
     before: float
     unlimited: float = math.nan
     n_conditions: int = 0
-    trials: tuple[AddedTrial, ...] = ()
+    trials: tuple[Mapping[str, Any], ...] = ()
     needed: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def after(self) -> float:
         """Power once all trials are made."""
-        return self.trials[-1].probability if self.trials else self.before
+        return float(self.trials[-1]["probability"]) if self.trials else self.before
 
     @property
     def is_reached(self) -> bool:
@@ -201,24 +191,8 @@ class FurtherTrials:
             "conditions_looked_at": self.n_conditions,
             "needed": dict(self.needed),
             "taken_for": dict(self.power.taken_for),
-            "trials": [
-                {
-                    **sheet_cells(added.trial),
-                    "vine": added.trial.vine,
-                    "changed": list(added.changed),
-                    "new_vine": added.new_vine,
-                    "probability": added.probability,
-                }
-                for added in self.trials
-            ],
+            "trials": list(self.trials),
         }
-
-
-def sheet_cells(trial: Trial) -> dict[str, float]:
-    """Cells of the sheet that describe how to set up a further trial, without blank ones."""
-    names = [*(name for name, column in COLUMNS.items() if column.limit), "yield_pressure_kPa", "capture_fps"]
-    cells = {name: COLUMNS[name].of_trial(trial) for name in names}
-    return {name: float(f"{value:.6g}") for name, value in cells.items() if math.isfinite(value)}
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,12 @@ from vinetrack.diagnosis.campaign_power import (
 from vinetrack.diagnosis.further_trials import exploratory_trials, further_trials
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates, sheet_cells
+from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, PlannedTrials, expected_systematic_m, planned_sheet
 from vinetrack.inference.fit import fit
@@ -240,11 +241,11 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
     """Return the rows of the sheet for the further trials."""
     return [
         {
-            "trial": f"{plan.power.effect}_{k}" if len(power.further) > 1 else added.trial.name,
-            **sheet_cells(added.trial),
+            "trial": f"{plan.power.effect if len(power.further) > 1 else 'added'}_{k}",
+            **{name: value for name, value in trial.items() if name in COLUMNS},
         }
         for plan in power.further
-        for k, added in enumerate(plan.trials, 1)
+        for k, trial in enumerate(plan.trials, 1)
     ]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,17 +33,14 @@ from vinetrack.planning.prediction import (
     GAMMAS,
     TIME,
     Choice,
-    Neglected,
     Quantity,
     Room,
     VinePrediction,
     chambers,
-    design_checks,
     fastest,
     final_speeds,
     final_with,
     gauge_loss,
-    neglected,
     predict_vine,
     supplied_chamber,
     swept_m3,
@@ -192,14 +189,6 @@ def planning_errors() -> Iterator[None]:
         raise ResultsError(str(error)) from None
 
 
-class ConditionPrediction(NamedTuple):
-    """Prediction of one condition, its design checks (`hazards`), and the influence of neglected effects."""
-
-    prediction: VinePrediction
-    hazards: tuple[str, ...]
-    neglected: tuple[Neglected, ...]
-
-
 def predict_conditions(
     *, samples: int, seed: int, at_fraction: float, figure: Path | None = None, csv: Path | None = None, **given: Any
 ) -> tuple[list[str], list[dict[str, Any]]]:
@@ -208,27 +197,27 @@ def predict_conditions(
 
     check_figure(figure)
     basis = read_basis(**given)
-    entries = []
+    predictions: list[VinePrediction] = []
+    content = []
     with planning_errors():
         for inputs in progress(basis.inputs, "predicting", unit="condition"):
-            prediction = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
-            hazards = tuple(map(str, design_checks(prediction)))
-            entries.append(ConditionPrediction(prediction, hazards, neglected(inputs, at_fraction)))
-    lines = [*basis.heading, *(_condition_lines(entries[0]) if len(entries) == 1 else _table_lines(entries))]
+            predictions.append(predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction))
+            content.append(_json_entry(predictions[-1]))
+    several = len(predictions) > 1
+    lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
-        titles = [trial_text(entry.prediction.inputs.trial) for entry in entries]
-        write_figure(draw_predictions([entry.prediction for entry in entries], titles, at_fraction), figure)
+        titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
+        write_figure(draw_predictions(predictions, titles, at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
-        write_csv(csv, pd.concat([entry.prediction.curve for entry in entries], ignore_index=True))
+        write_csv(csv, pd.concat([prediction.curve for prediction in predictions], ignore_index=True))
         lines.append(f"Curves: {csv}")
-    return lines, [_json_entry(entry) for entry in entries]
+    return lines, content
 
 
-def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
+def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
     """Yield all lines about a single condition."""
-    prediction = entry.prediction
     inputs = prediction.inputs
     yield f"{trial_text(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
@@ -246,14 +235,14 @@ def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
     yield from table([(share.name, speed_band_text(share), str(share.why)) for share in prediction.shares], head)
     # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
-    listed = [omitted for omitted in entry.neglected if abs(omitted.change) >= 0.005]
+    listed = [omitted for omitted in prediction.neglected if abs(omitted.change) >= 0.005]
     speeds = [" → ".join(value_in_unit(m_s, "m/s") for m_s in (one.without_m_s, one.final_m_s)) for one in listed]
     if listed:
         yield ""
         changes = [(o.effect, o.size, f"{m_s} m/s", f"{o.change:+.1%}") for o, m_s in zip(listed, speeds, strict=True)]
         yield from table(changes, ("not in the model", "at the size", "final speed", "change"))
     yield ""
-    yield from (f"! {warning}" for warning in entry.hazards)
+    yield from (f"! {warning}" for warning in prediction.hazards)
 
 
 def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
@@ -271,37 +260,37 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
 
-def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
+def _table_lines(predictions: Sequence[VinePrediction]) -> Iterator[str]:
     """Yield a table with one row per condition."""
-    first = entries[0].prediction
-    yield str(remark("medians_and_bands", model=first.inputs.model.names, samples=first.samples))
+    yield str(remark("medians_and_bands", model=predictions[0].inputs.model.names, samples=predictions[0].samples))
     rows = [
         (
-            entry.prediction.inputs.trial.condition,
-            *_quantity_row(entry.prediction.final)[1:4],
-            *_quantity_row(entry.prediction[TIME])[2:4],
-            f"{entry.prediction.slack:.0%}",
+            prediction.inputs.trial.condition,
+            *_quantity_row(prediction.final)[1:4],
+            *_quantity_row(prediction[TIME])[2:4],
+            f"{prediction.slack:.0%}",
         )
-        for entry in entries
+        for prediction in predictions
     ]
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
-    if any(entry.prediction.inputs.trial.payload_kg > 0 for entry in entries):
+    if any(prediction.inputs.trial.payload_kg > 0 for prediction in predictions):
         yield str(remark("final_speed"))
     yield ""
     yield "uncertainties included:"
-    sources = dict.fromkeys((share.name, str(share.why)) for entry in entries for share in entry.prediction.shares)
+    sources = dict.fromkeys((share.name, str(share.why)) for prediction in predictions for share in prediction.shares)
     yield from (f"  {name}: {text}" for name, text in sources)
     yield ""
-    hazards = dict.fromkeys(text for entry in entries for text in entry.hazards)
-    for text in hazards:
-        conditions = [entry.prediction.inputs.trial.condition for entry in entries if text in entry.hazards]
-        yield f"! {'all conditions' if len(conditions) == len(entries) else ', '.join(conditions)}: {text}"
+    conditions_of: dict[str, list[str]] = {}
+    for prediction in predictions:
+        for text in dict.fromkeys(map(str, prediction.hazards)):
+            conditions_of.setdefault(text, []).append(prediction.inputs.trial.condition)
+    for text, conditions in conditions_of.items():
+        yield f"! {'all conditions' if len(conditions) == len(predictions) else ', '.join(conditions)}: {text}"
 
 
-def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
+def _json_entry(prediction: VinePrediction) -> dict[str, Any]:
     """Return one condition as JSON content, SI."""
-    prediction = entry.prediction
     return {
         "condition": prediction.inputs.trial.condition,
         "model": list(prediction.inputs.model.names),
@@ -312,10 +301,10 @@ def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
             {"name": s.name, "words": str(s.why), "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
             for s in prediction.shares
         ],
-        "left_out": [asdict(omitted) for omitted in entry.neglected],
+        "left_out": [asdict(omitted) for omitted in prediction.neglected],
         "arrives": prediction.arrives,
         "slack": prediction.slack,
-        "warnings": list(entry.hazards),
+        "warnings": list(map(str, prediction.hazards)),
     }
 
 
@@ -435,7 +424,7 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield ""
     if choices[0].odds < 0.8 and len(choices) > 1:
         yield str(remark("film_uncertain", um=1e6 * choices[0].thickness_m, odds=choices[0].odds))
-    yield from (f"! {warning}" for warning in design_checks(best))
+    yield from (f"! {warning}" for warning in best.hazards)
 
 
 def design_reservoir(

@@ -704,14 +704,14 @@ def _extended_layout(hypothesis: Hypothesis, places: Sequence[int]) -> Parameter
 class RefitTerms:
     """Quadratic form of −2 ln L of one hypothesis, refitted to one trial of every condition; beside the information of
     the trials so far in its `levels`, which are the first axis here too. `information`, shape (n_levels, n_conditions,
-    n_free, n_free); `gradient`, (n_levels, n_conditions, n_free, n_hypotheses), if each hypothesis is true.
+    n_free, n_free); `gradient`, (n_levels, n_conditions, n_free, n_hypotheses), and `misfit`, (n_levels,
+    n_conditions, n_hypotheses), with the rise of the scatter, if each hypothesis is true.
     """
 
     hypothesis: Hypothesis
     information: Floats
     gradient: Floats
     misfit: Floats
-    scatter_rise: Floats
 
 
 def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[RefitTerms]:
@@ -738,7 +738,7 @@ def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float,
         information, gradient, misfit = (np.stack(part) for part in zip(*by_level, strict=True))
         has_deviations = np.stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
         scatter_rise = (2 * np.log(levels.factors) + 1 / levels.factors**2 - 1) @ has_deviations.astype(float)
-        terms.append(RefitTerms(hypothesis, information, gradient, misfit, scatter_rise))
+        terms.append(RefitTerms(hypothesis, information, gradient, misfit + scatter_rise[:, :, None]))
     return terms
 
 
@@ -792,7 +792,6 @@ def separations(terms: Sequence[RefitTerms], designs: Sequence[Sequence[int]] | 
             information += levels.information[level][use[:, None], use]
             gradient = levels.gradient[level][use, None] + _over_trials(refitted.gradient[level][:, use], designs)
             misfit = _over_trials(refitted.misfit[level], designs) + old_rise
-            misfit += _over_trials(refitted.scatter_rise[level], designs)[:, None]
             for a in range(n):
                 if a != b:
                     square = misfit[:, a] - _largest_gain(information, gradient[:, :, a], down[use], up[use])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -216,6 +217,16 @@ class VinePrediction:
         """Return the quantity of that name; KeyError where there is none."""
         return {quantity.name: quantity for quantity in self.quantities}[name]
 
+    @cached_property
+    def hazards(self) -> tuple[Remark, ...]:
+        """Warnings about the vine, most serious first."""
+        return (*_hazards(self), *self.inputs.notes)
+
+    @cached_property
+    def neglected(self) -> tuple[Neglected, ...]:
+        """The final speed at the medians with each of the universal effects added, see `neglected`."""
+        return neglected(self.inputs, self.at_fraction)
+
     @property
     def table(self) -> pd.DataFrame:
         """A row for each quantity, SI."""
@@ -348,11 +359,6 @@ class Neglected:
     def change(self) -> float:
         """Relative change of the final speed."""
         return self.final_m_s / self.without_m_s - 1 if self.without_m_s > 0 else math.nan
-
-
-def design_checks(prediction: VinePrediction) -> tuple[Remark, ...]:
-    """Return warnings about a planned vine, most serious first."""
-    return (*_hazards(prediction), *prediction.inputs.notes)
 
 
 def _hazards(prediction: VinePrediction) -> Iterator[Remark]:
