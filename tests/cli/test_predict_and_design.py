@@ -14,7 +14,7 @@ from own_effect import write_effect
 import vinetrack as vt
 from vinetrack.core.tables import write_json
 from vinetrack.inference.fit_summary import summary_of
-from vinetrack.pipeline.predict_stage import PredictionRequest, read_basis, read_range
+from vinetrack.pipeline.predict_stage import read_basis, read_si_range
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 # `vinetrack predict`: what it says, what it writes, and how it refuses.
@@ -88,7 +88,7 @@ def test_a_fit_is_believed_with_its_numbers_and_an_effect_of_an_experiments_own_
     write_json(results / "fit.json", content | {"model": [*content["model"], "spring_line"]})
     write_json(results / "provenance.json", {"experiment": experiment.as_posix()})
     values = dict(zip((name[2:].replace("-", "_") for name in FAST[::2]), map(str, FAST[1::2]), strict=True))
-    (inputs,) = read_basis(PredictionRequest(cells=values, results=results)).inputs
+    (inputs,) = read_basis(cells=values, results=results).inputs
     assert inputs.model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
     assert run("predict", *FAST, "--fit", results).exit_code == 1
@@ -100,7 +100,7 @@ FASTEST = ("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60)
 
 
 def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path):
-    assert read_range("diameter_mm", "5:25") == (0.005, 0.025)
+    assert read_si_range("diameter_mm", "5:25") == (0.005, 0.025)
     output = succeed("design", *FASTEST, "--figure", tmp_path / "a.svg")
     film, diameter, length, pressure, hoop, *_ = row(output, "100")
     assert (film, diameter, length, pressure, hoop) == ("100", "25", "400", "62", "7.75")

@@ -12,7 +12,7 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis import campaign_power, linear_power
-from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
+from vinetrack.diagnosis.campaign_power import CampaignDesign, FilmingPlan, make, planned_tests
 from vinetrack.diagnosis.further_trials import (
     NextExperiment,
     _alone_and_distinct,
@@ -20,12 +20,11 @@ from vinetrack.diagnosis.further_trials import (
     further_trials,
     next_experiment,
 )
-from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
-from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
 
@@ -121,20 +120,20 @@ def test_probabilities_invert_sizes():
 
 
 def test_simulated_diagnoses_are_counted_and_have_the_exact_interval_of_a_rate():
-    told = [("missing", ("leak",)), ("ambiguous", ("supply_refill", "leak")), ("missing", ("supply_refill",))]
-    told += [("adequate", (), ()), ("", (), (), "FitError: none")]
-    rates = campaign_power.rates_of([campaign_power.SimulatedDiagnosis("leak", *said) for said in told], 0.5, 0.9)
-    assert (rates.detections, rates.alarms, rates.failed) == (Rate(2, 4), Rate(3, 4), 1)
+    told = [("leak", True), ("supply_refill or leak", True), ("supply_refill",), ("",), ("", False, "FitError: none")]
+    diagnoses = [campaign_power.SimulatedDiagnosis(*said) for said in told]
+    rates = campaign_power.rates_of("leak", diagnoses, 0.5, 0.9)
+    assert (rates.count, rates.alarms, rates.campaigns, rates.failed) == (2, 3, 4, 1)
     # Clopper and Pearson's for nine of ten, from the quantiles of the beta distribution.
-    assert Rate(9, 10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
-    assert Rate(0, 0).interval == (0.0, 1.0)
+    assert replace(rates, count=9, campaigns=10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
+    assert replace(rates, campaigns=0).interval == (0.0, 1.0)
 
 
 @pytest.mark.slow
 def test_a_simulated_campaign_is_diagnosed_with_its_effect():
     found = campaign_power.simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", (0.02,), 3)
     assert found.failed == ""
-    assert found.is_found
+    assert found.found
 
 
 def test_the_design_of_a_fit_records_as_long_as_its_trials():
@@ -159,14 +158,15 @@ def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_c
     design, power = few
     further = further_trials(design, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
     assert further.before < 0.9 <= further.after
-    made = with_trials(design, [added.trial for added in further.trials])
-    again = linear_power.effect_power(planned_tests(made)[0], "leak")
+    pressures = [1e3 * added["pressure_kPa"] for added in further.trials]
+    like = design.trials[0]
+    made = [replace(like, name=f"a{k}", pressure_Pa=P, pressure_sigma_Pa=0.01 * P) for k, P in enumerate(pressures)]
+    again = linear_power.effect_power(planned_tests(with_trials(design, made))[0], "leak")
     assert again.size_at(0.9) == pytest.approx(further.power.size_at(0.9), rel=0.02)
-    fewer = [added.probability for added in further.trials if added.probability < further.target]
+    fewer = [added for added in further.trials if added["probability"] < further.target]
     assert len(fewer) == len(further.trials) - 2
-    pressures = [added.trial.pressure_Pa for added in further.trials]
     assert all(14e3 <= pressure <= 40e3 for pressure in pressures)
-    assert not any(added.new_vine for added in further.trials)
+    assert not any(added["new_vine"] for added in further.trials)
     assert all(count % 2 == 0 for count in np.unique(pressures, return_counts=True)[1])
 
 
@@ -304,9 +304,8 @@ def test_trials_respect_every_limit(dragged):
         thickness_um=(120.0, 200.0), inlet_mm=(5.0, 8.0), chamber_l=(3.7,), hoop_stress_MPa=1.6,
     )  # fmt: skip
     found = next_experiment(dragged[1], limits)
-    entries = [*found.trials, *(entry for other in found.alternatives for entry in other["trials"])]
-    assert entries
-    for entry in entries:
+    assert found.trials
+    for entry in found.trials:
         assert 10 <= entry["pressure_kPa"] <= 30
         assert entry["pressure_kPa"] * entry["diameter_mm"] / (2 * entry["thickness_um"]) <= 1.6 * (1 + 1e-6)
         assert entry["payload_g"] == 0

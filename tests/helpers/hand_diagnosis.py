@@ -100,7 +100,6 @@ def next_experiment() -> dict[str, Any]:
         "trials": [trial],
         "separation_sigma": {pair: 21.0},
         "simulated_sigma": {pair: {"mean": 20.0, "sd": 1.4}},
-        "alternatives": [],
         "calibration": "film a ruler and a strobe",
     }
 

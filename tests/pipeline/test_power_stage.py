@@ -66,14 +66,13 @@ def test_simulated_campaigns_are_counted_beside_the_prediction(folder, monkeypat
 
     def answered(_design: object, effect: str, _values: object, seed: int) -> SimulatedDiagnosis:
         asked_for.append((effect, seed))
-        verdict, names = ("missing", ("leak",)) if effect and seed % 2 else ("adequate", ())
-        return SimulatedDiagnosis(effect, verdict, names)
+        return SimulatedDiagnosis("leak", True) if effect and seed % 2 else SimulatedDiagnosis()
 
     monkeypatch.setattr(power_stage, "simulated_diagnosis", answered)
     nothing, leak = power_of_target(PowerRequest(folder, ("leak=0.01",), simulate=3)).simulated
     assert asked_for == [("", 1), ("", 2), ("", 3), ("leak", 1), ("leak", 2), ("leak", 3)]
-    assert (nothing.alarms.count, nothing.alarms.campaigns) == (0, 3)
-    assert (leak.detections.count, leak.value, leak.named) == (2, pytest.approx(0.01), (("leak", 2),))
+    assert (nothing.count, nothing.campaigns) == (0, 3)
+    assert (leak.count, leak.value, leak.named) == (2, pytest.approx(0.01), (("leak", 2),))
 
 
 @pytest.mark.slow

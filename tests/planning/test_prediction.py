@@ -16,8 +16,8 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
-from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TAIL, TENSION, TIME, design_checks, neglected, run
-from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, Size, damping_prior
+from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TAIL, TENSION, TIME, run
+from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, damping_prior
 
 FAST = {name: str(value) for name, value in published.FAST_VINE.items()}
 SIZES = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
@@ -175,9 +175,9 @@ def test_a_fit_from_python_is_believed_as_its_file_is():
     ("text", "sizes"),
     [
         ("air_drag", {}),
-        ("air_drag=0.8", {"air_drag.C_D": Size(0.8, 0.8)}),
-        ("reservoir_depletion=1.4:1", {"reservoir_depletion.gamma": Size(1.0, 1.4)}),
-        ("supply_refill=0.1, 1:1.4", {"supply_refill.tau": Size(0.1, 0.1), "supply_refill.gamma": Size(1.0, 1.4)}),
+        ("air_drag=0.8", {"air_drag.C_D": (0.8, 0.8)}),
+        ("reservoir_depletion=1.4:1", {"reservoir_depletion.gamma": (1.0, 1.4)}),
+        ("supply_refill=0.1, 1:1.4", {"supply_refill.tau": (0.1, 0.1), "supply_refill.gamma": (1.0, 1.4)}),
     ],
 )
 def test_sizes_of_effects_are_numbers_or_ranges(text, sizes):
@@ -255,8 +255,8 @@ PUSHING = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_
     ],
 )
 def test_a_hazard_is_told_once_with_its_number_and_none_of_a_sound_vine(changes, told):
-    assert sum(told in str(one) for one in design_checks(predicted(**changes))) == 1
-    assert design_checks(predicted()) == ()
+    assert sum(told in str(one) for one in predicted(**changes).hazards) == 1
+    assert predicted().hazards == ()
 
 
 def test_a_tail_that_may_go_slack_does():
@@ -264,21 +264,21 @@ def test_a_tail_that_may_go_slack_does():
     assert loose.final.name == "speed of the leading edge"
     with pytest.raises(KeyError):
         loose["ejection speed of the payload"]
-    told = "\n".join(map(str, design_checks(loose)))
+    told = "\n".join(map(str, loose.hazards))
     assert "slack on the way in every draw" in told
     assert "predicts compression in the tail" not in told
 
 
 def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in_and_only_those_left_out_are_asked():
     inputs = predicted().inputs
-    drag = next(one for one in neglected(inputs, 0.95) if one.effect == "air_drag")
+    drag = next(one for one in predicted().neglected if one.effect == "air_drag")
     model = vt.make_model([*inputs.model.names, "air_drag"]).with_values(inputs.model.values)
     found = vt.simulate(model, inputs.trial, np.linspace(0, 2.0, 20_001))
     speed = np.interp(0.95 * 0.25, found.lead_position_m, found.lead_velocity_m_s)
     assert drag.final_m_s == pytest.approx(speed, rel=1e-3)
     assert drag.change < 0
     said = vt.StatedValues(effects=("air_drag",), sizes=guess.read_sizes("air_drag=1")[1])
-    names = {one.effect for one in neglected(predicted(said).inputs, 0.95)}
+    names = {one.effect for one in predicted(said).neglected}
     assert "air_drag" not in names
     assert "inlet_loss" not in names  # no inlet in the sheet
     assert "payload_drag" not in names  # no payload

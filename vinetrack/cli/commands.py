@@ -9,18 +9,14 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from vinetrack.cli.options import MORE, START, Answer, command
 from vinetrack.core.problems import UserError
 from vinetrack.pipeline.stages import STAGES, Job, Stage, compilation_told
-
-if TYPE_CHECKING:
-    from vinetrack.pipeline.predict_stage import PredictionRequest
 
 Say = Callable[[str], None]
 
@@ -199,14 +195,6 @@ YIELD_MEANING = "Yield pressure; a scaling prior if not given."
 OF_A_RIG = ("film_density_kg_m3", "yield_pressure_kPa", "pressure_kPa", "payload_g", "growth_angle_deg", "inlet_mm")
 
 
-def _request(options: dict[str, Any], **more: Any) -> PredictionRequest:
-    """Take what a prediction is asked with out of the options of a command."""
-    from vinetrack.pipeline.predict_stage import PredictionRequest
-
-    names = [field.name for field in fields(PredictionRequest) if field.name in options]
-    return PredictionRequest(**{name: options.pop(name) for name in names}, **more)
-
-
 @command(
     columns=(
         *("diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3"),
@@ -219,7 +207,7 @@ def _predict(sheet: Path | None, options: dict[str, Any]) -> Answer:
     """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
     from vinetrack.pipeline.predict_stage import predict_conditions
 
-    return predict_conditions(_request(options, sheet=sheet), **options)
+    return predict_conditions(sheet=sheet, **options)
 
 
 @command(
@@ -231,8 +219,7 @@ def _vine(options: dict[str, Any]) -> Answer:
     """Find the fastest vine within limits of burst stress, diameter and length, for a choice of films."""
     from vinetrack.pipeline.predict_stage import design_vine
 
-    request = _request(options)
-    return design_vine(request, **options)
+    return design_vine(**options)
 
 
 @command(
@@ -245,8 +232,7 @@ def _reservoir(options: dict[str, Any]) -> Answer:
     """Find the chamber that limits the loss of gauge pressure, by the gas law in absolute pressure."""
     from vinetrack.pipeline.predict_stage import design_reservoir
 
-    request = _request(options)
-    return design_reservoir(request, **options)
+    return design_reservoir(**options)
 
 
 @command()

@@ -1,6 +1,8 @@
 """Power of a campaign: of trials that were fitted, or of a planned design.
 
-A planned campaign is simulated without noise, and tested with the noise and between-trial scatter expected of it.
+A planned campaign is simulated without noise, and tested with the noise and between-trial scatter expected of it. As a
+check, campaigns are simulated with all of these and diagnosed in full: every trial has its own pressure and B, every
+vine a misread yield pressure, release falls between frames and positions are noisy; the truth may have one effect more.
 """
 
 from __future__ import annotations
@@ -10,26 +12,85 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vinetrack.core.problems import Remark
-from vinetrack.core.records import Trial
+from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
-from vinetrack.diagnosis.power import Rate, SimulatedRates
+from vinetrack.diagnosis.power import SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.score_test import testable
 from vinetrack.dynamics.model import Model, host_for
-from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.dynamics.simulate import SimulationError, simulate_many
 from vinetrack.effects import EffectError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit
-from vinetrack.planning.simulated_campaigns import FilmingPlan, make
+from vinetrack.inference.fit_result import DAMPING, Fit
+from vinetrack.tracks.position_noise import ar1_noise
+
+
+@dataclass(frozen=True)
+class FilmingPlan:
+    """How a trial is filmed: frames per second, noise of a position, m, and its lag-one correlation. A recording ends
+    with the growth, at twice `longest_s` where the growth does not end, and at the latest `stops_s` after release.
+    `slow_error_m` is the slow error that its tracker states, NaN for positions measured elsewhere; `has_trace` says
+    whether its pressure is measured.
+    """
+
+    capture_fps: float
+    noise_m: float
+    noise_correlation: float = 0.0
+    longest_s: float = 4.0
+    stops_s: float = math.inf
+    slow_error_m: float = math.nan
+    has_trace: bool = False
+
+
+def make(
+    model: Model,
+    trials: Sequence[Trial],
+    cameras: Sequence[FilmingPlan],
+    spreads: tuple[float, float],
+    draw: np.random.Generator,
+    host: Model | None = None,
+) -> list[tuple[Trial, Track]]:
+    """Simulate one campaign: its trials as the sheet states them, and their tracks."""
+    rest_frames = 20  # Frames at rest before release (chosen)
+    count = len(trials)
+    pressure_factors = 1 + spreads[0] * draw.standard_normal(count)
+    misread = {vine: draw.standard_normal() for vine in dict.fromkeys(trial.vine for trial in trials)}
+    true_trials = [
+        replace(
+            trial,
+            pressure_Pa=trial.pressure_Pa * float(factor),
+            yield_pressure_Pa=max(trial.yield_pressure_Pa + trial.yield_pressure_sigma_Pa * misread[trial.vine], 0.0),
+        )
+        for trial, factor in zip(trials, pressure_factors, strict=True)
+    ]
+    theta = np.array([model.parameters_of(trial) for trial in trials])
+    theta[:, model.parameter_names.index(DAMPING)] *= np.exp(spreads[1] * draw.standard_normal(count))
+    until_longest = [np.array([0.0, 2 * camera.longest_s]) for camera in cameras]
+    ends = simulate_many(model, true_trials, until_longest, parameters=theta, host=host)
+    release_frames = rest_frames - draw.uniform(size=count)
+    times, since_release = [], []
+    for end, camera, release in zip(ends, cameras, release_frames.tolist(), strict=True):
+        stop_s = min(end.end_time_s if end.status == "ended" else 2 * camera.longest_s, camera.stops_s)
+        times.append(np.arange(rest_frames + int(stop_s * camera.capture_fps)) / camera.capture_fps)
+        since_release.append(times[-1] - release / camera.capture_fps)
+    moved = simulate_many(model, true_trials, since_release, parameters=theta, host=host)
+    pairs = []
+    for trial, time_s, trajectory, camera in zip(trials, times, moved, cameras, strict=True):
+        noise_m = ar1_noise(time_s.size, camera.noise_m, camera.noise_correlation, draw)
+        position_m = trajectory.observed_position_m + noise_m + draw.uniform(-0.05, 0.05)
+        pressure_Pa = np.full(time_s.size, trial.pressure_Pa) if camera.has_trace else None
+        track = plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
+        pairs.append((trial, replace(track, lead_position_systematic_m=np.full(time_s.size, camera.slow_error_m))))
+    return pairs
 
 
 @dataclass(frozen=True)
@@ -47,9 +108,8 @@ class CampaignDesign:
     @property
     def to_fit(self) -> Model:
         """The model without the values that a fit estimates."""
-        held = [f"{effect.name}.{parameter.name}" for effect in self.model for parameter in effect.parameters
-                if parameter.held]  # fmt: skip
-        return replace(self.model, values={key: self.model.values[key] for key in held if key in self.model.values})
+        held = {f"{effect.name}.{p.name}" for effect in self.model for p in effect.parameters if p.held}
+        return replace(self.model, values={key: value for key, value in self.model.values.items() if key in held})
 
 
 def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> CampaignDesign:
@@ -99,11 +159,8 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark
     simulated = make(
         design.model, [exact[k] for k in first], [cameras[k] for k in first], (0.0, 0.0), np.random.default_rng(0), host
     )
-    track_of = dict(zip(dict.fromkeys(signatures), simulated, strict=True))
-    pairs = []
-    for planned, signature in zip(design.trials, signatures, strict=True):
-        trial, track = track_of[signature]
-        pairs.append((replace(planned, position_systematic_m=trial.position_systematic_m), track))
+    track_of = {signature: track for signature, (_, track) in zip(dict.fromkeys(signatures), simulated, strict=True)}
+    pairs = [(trial, track_of[signature]) for trial, signature in zip(design.trials, signatures, strict=True)]
     noise_m = math.sqrt(float(np.mean([camera.noise_m**2 for camera in design.cameras])))
     noise = (noise_m, design.cameras[0].noise_correlation)
     fitted = fit(design.to_fit, pairs, spreads=design.spreads, noise=noise, host=host, profile=False, thorough=False)
@@ -114,30 +171,14 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark
 # Simulated campaigns of a design, diagnosed in full as measured ones are: a check on linear theory.
 
 
-@dataclass(frozen=True)
-class SimulatedDiagnosis:
-    """Result of the diagnosis of one simulated campaign; `failed` is the reason why there is no verdict."""
+class SimulatedDiagnosis(NamedTuple):
+    """What the diagnosis of one simulated campaign named, blank for nothing; whether the effect was among it or was
+    added later; and the reason why there is no verdict.
+    """
 
-    effect: str
-    verdict: str = ""
-    answer_set: tuple[str, ...] = ()
-    effects: tuple[str, ...] = ()
+    named: str = ""
+    found: bool = False
     failed: str = ""
-
-    @property
-    def alarm(self) -> bool:
-        """Whether anything was called missing or a fault of the measurement."""
-        return bool(self.verdict) and self.verdict != ADEQUATE
-
-    @property
-    def is_found(self) -> bool:
-        """Whether the effect is in the answer set, or was added later."""
-        return self.alarm and self.effect in (*self.answer_set, *self.effects)
-
-    @property
-    def named(self) -> str:
-        """What was named: the members of the answer set, else the verdict."""
-        return " or ".join(self.answer_set) or self.verdict
 
 
 def simulated_diagnosis(design: CampaignDesign, effect: str, values: Sequence[float], seed: int) -> SimulatedDiagnosis:
@@ -158,20 +199,24 @@ def simulated_diagnosis(design: CampaignDesign, effect: str, values: Sequence[fl
                 user_effects=design.model.user_effects,
             )  # fmt: skip
     except (FitError, SimulationError, EffectError, np.linalg.LinAlgError) as error:
-        return SimulatedDiagnosis(effect, failed=f"{type(error).__name__}: {error}")
-    return SimulatedDiagnosis(effect, diagnosis.verdict, diagnosis.answer_set, diagnosis.effects)
+        return SimulatedDiagnosis(failed=f"{type(error).__name__}: {error}")
+    if diagnosis.verdict == ADEQUATE:
+        return SimulatedDiagnosis()
+    named = " or ".join(diagnosis.answer_set) or diagnosis.verdict
+    return SimulatedDiagnosis(named, effect in (*diagnosis.answer_set, *diagnosis.effects))
 
 
-def rates_of(diagnoses: Sequence[SimulatedDiagnosis], value: float, promised: float) -> SimulatedRates:
-    """Count the outcomes of campaigns with the same effect, of this size."""
-    completed = [diagnosis for diagnosis in diagnoses if not diagnosis.failed]
-    named = Counter(diagnosis.named for diagnosis in completed if diagnosis.alarm)
+def rates_of(effect: str, diagnoses: Sequence[SimulatedDiagnosis], value: float, promised: float) -> SimulatedRates:
+    """Count the outcomes of campaigns with one effect, of this size; with none where it is blank."""
+    named = Counter(diagnosis.named for diagnosis in diagnoses if diagnosis.named)
+    failed = sum(bool(diagnosis.failed) for diagnosis in diagnoses)
     return SimulatedRates(
-        effect=diagnoses[0].effect,
+        effect=effect,
         value=value,
         promised=promised,
-        alarms=Rate(sum(diagnosis.alarm for diagnosis in completed), len(completed)),
-        detections=Rate(sum(diagnosis.is_found for diagnosis in completed), len(completed)),
+        alarms=named.total(),
+        count=sum(diagnosis.found for diagnosis in diagnoses) if effect else named.total(),
+        campaigns=len(diagnoses) - failed,
         named=tuple(named.most_common()),
-        failed=len(diagnoses) - len(completed),
+        failed=failed,
     )

@@ -151,7 +151,7 @@ def _to_diagnosis(fit: Fit, steps: Sequence[SelectionStep], not_testable: Mappin
     lack_columns = [name for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)]
     if lack_columns and any(finished.verdict == UNEXPLAINED for finished in rounds):
         explanation += " " + str(remark("not_tried", names=lack_columns))
-    power = power_of(steps[-1].tests, not_testable, first_round=steps[0].tests)
+    power = power_of(steps[-1].tests, not_testable)
     return Diagnosis(rounds=rounds, effects=added, explanation=explanation, fits=fits, power=power)
 
 

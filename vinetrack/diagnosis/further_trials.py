@@ -24,12 +24,11 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials, Power
+from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
-from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
-from vinetrack.experiment.schema import COLUMNS, LIMITED
+from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, Fit
@@ -39,19 +38,20 @@ from vinetrack.planning.discriminating_design import (
     OTHER_RIG,
     SAME_RIG,
     Condition,
+    Hypothesis,
     RefitTerms,
     best_design,
     best_new_vines,
     conditions_by_effort,
+    exchanged,
     extend,
     feasible_conditions,
     growth_courses,
     refit_terms,
-    sampling_of,
+    simulated_rises,
     worth,
 )
 from vinetrack.planning.predictive_inputs import prior_ratio
-from vinetrack.planning.simulated_campaigns import DesignProblem, simulated_rises
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
@@ -63,9 +63,6 @@ from vinetrack.planning.simulated_campaigns import DesignProblem, simulated_rise
 # separation is predicted by refitting simulated trials; as a check, the trials are simulated again with the true
 # parameters and all noise drawn anew. Where no trials help, or only measurements are in question, the advice is what to
 # measure instead.
-
-# Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended (chosen)
-SUFFICIENT_SEPARATION = 8.0
 
 NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
 
@@ -82,7 +79,6 @@ class NextExperiment:
     separation_sigma: Mapping[str, float] = field(default_factory=dict)
     if_true_sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     simulated_sigma: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    alternatives: tuple[Mapping[str, Any], ...] = ()
     measurement: Remark = field(default_factory=Remark)
 
     @property
@@ -98,31 +94,20 @@ class NextExperiment:
             "separation_sigma": self.separation_sigma,
             "if_true_sigma": self.if_true_sigma,
             "simulated_sigma": {pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()},
-            "alternatives": self.alternatives,
             "calibration": str(self.measurement) or None,
         }
 
 
-@dataclass(frozen=True)
-class _Option:
-    """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `simulated_rises`."""
+def _separations(rises: Floats) -> Floats:
+    """Root of the mean rise over the draws, shape (n, n); 0 where a wrong hypothesis fits better."""
+    count = np.maximum(np.isfinite(rises).sum(axis=0), 1)
+    return np.asarray(np.sqrt(np.maximum(np.nansum(rises, axis=0) / count, 0.0)))
 
-    design: tuple[int, ...]
-    rises: Floats
 
-    @property
-    def separations(self) -> Floats:
-        """Root of the mean rise over the draws, shape (n, n); 0 where a wrong hypothesis fits better."""
-        count = np.maximum(np.isfinite(self.rises).sum(axis=0), 1)
-        return np.asarray(np.sqrt(np.maximum(np.nansum(self.rises, axis=0) / count, 0.0)))
-
-    @property
-    def worth(self) -> float:
-        return float(worth(self.separations[None])[0])
-
-    @property
-    def weakest(self) -> float:
-        return min(_by_pair(self.separations).values())
+def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
+    """The smaller separation of the two directions, by pair."""
+    pairs = itertools.combinations(range(len(separations)), 2)
+    return {(a, b): float(min(separations[a, b], separations[b, a])) for a, b in pairs}
 
 
 @in_one_blas_thread
@@ -135,18 +120,20 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
         raise FitError("The fits to separate are not of the same trials: fit all hypotheses to the same trials.")
     # 5: most hypotheses that a design separates (chosen)
     tied = list(tied)[:5]
-    names = _hypothesis_names(tied)
-    measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
+    # Each is named by the effects that not all of them have, numbered where that is ambiguous.
     common = set.intersection(*(set(fit.model.names) for fit in tied))
+    names = [" + ".join(name for name in fit.model.names if name not in common) or NO_FURTHER_EFFECT for fit in tied]
+    names = [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
+    measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
     differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
     if differ and all(effect.kind == "measurement" for effect in differ):
         faults = [name for name in names if name != NO_FURTHER_EFFECT]
         return NextExperiment(remark("measure_first", faults=faults, measurement=measurement), measurement=measurement)
-    bench, terms = _feasible_trials(tied, names, limits)
-    options = _options(bench, terms, limits, seed)
-    if not options:
+    terms = _feasible_trials(tied, names, limits)
+    if not terms:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
-    return _recommendation(bench, options, seed)
+    design, rises = _best_option(terms, limits, seed)
+    return _recommendation([of_hypothesis.hypothesis for of_hypothesis in terms], design, rises, seed)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -170,132 +157,92 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
     return Remark("deciding_measurements", {**facts, "faults_only": bool(measured)})
 
 
-def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
-    """Each hypothesis named by the effects that not all of them have, numbered where that is ambiguous."""
-    common = set.intersection(*(set(fit.model.names) for fit in tied))
-    names = [" + ".join(name for name in fit.model.names if name not in common) or NO_FURTHER_EFFECT for fit in tied]
-    return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
-
-
-def _feasible_trials(
-    tied: Sequence[Fit], names: Sequence[str], limits: Limits
-) -> tuple[DesignProblem, list[RefitTerms]]:
-    """The hypotheses and conditions that can be simulated, and the quadratic forms of −2 ln L of a trial of each."""
-    data = tied[0].predictor.data
-    feasible = feasible_conditions([trial_data.trial for trial_data in data], limits)
-    if not feasible:
-        return DesignProblem((), (), ()), []
-    cameras = [sampling_of(data, condition.like) for condition in feasible]
-    runs = growth_courses(
-        [extend(fit, name, feasible) for fit, name in zip(tied, names, strict=True)], feasible, cameras
-    )
-    usable = [
-        (condition, camera, run)
-        for condition, camera, run in zip(feasible, cameras, runs, strict=True)
-        if run is not None
-    ]
+def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[RefitTerms]:
+    """The quadratic forms of −2 ln L of all hypotheses with the conditions that can be filmed; none without any."""
+    conditions = feasible_conditions([trial_data.trial for trial_data in tied[0].predictor.data], limits)
+    if not conditions:
+        return []
+    courses = growth_courses([extend(fit, name, conditions) for fit, name in zip(tied, names, strict=True)])
+    usable = [(condition, course) for condition, course in zip(conditions, courses, strict=True) if course is not None]
     if not usable:
-        return DesignProblem((), (), ()), []
-    chosen, samplings, courses = (list(column) for column in zip(*usable, strict=True))
+        return []
+    chosen = [condition for condition, _ in usable]
     hypotheses = [extend(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
     try:
-        return DesignProblem(hypotheses, chosen, samplings), refit_terms(hypotheses, chosen, samplings, courses)
+        return refit_terms(hypotheses, [course for _, course in usable])
     except SimulationError as error:
         raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
 
 
-def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
-    """The best set of trials for each level of effort that gains over the lower ones, with its expected separation. One
-    level beyond a sufficient one is computed as well, for comparison.
+def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> tuple[list[int], Floats]:
+    """The best set of trials of the least effort that is sufficient, else of all. Returns design (indices of
+    conditions, one a trial), rises (see `simulated_rises`).
     """
-    options: list[_Option] = []
+    hypotheses = [of_hypothesis.hypothesis for of_hypothesis in terms]
+    options: list[tuple[list[int], Floats]] = []
     before = -math.inf
 
     def best_vines(places: NDArray[np.intp]) -> list[str]:
         # 2: new vines that are tried, at most (chosen)
-        return best_new_vines(terms, bench.conditions, places, limits.trials, 2 if len(terms) == 2 else 1)
+        return best_new_vines(terms, places, limits.trials, 2 if len(terms) == 2 else 1)
 
-    for _, allowed in conditions_by_effort(bench.conditions, best_vines):
-        if any(option.weakest >= SUFFICIENT_SEPARATION for option in options[:-1]):
-            break
+    for _, allowed in conditions_by_effort(hypotheses[0].conditions, best_vines):
         design, predicted = best_design(terms, allowed, limits.trials)
         # 1.01: factor by which the worth of a design must exceed that with less effort for it to be
         # considered (chosen)
         if predicted > 1.01 * before:
             before = predicted
-            options.append(_Option(tuple(design.tolist()), simulated_rises(bench, design.tolist(), [0], seed)))
-    return options
+            options.append((design, simulated_rises(hypotheses, design, [0], seed)))
+            # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
+            # recommended (chosen)
+            if min(_by_pair(_separations(options[-1][1])).values()) >= 8.0:
+                return options[-1]
+    return max(options, key=lambda option: float(worth(_separations(option[1])[None])[0]))
 
 
-def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
-    """The smaller separation of the two directions, by pair."""
-    return {
-        (a, b): float(min(separations[a, b], separations[b, a]))
-        for a, b in itertools.combinations(range(len(separations)), 2)
-    }
-
-
-def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int) -> NextExperiment:
+def _recommendation(hypotheses: Sequence[Hypothesis], design: list[int], rises: Floats, seed: int) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    # The option of least effort that is sufficient, else the best.
-    sufficient = (option for option in options if option.weakest >= SUFFICIENT_SEPARATION)
-    best = next(sufficient, None) or max(options, key=lambda option: option.worth)
-    best = _Option(best.design, np.concatenate([best.rises, simulated_rises(bench, best.design, [1], seed)]))
-    names = [hypothesis.name for hypothesis in bench.hypotheses]
-    expected_sigma = _by_pair(best.separations)
-    worth_it = max(expected_sigma.values()) >= least_separation
+    separations = _separations(np.concatenate([rises, simulated_rises(hypotheses, design, [1], seed)]))
+    expected = _by_pair(separations)
+    names = [hypothesis.name for hypothesis in hypotheses]
+    pair_names = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
+    worth_it = max(expected.values()) >= least_separation
     # Draws of the check by number of hypotheses, otherwise one; one less beyond 20 standard deviations (chosen)
-    draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected_sigma.values()) > 20.0), 1)
+    draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected.values()) > 20.0), 1)
     simulated = {}
     if worth_it:
-        simulated = _simulated_separations(simulated_rises(bench, best.design, range(draws), seed, thorough=True))
+        simulated = _simulated_separations(simulated_rises(hypotheses, design, range(draws), seed, thorough=True))
     unresolved = [
-        pair
-        for pair, sigma in expected_sigma.items()
-        if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
+        pair for pair, sigma in expected.items() if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
     ]
-    worth_it = worth_it and len(unresolved) < len(expected_sigma)
-    fits = [hypothesis.fit for hypothesis in bench.hypotheses]
-    pairs = [(fits[a], fits[b]) for a, b in unresolved or _separable_by_measurement(fits)]
-    measurement = _deciding_measurements(pairs)
-    sigmas = {_pair_name(names, pair): sigma for pair, sigma in expected_sigma.items()}
-    simulated_by_name = {_pair_name(names, pair): mean_and_sd for pair, mean_and_sd in simulated.items()}
-    trials = trial_entries(bench.conditions, best.design)
+    worth_it = worth_it and len(unresolved) < len(expected)
+    fits = [hypothesis.fit for hypothesis in hypotheses]
+    # Where all pairs are resolved: those that a measurement would decide as well, with an effect of it in only one.
+    kinds = [{effect.kind for effect in fit.model} for fit in fits]
+    pairs = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
+    measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in pairs])
+    trials = trial_entries(hypotheses[0].conditions, design)
     if_true = {
-        _pair_name(names, (a, b)): {names[a]: float(best.separations[a, b]), names[b]: float(best.separations[b, a])}
-        for a, b in expected_sigma
+        pair: {names[a]: float(separations[a, b]), names[b]: float(separations[b, a])}
+        for (a, b), pair in pair_names.items()
     }
+    simulated_by_name = {pair_names[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()}
     return NextExperiment(
         advice=remark(
             "trials_to_make" if worth_it else "no_trials_separate",
             trials=trials,
             if_true=if_true,
             simulated=simulated_by_name,
-            unresolved=[_pair_name(names, pair) for pair in unresolved],
+            unresolved=[pair_names[pair] for pair in unresolved],
             measurement=measurement,
             least_sigma=least_separation,
         ),
         trials=trials if worth_it else (),
-        separation_sigma=sigmas,
+        separation_sigma={pair_names[pair]: sigma for pair, sigma in expected.items()},
         if_true_sigma=if_true,
         simulated_sigma=simulated_by_name,
-        alternatives=tuple(
-            {
-                "trials": [dict(entry) for entry in trial_entries(bench.conditions, option.design)],
-                "separation_sigma": {_pair_name(names, p): s for p, s in _by_pair(option.separations).items()},
-            }
-            for option in sorted(options, key=lambda ranked: -ranked.worth)
-            if option.design != best.design
-        ),
         measurement=measurement,
     )
-
-
-def _separable_by_measurement(fits: Sequence[Fit]) -> list[tuple[int, int]]:
-    """Pairs that a measurement would decide as well as trials: those with a measurement effect in only one of them."""
-    kinds = [{effect.kind for effect in fit.model} for fit in fits]
-    pairs = itertools.combinations(range(len(fits)), 2)
-    return [(a, b) for a, b in pairs if "measurement" in kinds[a] ^ kinds[b]]
 
 
 def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
@@ -303,34 +250,28 @@ def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, 
     sigma = np.sqrt(np.maximum(rises, 0.0))
     simulated = {}
     for a, b in itertools.combinations(range(rises.shape[1]), 2):
-        directions = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
-        directions = [draws for draws in directions if draws.size]
-        if directions:
-            least = min(directions, key=lambda draws: float(np.mean(draws)))
+        known = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
+        least = min((draws for draws in known if draws.size), key=lambda draws: float(np.mean(draws)), default=None)
+        if least is not None:
             simulated[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
     return simulated
 
 
-def _pair_name(names: Sequence[str], pair: tuple[int, int]) -> str:
-    return f"{names[pair[0]]} | {names[pair[1]]}"
-
-
 def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
     """Return the trials of a design as entries of `next_experiment`, one for each condition."""
-    entries = []
-    for index, replicates in zip(*np.unique(np.array(design), return_counts=True), strict=True):
-        condition = every[index]
-        cells = {name: COLUMNS[name].of_trial(condition.trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
-        entries.append(
-            {
-                **{name: float(f"{value:.6g}") for name, value in cells.items()},
-                "replicates": int(replicates),
-                "vine": condition.trial.vine,
-                "new_vine": condition.effort == NEW_VINE,
-                "changed": list(condition.changed),
-            }
-        )
-    return tuple(entries)
+    counted = zip(*np.unique(np.array(design), return_counts=True), strict=True)
+    return tuple({**_entry(every[index]), "replicates": int(replicates)} for index, replicates in counted)
+
+
+def _entry(condition: Condition, *more: str) -> dict[str, Any]:
+    """The cells of the sheet that may be chosen, and `more` of them, NaN where blank; and what is new about a trial."""
+    names = [*(name for name, column in COLUMNS.items() if column.limit), *more]
+    return {
+        **{name: float(f"{COLUMNS[name].of_trial(condition.trial):.6g}") for name in names},
+        "vine": condition.trial.vine,
+        "new_vine": condition.effort == NEW_VINE,
+        "changed": list(condition.changed),
+    }
 
 
 # ------------------------------------------------------------------------------
@@ -349,7 +290,7 @@ REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
 UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
 
-Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products, shape
+Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products
 
 
 class DesignInformation:
@@ -385,24 +326,22 @@ class DesignInformation:
         solved = np.linalg.solve(totals[:, :-count, :-count], cross)
         return np.asarray(totals[:, -count:, -count:] - np.swapaxes(cross, 1, 2) @ solved)
 
-    def exchanged(self, chosen: Sequence[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
-        """The same number of groups, each exchanged for a better one until none gains."""
-        chosen = list(chosen)
-        now = float(worth(self.total(chosen)[None])[0])
-        # 3, 1.002: most passes of the exchange, and the ratio of worth from which a trial is exchanged (chosen)
-        for _ in range(3):
-            before = now
-            for k in range(len(chosen)):
-                others = worth(self.total(chosen[:k] + chosen[k + 1 :]) + self.each[allowed])
-                if np.max(others) > 1.002 * now:
-                    chosen[k], now = int(allowed[int(np.argmax(others))]), float(np.max(others))
-            if now <= before:
+    def grown(self, allowed: NDArray[np.intp], worth: Worth, most: int, wanted: float = math.inf) -> list[int]:
+        """Groups of trials added one by one, up to the `wanted` worth or `most` groups, and exchanged."""
+        chosen: list[int] = []
+        now = float(worth(self.so_far[None])[0])
+        while now < wanted and len(chosen) < most:
+            values = worth(self.total(chosen) + self.each[allowed])
+            if not np.max(values) > now:
                 break
-        return chosen
+            chosen.append(int(allowed[int(np.argmax(values))]))
+            now = float(np.max(values))
+        return self.improved(chosen, allowed, worth)
 
-    def first_information(self, totals: Floats) -> Floats:
-        """Information about the first effect alone, shape (n_designs,)."""
-        return np.asarray(np.maximum(self.information_of(totals)[:, 0, 0], 0.0))
+    def improved(self, chosen: list[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
+        """The same number of groups, exchanged."""
+        now = float(worth(self.total(chosen)[None])[0])
+        return exchanged(chosen, now, allowed, lambda others: worth(self.total(others) + self.each[allowed]))[0]
 
 
 def tests_with_conditions(
@@ -410,27 +349,17 @@ def tests_with_conditions(
 ) -> MisfitTests:
     """Misfit tests of a noise-free design with one trial of each condition added."""
     longest_s = max(camera.longest_s for camera in design.cameras)
-    values: dict[str, Value] = {}
-    stated_B = design.model.values.get(DAMPING)
-    new = {c.trial.vine: c for c in added if c.trial.vine not in {trial.vine for trial in design.trials}}
-    if new and stated_B is not None:
-        B = (
-            dict(stated_B)
-            if isinstance(stated_B, Mapping)
-            else {trial.vine: float(stated_B) for trial in design.trials}
-        )
-        for vine, condition in new.items():
-            like = design.trials[condition.like]
-            B[vine] = B[like.vine] * prior_ratio(condition.trial, like)
-        values = {DAMPING: B}
+    column = design.model.parameter_names.index(DAMPING)
+    B = {trial.vine: float(design.model.parameters_of(trial)[column]) for trial in design.trials}
+    for condition in added:
+        like = design.trials[condition.like]
+        B.setdefault(condition.trial.vine, B[like.vine] * prior_ratio(condition.trial, like))
+    cameras = [replace(design.cameras[c.like], stops_s=math.inf, longest_s=longest_s) for c in added]
     extended = replace(
         design,
-        model=design.model.with_values(values),
+        model=design.model.with_values({DAMPING: B}),
         trials=(*design.trials, *(condition.trial for condition in added)),
-        cameras=(
-            *design.cameras,
-            *(replace(design.cameras[c.like], stops_s=math.inf, longest_s=longest_s) for c in added),
-        ),
+        cameras=(*design.cameras, *cameras),
         candidates=candidates,
     )
     return planned_tests(extended)[0]
@@ -513,28 +442,30 @@ def further_trials(
 class _Search(DesignInformation):
     """The smallest design that has the wanted information about one effect."""
 
+    def first_information(self, totals: Floats) -> Floats:
+        """Information about the first effect alone, shape (n_designs,)."""
+        return np.asarray(np.maximum(self.information_of(totals)[:, 0, 0], 0.0))
+
     def information(self, chosen: Sequence[int]) -> float:
         """Information about the size from these trials and those so far."""
         return float(self.first_information(self.total(chosen)[None])[0])
 
     def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
         """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
+
+        def cost(chosen: Sequence[int]) -> tuple[float, float]:
+            information = self.information(chosen)
+            return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
+
         options: dict[str, list[int]] = {}
         effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
         for effort, allowed in conditions_by_effort(self.conditions, self._best_new_vines):
             words, chosen = effort_words[effort], self._design(allowed, wanted, most)
-            options[words] = min(options.get(words, chosen), chosen, key=lambda design: self._cost(design, wanted))
-        if not options:
-            return [], {}
-        words = min(options, key=lambda name: self._cost(options[name], wanted))
+            options[words] = min(options.get(words, chosen), chosen, key=cost)
         reached = {
-            name: REPLICATES * len(chosen) for name, chosen in options.items() if self.information(chosen) >= wanted
+            words: REPLICATES * len(chosen) for words, chosen in options.items() if self.information(chosen) >= wanted
         }
-        return options[words], reached
-
-    def _cost(self, chosen: Sequence[int], wanted: float) -> tuple[float, float]:
-        information = self.information(chosen)
-        return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
+        return min(options.values(), key=cost, default=[]), reached
 
     def _best_new_vines(self, places: NDArray[np.intp]) -> list[str]:
         """The new vines with the largest information in unlimited trials of all their conditions."""
@@ -545,37 +476,20 @@ class _Search(DesignInformation):
         return [new[k] for k in np.argsort(-self.first_information(np.stack(unlimited)))[:2]]
 
     def _design(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
-        """Pairs added one by one up to the wanted information, exchanged, and removed where not needed."""
-        pairs_per_step = (1, 2)  # Pairs of one condition that are added at a time; the best gain a pair counts (chosen)
-        chosen: list[int] = []
-        information = self.information(())
-        while information < wanted and len(chosen) < most:
-            total = self.total(chosen)
-            gains = [
-                (self.first_information(total + count * self.each[allowed]) - information) / count
-                for count in pairs_per_step
-            ]
-            step, index = np.unravel_index(int(np.argmax(gains)), (len(pairs_per_step), allowed.size))
-            if not gains[step][index] > 0:
-                break
-            chosen += [int(allowed[index])] * min(pairs_per_step[step], most - len(chosen))
-            information = self.information(chosen)
-        chosen = self.exchanged(chosen, allowed, self.first_information)
+        """Pairs added one by one up to the wanted information, exchanged, and removed where not needed; the most
+        informative first.
+        """
+        chosen = self.grown(allowed, self.first_information, most, wanted)
         while len(chosen) > 1:
             least = int(np.argmax(self.first_information(self.total(chosen) - self.each[chosen])))
-            fewer = self.exchanged(chosen[:least] + chosen[least + 1 :], allowed, self.first_information)
+            fewer = self.improved(chosen[:least] + chosen[least + 1 :], allowed, self.first_information)
             if self.information(fewer) < wanted:
                 break
             chosen = fewer
-        return self._most_informative_first(chosen)
-
-    def _most_informative_first(self, chosen: Sequence[int]) -> list[int]:
-        """The same trials, in order of the information they add."""
-        remaining: list[int] = list(chosen)
         order: list[int] = []
-        while remaining:
-            gains = self.first_information(self.total(order) + self.each[remaining])
-            order.append(remaining.pop(int(np.argmax(gains))))
+        while chosen:
+            gains_of = self.first_information(self.total(order) + self.each[chosen])
+            order.append(chosen.pop(int(np.argmax(gains_of))))
         return order
 
 
@@ -596,14 +510,15 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
     """The plan with as many of these trials as needed, and the power after each."""
     conditions = [search.conditions[k] for k in chosen for _ in range(REPLICATES)]
     tests_with = tests_of_designs(design, conditions)
-    trials: list[AddedTrial] = []
+    trials: list[dict[str, Any]] = []
     power, probability = plan.power, plan.before
     while len(trials) < len(conditions) and probability < plan.target:
         power = effect_power(tests_with(conditions[: len(trials) + REPLICATES]), power.effect) or power
         probability = power.probability_at(plan.value)
         for condition in conditions[len(trials) : len(trials) + REPLICATES]:
-            trial = replace(condition.trial, name=f"added_{len(trials) + 1}")
-            trials.append(AddedTrial(trial, condition.changed, condition.effort == NEW_VINE, probability))
+            cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
+            known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
+            trials.append({**known, "probability": probability})
     endless = search.first_information((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
     ratio = math.sqrt(endless / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
     unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))
@@ -643,43 +558,25 @@ def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | No
     feasible = feasible_conditions(design.trials, limits.model_copy(update={"new_vines": False}))
     if not feasible or not power.effects:
         return None
-    search = _InformativeTrialsSearch(design, feasible, power)
+    search = DesignInformation(design, feasible, [entry.effect for entry in power.effects])
     if not search.conditions or not search.effects:
         return None
-    chosen = search.best(max(limits.trials // REPLICATES, 1))
-    before, after = search.total(())[None], search.total(chosen)[None]
-    if not search.expected_discoveries(after)[0] > search.expected_discoveries(before)[0]:
+    largest = np.array([abs(power[name].largest - power[name].zero) for name in search.effects])
+
+    def expected_discoveries(totals: Floats) -> Floats:
+        """Expected numbers of effects that are detected, and that are told from all others, added up."""
+        information = np.stack(_alone_and_distinct(search.information_of(totals)))
+        scores = SIZES[:, None, None, None] * largest * np.sqrt(information)
+        return np.asarray(ndtr(scores - power.threshold).mean(axis=0).sum(axis=(0, 2)))
+
+    every = np.arange(len(search.conditions))
+    chosen = search.grown(every, expected_discoveries, max(limits.trials // REPLICATES, 1))
+    if not chosen:
         return None
     groups = [k for k in chosen for _ in range(min(REPLICATES, limits.trials))]
     added = [search.conditions[k] for k in groups]
     then = power_of(tests_of_designs(design, added)(added), nonlinear=True)
     return InformativeTrials(trial_entries(search.conditions, groups), power, then)
-
-
-class _InformativeTrialsSearch(DesignInformation):
-    """The design that is worth most."""
-
-    def __init__(self, design: CampaignDesign, every: Sequence[Condition], power: Power) -> None:
-        super().__init__(design, every, [entry.effect for entry in power.effects])
-        self.largest = np.array([abs(power[name].largest - power[name].zero) for name in self.effects])
-        self.required = power.threshold
-
-    def expected_discoveries(self, totals: Floats) -> Floats:
-        """Expected numbers of effects that are detected, and that are told from all others, added up."""
-        alone, distinct = _alone_and_distinct(self.information_of(totals))
-        return self._expected(alone) + self._expected(distinct)
-
-    def _expected(self, information: Floats) -> Floats:
-        """Expected number of effects detected with this information about each, shape (n_designs,)."""
-        scores = SIZES[:, None, None] * self.largest * np.sqrt(information)
-        return np.asarray(ndtr(scores - self.required).mean(axis=0).sum(axis=1))
-
-    def best(self, count: int) -> list[int]:
-        """As many groups of trials, added one by one and exchanged."""
-        chosen: list[int] = []
-        for _ in range(count):
-            chosen.append(int(np.argmax(self.expected_discoveries(self.total(chosen) + self.each))))
-        return self.exchanged(chosen, np.arange(len(self.conditions)), self.expected_discoveries)
 
 
 def _alone_and_distinct(information: Floats) -> tuple[Floats, Floats]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from scipy.stats import norm, t
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import END_FRACTION, Floats
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
-from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.score_test import (
     CandidateShape,
@@ -185,18 +186,18 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
     """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held."""
     state, jobs = start.state, start.jobs.with_effect([shape.size.zero + size, *shape.other_values])
     moved = start.predictor.run_as(fit.model + shape.effect, jobs)
-    used = [
-        _used_points(trial_data, trajectory) for trial_data, trajectory in zip(fit.predictor.data, moved, strict=True)
-    ]
+    before = fit.predictor.data
+    used = [_used_points(trial_data, trajectory) for trial_data, trajectory in zip(before, moved, strict=True)]
+    origins_m = state.trial_effects[:, ORIGIN]
     data = [
-        _with_positions(trial_data, trajectory, state.trial_effects[i], keep)
-        for i, (trial_data, trajectory, keep) in enumerate(zip(fit.predictor.data, moved, used, strict=True))
+        _with_positions(trial_data, origin_m + trajectory.observed_position_m, keep)
+        for trial_data, trajectory, origin_m, keep in zip(before, moved, origins_m, used, strict=True)
     ]
     if any(trial_data.time_s.size < FEWEST_POINTS or not np.ptp(trial_data.lead_position_m) > 0 for trial_data in data):
         raise SimulationError(f"With {shape.effect.name} at that size a trial does not move.")
     initial = [columns[keep] for columns, keep in zip(start.columns, used, strict=True)]
-    for columns, trial_data, before, keep in zip(initial, data, fit.predictor.data, used, strict=True):
-        columns[:, -1] += trial_data.lead_position_m - before.lead_position_m[keep]
+    for columns, trial_data, measured, keep in zip(initial, data, before, used, strict=True):
+        columns[:, -1] += trial_data.lead_position_m - measured.lead_position_m[keep]
     predictor = _predictor_of(start.predictor, data)
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
     # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
@@ -232,25 +233,18 @@ def _used_points(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.boo
     return np.asarray(grown | (ended & (trajectory.time_s > behind_s)) | ~np.isfinite(trial_data.trial.length_m))
 
 
-def _with_positions(
-    trial_data: FitTrial, trajectory: Trajectory, trial_effects: Floats, keep: NDArray[np.bool_]
-) -> FitTrial:
-    """A trial with the positions of a trajectory, at the points that a fit uses."""
+def _with_positions(trial_data: FitTrial, position_m: Floats, keep: NDArray[np.bool_]) -> FitTrial:
+    """A trial with other positions, at the points that a fit uses; stretches without gaps begin anew behind a gap."""
+    stretch = np.cumsum(trial_data.first | np.concatenate([[False], ~keep[:-1]]))[keep]
+    known = {name: getattr(trial_data, name) for name in ("stated_m", "slow_m", "relative_sd")}
+    of_points: dict[str, Any] = {name: None if values is None else values[keep] for name, values in known.items()}
     return replace(
         trial_data,
         time_s=trial_data.time_s[keep],
-        lead_position_m=(trial_effects[ORIGIN] + trajectory.observed_position_m)[keep],
-        first=_stretch_starts(trial_data, keep),
-        stated_m=None if trial_data.stated_m is None else trial_data.stated_m[keep],
-        slow_m=None if trial_data.slow_m is None else trial_data.slow_m[keep],
-        relative_sd=None if trial_data.relative_sd is None else trial_data.relative_sd[keep],
+        lead_position_m=position_m[keep],
+        first=np.concatenate([[True], np.diff(stretch) > 0]),
+        **of_points,
     )
-
-
-def _stretch_starts(trial_data: FitTrial, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the used points begin a stretch without gaps."""
-    stretch = np.cumsum(trial_data.first | np.concatenate([[False], ~keep[:-1]]))[keep]
-    return np.concatenate([[True], np.diff(stretch) > 0])
 
 
 DRAWS, SEED = 4000, 5  # Draws of the normal distributions, and their seed (derived)
@@ -260,35 +254,21 @@ DRAWS, SEED = 4000, 5  # Draws of the normal distributions, and their seed (deri
 SCORE_GRID = np.linspace(0.0, 40.0, 401)
 
 
-@dataclass(frozen=True)
-class _Response:
-    """Expected scores of all shapes when an effect has one of several sizes. `index` is that of `shape` among all.
-    `sizes`, shape (n_sizes,), are deviations from absence in SI, increasing in absolute value; `scores`, shape
-    (n_sizes, n_shapes), are the means of the scores in standard errors.
-    """
-
-    effect: Effect
-    shape: CandidateShape
-    index: int
-    sizes: Floats
-    scores: Floats
-
-
 def power_of(
     tests: MisfitTests,
     not_testable: Mapping[str, Remark] | None = None,
     inputs: Sequence[PowerInput] = (),
     *,
     nonlinear: bool = False,
-    first_round: MisfitTests | None = None,
     only: str = "",
 ) -> Power:
     """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
-    null_scores, inflation, least = _null_scores(tests), error_inflation(tests), sizes_at_systematic_error(tests)
+    start = noiseless_start(tests.fit) if nonlinear else None
+    known = _null_scores(tests), error_inflation(tests), sizes_at_systematic_error(tests)
     effects = [
         power
-        for response in _responses(tests, nonlinear=nonlinear, only=only)
-        if (power := _effect_power(tests, response, null_scores, inflation, least)) is not None
+        for effect in tests.effects
+        if only in ("", effect.name) and (power := _effect_power(tests, effect, start, *known)) is not None
     ]
     silent = dict.fromkeys(tests.sensitivities.silent, remark("no_response"))
     wary = Remark()
@@ -297,11 +277,11 @@ def power_of(
     return Power(
         n_trials=len(tests.fit.trials),
         threshold=tests.family.single_shape_threshold,
-        false_alarms=_false_alarms(first_round or tests),
+        false_alarms=_false_alarms(tests.fit),
         effects=tuple(effects),
         not_testable={**(not_testable or {}), **silent},
         numbers=_interval_widths(tests.fit),
-        inputs=tuple(inputs) or inputs_of_fit(tests.fit),
+        inputs=tuple(inputs or _inputs_of_fit(tests.fit)),
         model=tests.fit.model.names,
         wary=wary,
     )
@@ -312,45 +292,14 @@ def effect_power(tests: MisfitTests, name: str) -> EffectPower | None:
     return next(iter(power_of(tests, nonlinear=True, only=name).effects), None)
 
 
-def inputs_of_fit(fit: Fit) -> tuple[PowerInput, ...]:
+def _inputs_of_fit(fit: Fit) -> list[PowerInput]:
     """Noise and between-trial standard deviations that a fit estimated or was given."""
-    rows = [
-        PowerInput("noise of a position", f"{1e3 * fit.noise_m:.3g} mm, correlation {fit.noise_correlation:.2f}", "fit")
-    ]
+    noise = f"{1e3 * fit.noise_m:.3g} mm, correlation {fit.noise_correlation:.2f}"
+    rows = [PowerInput("noise of a position", noise, "fit")]
     for name, spread in fit.spreads.items():
         origin = "fit" if spread.estimated else "assumed: too few trials to estimate it"
         rows.append(PowerInput(f"spread of {name} from trial to trial", f"{100 * spread.value:.2g} %", origin))
-    return tuple(rows)
-
-
-def _responses(tests: MisfitTests, *, nonlinear: bool, only: str) -> list[_Response]:
-    """Expected scores of all shapes by the size of an effect: one response for each effect, or only one."""
-    information = tests.scores.information
-    root = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    start = noiseless_start(tests.fit) if nonlinear else None
-    responses = []
-    for effect in tests.effects:
-        if only not in ("", effect.name):
-            continue
-        indices = typical_shapes(tests, effect.name)
-        if not indices:
-            continue
-        shapes = [tests.sensitivities.shapes[index] for index in indices]
-        sizes = np.array(
-            [
-                shape.step if shape.whole else _plausible_sign(shape) / root[k]
-                for shape, k in zip(shapes, indices, strict=True)
-            ]
-        )
-        scores = information[indices] * sizes[:, None] / root
-        if start is not None and not shapes[0].whole:
-            unit = float(sizes[0])
-            sizes, ratios = score_ratios(tests, indices[0], unit, start)
-            scores = scores[0] * (ratios * sizes / unit)[:, None]
-        responses.append(
-            _Response(effect, shapes[0], indices[0], sizes, np.where(np.diag(information) > 0, scores, 0.0))
-        )
-    return responses
+    return rows
 
 
 def typical_shapes(tests: MisfitTests, name: str) -> list[int]:
@@ -378,28 +327,49 @@ def _sided(scores: Floats, signs: Sequence[int]) -> Floats:
 
 
 def _effect_power(
-    tests: MisfitTests, response: _Response, null_scores: Floats, inflation: Floats, least: Floats
+    tests: MisfitTests,
+    effect: Effect,
+    start: NoiselessStart | None,
+    null_scores: Floats,
+    inflation: Floats,
+    least: Floats,
 ) -> EffectPower | None:
-    """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %."""
-    indices = [k for k, name in enumerate(tests.sensitivities.effects) if name == response.effect.name]
-    expected = _sided(response.scores, tests.signs)
+    """Detectable sizes of one effect, and how often others score higher at the size detected with 90 %; those of finite
+    size from linear theory, without `start`.
+    """
+    typical = typical_shapes(tests, effect.name)
+    if not typical:
+        return None
+    shapes = [tests.sensitivities.shapes[k] for k in typical]
+    shape, size = shapes[0], shapes[0].size
+    # Sizes (deviations from absence in SI, increasing in absolute value), and the expected scores of all shapes there
+    information = tests.scores.information
+    root = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    units = [one.step if one.whole else _plausible_sign(one) / root[k] for one, k in zip(shapes, typical, strict=True)]
+    sizes = np.array(units)
+    scores = information[typical] * sizes[:, None] / root
+    if start is not None and not shape.whole:
+        sizes, ratios = score_ratios(tests, typical[0], float(units[0]), start)
+        scores = scores[0] * (ratios * sizes / units[0])[:, None]
+    scores = np.where(np.diag(information) > 0, scores, 0.0)
+    indices = [k for k, name in enumerate(tests.sensitivities.effects) if name == effect.name]
+    expected = _sided(scores, tests.signs)
     index = max(indices, key=lambda k: float(expected[-1, k]))
     means = np.maximum.accumulate(np.maximum(expected[:, index], 0.0))
     if not means[-1] > 0:
         return None
     needed = np.quantile(_required_means(tests, index, inflation[:, index]), PROBABILITIES)
-    steps = np.array([_size_with_mean(means, response.sizes, mean) for mean in needed])
-    if not response.shape.whole and np.isfinite(steps).all():
+    steps = np.array([_size_with_mean(means, sizes, mean) for mean in needed])
+    if not shape.whole and np.isfinite(steps).all():
         # A detection below the size that systematic errors imitate counts with probability one half.
-        size, smallest = np.abs(steps), float(least[response.index])
-        at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, size, right=math.inf)
-        steps = np.sign(steps) * np.where(size >= smallest, size, np.minimum(at_half_power, smallest))
-    taken_for, named_alone = _confusion(tests, response, float(steps[PROBABILITIES.index(0.9)]), null_scores)
-    effect, shape = response.effect, response.shape
+        away, smallest = np.abs(steps), float(least[typical[0]])
+        at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, away, right=math.inf)
+        steps = np.sign(steps) * np.where(away >= smallest, away, np.minimum(at_half_power, smallest))
+    at_90 = abs(float(steps[PROBABILITIES.index(0.9)]))
+    taken_for, named_alone = _confusion(tests, effect, _scores_at(sizes, scores, at_90), null_scores)
     if not effect.parameters:
-        sizes = tuple(steps.tolist())
-        return EffectPower(effect.name, effect.kind, "", "size", "1", 0.0, 0.0, 1.0, sizes, taken_for, named_alone)
-    size = shape.size
+        found_at = tuple(steps.tolist())
+        return EffectPower(effect.name, effect.kind, "", "size", "1", 0.0, 0.0, 1.0, found_at, taken_for, named_alone)
     ends = sorted(plausible_range(size), key=lambda end: abs(end - size.zero))
     same_side = (ends[0] - size.zero) * (ends[1] - size.zero) > 0
     return EffectPower(
@@ -416,6 +386,16 @@ def _effect_power(
         named_alone=named_alone,
         other_values=shape.other_values,
     )
+
+
+def _scores_at(sizes: Floats, scores: Floats, size: float) -> Floats:
+    """Expected scores of all shapes at a size: interpolated, and proportional beyond the last; NaN for no size."""
+    if not math.isfinite(size):
+        return np.full(scores.shape[1], math.nan)
+    away = np.concatenate([[0.0], np.abs(sizes)])
+    if size > away[-1]:
+        return np.asarray(scores[-1] * size / away[-1])
+    return np.array([np.interp(size, away, [0.0, *column]) for column in scores.T])
 
 
 def _size_with_mean(means: Floats, sizes: Floats, mean: float) -> float:
@@ -483,32 +463,25 @@ def _null_scores(tests: MisfitTests) -> Floats:
     return np.asarray(np.random.default_rng(SEED).standard_normal((DRAWS, len(values))) @ root.T)
 
 
-def _confusion(
-    tests: MisfitTests, response: _Response, size: float, null_scores: Floats
-) -> tuple[dict[str, float], float]:
-    """How often each other candidate scores highest at a size, and how often the effect is named alone. Both among
-    draws in which any candidate exceeds its threshold. A score counts where its size is credible; an effect that
-    contains another as a limit, be it this one or its rival, must be better by the Δχ² of the answer set.
+def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Floats) -> tuple[dict[str, float], float]:
+    """How often each other candidate scores highest at a size, whose scores have this mean, and how often the effect is
+    named alone. Both among draws in which any candidate exceeds its threshold. A score counts where its size is
+    credible; an effect that contains another as a limit, be it this one or its rival, must be better by the Δχ² of the
+    answer set.
     """
-    if not math.isfinite(size):
+    if np.isnan(mean).any():
         return {}, math.nan
-    sizes = np.concatenate([[0.0], np.abs(response.sizes)])
-    scores = np.vstack([np.zeros(response.scores.shape[1]), response.scores])
-    if abs(size) > sizes[-1]:
-        mean = response.scores[-1] * abs(size) / sizes[-1]
-    else:
-        mean = np.array([np.interp(abs(size), sizes, column) for column in scores.T])
     drawn = null_scores + mean
     counted = np.where(_credible(tests, drawn), _sided(drawn, tests.signs), 0.0)
     squares, names = _largest_by_effect(tests, np.maximum(counted, 0.0) ** 2)
-    itself = names.index(response.effect.name)
+    itself = names.index(effect.name)
     limits = np.array([tests.family.threshold(name) for name in names])
     alarm = np.any(squares > limits**2, axis=1)
     if np.count_nonzero(alarm) < DRAWS / 100:
         return {}, math.nan
-    containing = {effect.name for effect in tests.effects if response.effect.name in effect.replaces}
-    if any(name in response.effect.replaces for name in names):
-        containing.add(response.effect.name)
+    containing = {other.name for other in tests.effects if effect.name in other.replaces}
+    if any(name in effect.replaces for name in names):
+        containing.add(effect.name)
     squares[:, [k for k, name in enumerate(names) if name in containing]] -= ANSWER_SET_DELTA_CHI2
     squares = squares[alarm]
     highest = np.argmax(squares, axis=1)
@@ -541,9 +514,9 @@ def _largest_by_effect(tests: MisfitTests, values: Floats) -> tuple[Floats, list
     return np.stack([values[:, effect_of_shape == k].max(axis=1) for k in range(len(names))], axis=1), names
 
 
-def _false_alarms(tests: MisfitTests) -> dict[str, float]:
-    """False-alarm rate of every test of a round, as `misfit_tests` and `selection` set their levels."""
-    level = tests.level
+def _false_alarms(fit: Fit) -> dict[str, float]:
+    """False-alarm rate of every test of the first round, as `misfit_tests` and `selection` set their levels."""
+    level = FALSE_ALARM_LEVEL_FIRST_ROUND
     rates = {
         "scores of all candidates": level,
         "any smooth force": 0.1 * level,
@@ -551,7 +524,7 @@ def _false_alarms(tests: MisfitTests) -> dict[str, float]:
         "replicates that err alike": 0.1 * level,
         "noise that is larger in motion": 0.1 * level,
     }
-    trials = [trial.trial for trial in tests.fit.trials]
+    trials = [trial.trial for trial in fit.trials]
     if any(math.isfinite(trial.order) or any(getattr(trial, name) for name in GROUPINGS) for trial in trials):
         rates["specimens, days or the order of trials"] = level
     return rates
@@ -561,10 +534,8 @@ def _interval_widths(fit: Fit) -> tuple[NumberWidth, ...]:
     """Half widths of the 95 % intervals of n and of every B, relative for B."""
     widths = []
     for number in fit.numbers:
-        half = (number.high - number.low) / 2
-        if number.key == DAMPING and math.isfinite(half):
-            half = half / number.value if number.value > 0 else half
-            widths.append(NumberWidth("B", number.vine, number.value, half))
-        elif number.key == EXPONENT and math.isfinite(half):
-            widths.append(NumberWidth("n", number.vine, number.value, half))
+        half, symbol = (number.high - number.low) / 2, {DAMPING: "B", EXPONENT: "n"}.get(number.key)
+        if symbol and math.isfinite(half):
+            relative = half / number.value if symbol == "B" and number.value > 0 else half
+            widths.append(NumberWidth(symbol, number.vine, number.value, relative))
     return tuple(widths)

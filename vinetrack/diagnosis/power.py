@@ -16,10 +16,8 @@ from pydantic import Field
 
 from vinetrack.core.notebook import plot
 from vinetrack.core.problems import Remark, in_words, remark
-from vinetrack.core.records import Trial
 from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import or_nan
-from vinetrack.experiment.schema import COLUMNS
 from vinetrack.inference.fit_result import OrNaN, or_open
 
 if TYPE_CHECKING:
@@ -108,22 +106,26 @@ class PowerInput:
 
 
 @dataclass(frozen=True)
-class Rate:
-    """How often something happened in simulated campaigns, with the exact binomial 95 % interval. Clopper & Pearson,
-    Biometrika 26, 404 (1934).
+class SimulatedRates:
+    """Outcomes of complete diagnoses of simulated campaigns with one effect; with none where `effect` is blank. `count`
+    of `campaigns` are those in which the effect was found (where nothing is missing: anything); `promised` is its
+    probability by linear theory (that of a false alarm); `named` counts what was named, most frequent first.
     """
 
+    effect: str
+    value: float
+    promised: float
     count: int
+    alarms: int
     campaigns: int
-
-    @property
-    def value(self) -> float:
-        """Observed rate; NaN where there is no campaign."""
-        return self.count / self.campaigns if self.campaigns else math.nan
+    named: tuple[tuple[str, int], ...]
+    failed: int
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Ends of the 95 % interval; 0 and 1 where there is no campaign."""
+        """Exact binomial 95 % interval of the rate; 0 and 1 where there is no campaign. Clopper & Pearson, Biometrika
+        26, 404 (1934).
+        """
         from scipy.stats import binomtest
 
         if not self.campaigns:
@@ -132,53 +134,28 @@ class Rate:
         exact = binomtest(self.count, self.campaigns).proportion_ci(0.95, method="exact")
         return float(exact.low), float(exact.high)
 
-
-@dataclass(frozen=True)
-class SimulatedRates:
-    """Outcomes of complete diagnoses of simulated campaigns with one effect; with none where `effect` is blank.
-    `detections` counts those in which the effect was found; `promised` is its probability by linear theory (that of a
-    false alarm, where nothing is missing); `named` counts what was named, most frequent first.
-    """
-
-    effect: str
-    value: float
-    promised: float
-    alarms: Rate
-    detections: Rate
-    named: tuple[tuple[str, int], ...]
-    failed: int
-
     def to_json(self) -> dict[str, object]:
         """As an entry of `simulated`."""
-        counted = self.detections if self.effect else self.alarms
         return {
             "effect": self.effect,
             "value": None if math.isnan(self.value) else self.value,
             "promised": self.promised,
-            "rate": counted.value,
-            "interval_95": list(counted.interval),
-            "campaigns": counted.campaigns,
-            "alarms": self.alarms.count,
+            "rate": self.count / self.campaigns if self.campaigns else math.nan,
+            "interval_95": list(self.interval),
+            "campaigns": self.campaigns,
+            "alarms": self.alarms,
             "named": dict(self.named),
             "failed": self.failed,
         }
 
 
 @dataclass(frozen=True)
-class AddedTrial:
-    """A trial to make, what changes on the rig for it, and the power once it is made as well."""
-
-    trial: Trial
-    changed: tuple[str, ...]
-    new_vine: bool
-    probability: float
-
-
-@dataclass(frozen=True)
 class FurtherTrials:
     """Further trials that bring the power for an effect of one size to a target. `power` is that with these trials,
     `before` the probability with the trials so far, `unlimited` that with unlimited replicates of all trials within the
-    limits; `n_conditions` counts the conditions considered.
+    limits; `n_conditions` counts the conditions considered. `trials` has an entry for each trial to make: its cells of
+    the sheet without blank ones, `vine`, `new_vine`, what is `changed` on the rig, and the `probability` once it is
+    made as well.
     """
 
     power: EffectPower
@@ -187,13 +164,13 @@ class FurtherTrials:
     before: float
     unlimited: float = math.nan
     n_conditions: int = 0
-    trials: tuple[AddedTrial, ...] = ()
+    trials: tuple[Mapping[str, Any], ...] = ()
     needed: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def after(self) -> float:
         """Power once all trials are made."""
-        return self.trials[-1].probability if self.trials else self.before
+        return float(self.trials[-1]["probability"]) if self.trials else self.before
 
     @property
     def is_reached(self) -> bool:
@@ -214,24 +191,8 @@ class FurtherTrials:
             "conditions_looked_at": self.n_conditions,
             "needed": dict(self.needed),
             "taken_for": dict(self.power.taken_for),
-            "trials": [
-                {
-                    **sheet_cells(added.trial),
-                    "vine": added.trial.vine,
-                    "changed": list(added.changed),
-                    "new_vine": added.new_vine,
-                    "probability": added.probability,
-                }
-                for added in self.trials
-            ],
+            "trials": list(self.trials),
         }
-
-
-def sheet_cells(trial: Trial) -> dict[str, float]:
-    """Cells of the sheet that describe how to set up a further trial, without blank ones."""
-    names = [*(name for name, column in COLUMNS.items() if column.limit), "yield_pressure_kPa", "capture_fps"]
-    cells = {name: COLUMNS[name].of_trial(trial) for name in names}
-    return {name: float(f"{value:.6g}") for name, value in cells.items() if math.isfinite(value)}
 
 
 @dataclass(frozen=True)

@@ -223,9 +223,8 @@ def simulated_lines(power: Power) -> list[str]:
     """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory."""
     lines = []
     for rates in power.simulated:
-        counted = rates.detections if rates.effect else rates.alarms
-        low, high = map(percent, counted.interval)
-        rate = f"{counted.count} of {counted.campaigns} ({low} to {high} with 95 % confidence)"
+        low, high = map(percent, rates.interval)
+        rate = f"{rates.count} of {rates.campaigns} ({low} to {high} with 95 % confidence)"
         if rates.effect:
             entry = power[rates.effect]
             size = f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}"
@@ -240,7 +239,6 @@ def simulated_lines(power: Power) -> list[str]:
 def further_lines(plan: FurtherTrials) -> list[str]:
     """Return the further trials with which an effect is detected with the wanted power, a row for each condition."""
     from vinetrack.core.terminal import table
-    from vinetrack.diagnosis.power import sheet_cells
 
     power = plan.power
     what = f"{spaced_name(power.effect)} at {power.symbol} = {size_text(power, plan.value)}"
@@ -251,13 +249,13 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     count = len(plan.trials)
     lines = [f"To detect {what} with {percent(plan.target)} power ({percent(plan.before)} with the trials so far):"]
     rows = []
-    for cells, group in groupby(plan.trials, key=lambda trial: sheet_cells(trial.trial)):
+    for trial, group in groupby(plan.trials, key=lambda added: dict(added, probability=None)):
         alike = list(group)
-        added, kPa, grams = alike[0], cells.get("pressure_kPa", math.nan), cells.get("payload_g", 0.0)
-        new = ["a new vine"] if added.new_vine else []
-        new += [f"{(c := COLUMNS[name]).quantity} {cells.get(name, math.nan):g} {c.unit}" for name in added.changed]
-        then = percent(alike[-1].probability)
-        rows.append((str(len(alike)), added.trial.vine, f"{kPa:g}", f"{grams:g}", ", ".join(new) or "–", then))
+        new = ["a new vine"] if trial["new_vine"] else []
+        new += [f"{(c := COLUMNS[name]).quantity} {trial.get(name, math.nan):g} {c.unit}" for name in trial["changed"]]
+        pressure, payload = f"{trial.get('pressure_kPa', math.nan):g}", f"{trial.get('payload_g', 0.0):g}"
+        then = percent(alike[-1]["probability"])
+        rows.append((str(len(alike)), trial["vine"], pressure, payload, ", ".join(new) or "–", then))
     if rows and plan.after > plan.before:
         head = ("trials", "vine", "pressure", "payload", "new", "power then")
         lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
@@ -269,8 +267,8 @@ def further_lines(plan: FurtherTrials) -> list[str]:
             )
         else:
             lines.append(f"{count} further trials do not suffice; more would, up to {percent(plan.unlimited)} power.")
-    changes = {"with a new vine"} if any(added.new_vine for added in plan.trials) else set()
-    changes |= {"with another rig"} if any(added.changed for added in plan.trials) else set()
+    changes = {"with a new vine"} if any(trial["new_vine"] for trial in plan.trials) else set()
+    changes |= {"with another rig"} if any(trial["changed"] for trial in plan.trials) else set()
     alternatives = [
         f"{words} about {needed}"
         for words, needed in plan.needed.items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.campaign_power import (
     CampaignDesign,
+    FilmingPlan,
     design_of_fit,
     fitted_tests,
     planned_tests,
@@ -28,11 +29,12 @@ from vinetrack.diagnosis.campaign_power import (
 from vinetrack.diagnosis.further_trials import exploratory_trials, further_trials
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
+from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for, make_model
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.experiment.sheet import YIELD_SIGMA_KPA, PlannedTrials, expected_systematic_m, planned_sheet
 from vinetrack.inference.fit import fit
@@ -42,7 +44,6 @@ from vinetrack.pipeline.effects_stage import effects_of
 from vinetrack.pipeline.predict_stage import effects_of_plan
 from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
-from vinetrack.planning.simulated_campaigns import FilmingPlan
 from vinetrack.results.folder_layout import Results, measured_trials, read_diagnosis, read_source_experiment
 
 
@@ -70,39 +71,28 @@ class PowerRequest:
     recommend: bool = False
     experiment: Path | None = None
 
-    def assumptions(
-        self, noise: tuple[float, float], spreads: Sequence[float], otherwise: tuple[str, str]
-    ) -> tuple[tuple[float, float], tuple[float, float], list[PowerInput]]:
-        """Noise of a position, m, with its correlation, and standard deviations between trials of pressure and B: as
-        stated, else those given, which have the origins `otherwise`. Returns noise, spreads, and both in words.
-        """
-        pairs, origins = [], []
-        for stated, other, origin in (
-            ((self.noise_mm / 1e3, self.noise_correlation), noise, otherwise[0]),
-            ((self.spread_P, self.spread_B), spreads, otherwise[1]),
-        ):
-            first, second = np.where(np.isnan(stated), other, stated).tolist()
-            pairs.append((first, second))
-            origins.append(origin if np.isnan(stated).all() else "stated")
-        (noise_m, correlation), (pressure, damping) = pairs
-        words = (
-            ("noise of a position", f"{1e3 * noise_m:.3g} mm, correlation {correlation:.2f}", origins[0]),
-            ("spread of pressure from trial to trial", f"{100 * pressure:.2g} %", origins[1]),
-            ("spread of B from trial to trial", f"{100 * damping:.2g} %", origins[1]),
-        )
-        return pairs[0], pairs[1], [PowerInput(*row) for row in words]
+
+def _assumed(stated: tuple[float, float], otherwise: Sequence[float], origin: str) -> tuple[tuple[float, float], str]:
+    """A pair of numbers, each as stated, else as given otherwise; and where they come from."""
+    first, second = np.where(np.isnan(stated), otherwise, stated).tolist()
+    return (first, second), origin if np.isnan(stated).all() else "stated"
 
 
-@dataclass(frozen=True)
-class PowerCampaign:
-    """The power of a campaign by linear theory, its design for simulations, and constraints on further trials."""
+def _inputs_in_words(
+    noise: tuple[float, float], of_noise: str, spreads: tuple[float, float], of_spreads: str
+) -> list[PowerInput]:
+    """Noise of a position, m, with its correlation, and standard deviations between trials of pressure and B."""
+    return [
+        PowerInput("noise of a position", f"{1e3 * noise[0]:.3g} mm, correlation {noise[1]:.2f}", of_noise),
+        PowerInput("spread of pressure from trial to trial", f"{100 * spreads[0]:.2g} %", of_spreads),
+        PowerInput("spread of B from trial to trial", f"{100 * spreads[1]:.2g} %", of_spreads),
+    ]
 
-    power: Power
-    design: CampaignDesign
-    limits: Limits = field(default_factory=Limits)
+
+Campaign = tuple[Power, CampaignDesign, Limits]  # Power by linear theory, design, and constraints on further trials
 
 
-def campaign_of_target(request: PowerRequest) -> PowerCampaign:
+def _campaign_of_target(request: PowerRequest) -> Campaign:
     """Return the campaign of the measured trials of a results folder or an experiment; without any, of the planned."""
     target = request.target
     experiment: Experiment | None
@@ -127,34 +117,35 @@ def campaign_of_target(request: PowerRequest) -> PowerCampaign:
 
 def _measured_campaign(
     request: PowerRequest, model: Model, pairs: Pairs, candidates: Sequence[str] | None, limits: Limits
-) -> PowerCampaign:
+) -> Campaign:
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
     fitted = fit(model, pairs, host=host, profile=False, thorough=False)
-    noise, spreads, inputs = request.assumptions(
-        (fitted.noise_m, fitted.noise_correlation), fitted.state.spread, ("fit", "fit")
-    )
-    noise_stated, spreads_stated = (row.origin == "stated" for row in inputs[:2])
-    if noise_stated or spreads_stated:
-        of_trials, of_points = spreads if spreads_stated else None, noise if noise_stated else None
+    otherwise = fitted.noise_m, fitted.noise_correlation
+    noise, of_noise = _assumed((request.noise_mm / 1e3, request.noise_correlation), otherwise, "fit")
+    spreads, of_spreads = _assumed((request.spread_P, request.spread_B), fitted.state.spread, "fit")
+    inputs: Sequence[PowerInput] = ()
+    if "stated" in (of_noise, of_spreads):
+        of_trials, of_points = spreads if of_spreads == "stated" else None, noise if of_noise == "stated" else None
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False, thorough=False)
-    tests, not_testable = fitted_tests(fitted, candidates)
-    power = power_of(tests, not_testable, inputs if noise_stated or spreads_stated else (), nonlinear=True)
-    return PowerCampaign(power, design_of_fit(fitted, candidates), limits)
+        inputs = _inputs_in_words(noise, of_noise, spreads, of_spreads)
+    power = power_of(*fitted_tests(fitted, candidates), inputs, nonlinear=True)
+    return power, design_of_fit(fitted, candidates), limits
 
 
-def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCampaign:
+def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
-    default_noise_m, default_capture_fps = 1e-4, 1069.0  # Noise of a position, and frame rate, where not given (chosen)
+    default_noise, default_capture_fps = (1e-4, 0.0), 1069.0  # Noise of a position, and frame rate (chosen)
     settings = planned.settings
     stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=effects_of_plan(planned))
     first_of_vine = {trial.vine: trial for trial in reversed(planned.trials)}
-    vines = dict.fromkeys(trial.vine for trial in planned.trials)
-    by_vine = {vine: predictive_inputs(first_of_vine[vine], stated) for vine in vines}
+    by_vine = {
+        vine: predictive_inputs(first_of_vine[vine], stated) for vine in dict.fromkeys(t.vine for t in planned.trials)
+    }
     first = next(iter(by_vine.values()))
-    noise, spreads, inputs = request.assumptions(
-        (default_noise_m, 0.0), first.spreads, ("guess", "guess: a usual batch of vines")
-    )
+    noise, of_noise = _assumed((request.noise_mm / 1e3, request.noise_correlation), default_noise, "guess")
+    usual = "guess: a usual batch of vines"
+    spreads, of_spreads = _assumed((request.spread_P, request.spread_B), first.spreads, usual)
     systematic_m, systematic_origin = _planned_systematic(request, planned)
     trials, cameras = [], []
     for trial in planned.trials:
@@ -163,10 +154,11 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
             trial = replace(trial, yield_pressure_Pa=assumed_Pa, yield_pressure_sigma_Pa=1e3 * YIELD_SIGMA_KPA)
         trials.append(replace(trial, position_systematic_m=systematic_m))
         rates = (request.capture_fps, trial.capture_fps, default_capture_fps)
-        cameras.append(FilmingPlan(next(fps for fps in rates if math.isfinite(fps)), *noise))
+        cameras.append(FilmingPlan(next(filter(math.isfinite, rates)), *noise))
     is_in_sheet = all(math.isfinite(trial.capture_fps) for trial in trials)
     fps_origin = "stated" if math.isfinite(request.capture_fps) else "sheet" if is_in_sheet else "guess"
-    inputs += [
+    inputs = [
+        *_inputs_in_words(noise, of_noise, spreads, of_spreads),
         PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
         PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", fps_origin),
         *(
@@ -177,8 +169,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     ]
     model = first.model.with_values({DAMPING: {vine: of_vine.medians[DAMPING] for vine, of_vine in by_vine.items()}})
     design = CampaignDesign(model, tuple(trials), tuple(cameras), spreads, settings.candidates)
-    tests, not_testable = planned_tests(design)
-    return PowerCampaign(power_of(tests, not_testable, inputs, nonlinear=True), design, settings.limits)
+    return power_of(*planned_tests(design), inputs, nonlinear=True), design, settings.limits
 
 
 def _planned_systematic(request: PowerRequest, planned: PlannedTrials) -> tuple[float, str]:
@@ -197,45 +188,49 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     """Power of the trials by linear theory, and by simulated campaigns if asked; of `given` trials or fit if any."""
     with waiting("calculating the power of the trials"):
         if given is None:
-            campaign = campaign_of_target(request)
+            now, design, limits = _campaign_of_target(request)
         elif isinstance(given, Fit):
-            tests, not_testable = fitted_tests(given)
-            campaign = PowerCampaign(power_of(tests, not_testable, nonlinear=True), design_of_fit(given))
+            now, design, limits = power_of(*fitted_tests(given), nonlinear=True), design_of_fit(given), Limits()
         else:
-            campaign = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
-    names = [text.partition("=")[0] for text in request.effects]
-    power = campaign.power
-    for name in names:
-        if name not in power.not_testable and name not in {entry.effect for entry in power.effects}:
-            candidates = [*(entry.effect for entry in power.effects), *power.not_testable]
-            close = difflib.get_close_matches(name, candidates, 1, 0.6)
-            remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(sorted(candidates))}"
-            in_model = name in power.model
-            message = "is in the model already" if in_model else "is not a candidate for these trials"
-            raise _refusal(message, name, remedy)
+            now, design, limits = _measured_campaign(request, make_model(BASE_EFFECTS), list(given), None, Limits())
+    power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
-        power = replace(power, simulated=tuple(_simulated_rates(request, campaign)))
+        power = replace(power, simulated=tuple(_simulated_rates(request, design, now, asked)))
     if request.recommend:
         with waiting("searching for the trials to make next"):
-            recommended = exploratory_trials(campaign.design, campaign.power, campaign.limits)
-        power = replace(power, recommended=recommended)
+            power = replace(power, recommended=exploratory_trials(design, now, limits))
     if math.isfinite(request.reach):
-        power = replace(power, further=tuple(_further_trials(request, campaign)))
-    return power.of_effects(names)
+        for text, (name, value) in zip(request.effects, asked, strict=True):
+            if name in power.not_testable:
+                raise _refusal("cannot be tested with the columns of these trials", text, str(power.not_testable[name]))
+            if not math.isfinite(value):
+                raise _refusal("needs a size", text, "write the size to detect, such as leak=0.5")
+            with waiting(f"searching for trials that detect {name}"):
+                plan = further_trials(design, power[name], value, request.reach, limits)
+            power = replace(power, further=(*power.further, plan))
+    return power.of_effects([name for name, _ in asked])
 
 
-def _further_trials(request: PowerRequest, campaign: PowerCampaign) -> Iterator[FurtherTrials]:
-    """Determine the fewest further trials that detect each requested effect of given size."""
-    for text in request.effects:
-        name, _, size = text.partition("=")
-        if not size:
-            raise _refusal("needs a size", text, "write the size to detect, such as leak=0.5")
-        if name in campaign.power.not_testable:
-            why = str(campaign.power.not_testable[name])
-            raise _refusal("cannot be tested with the columns of these trials", text, why)
-        value = _size_of(text, campaign.power[name])
-        with waiting(f"searching for trials that detect {name}"):
-            yield further_trials(campaign.design, campaign.power[name], value, request.reach, campaign.limits)
+def _asked(text: str, power: Power) -> tuple[str, float]:
+    """Read `name` or `name=size`: the effect, and its size in SI, NaN where none is given."""
+    name, _, size = text.partition("=")
+    if name in power.not_testable:
+        return name, math.nan
+    known = {entry.effect: entry for entry in power.effects}
+    if name not in known:
+        candidates = sorted([*known, *power.not_testable])
+        close = difflib.get_close_matches(name, candidates, 1, 0.6)
+        remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(candidates)}"
+        in_model = name in power.model
+        message = "is in the model already" if in_model else "is not a candidate for these trials"
+        raise _refusal(message, name, remedy)
+    if not size:
+        return name, math.nan
+    unit, factor = display_unit(known[name].unit)
+    try:
+        return name, float(size) / factor
+    except ValueError:
+        raise _refusal("is not a size", text, f"write a number in {unit or 'the unit of the parameter'}") from None
 
 
 def _refusal(message: str, value: str, remedy: str) -> ExperimentError:
@@ -246,32 +241,23 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
     """Return the rows of the sheet for the further trials."""
     return [
         {
-            "trial": f"{plan.power.effect}_{k}" if len(power.further) > 1 else added.trial.name,
-            **sheet_cells(added.trial),
+            "trial": f"{plan.power.effect if len(power.further) > 1 else 'added'}_{k}",
+            **{name: value for name, value in trial.items() if name in COLUMNS},
         }
         for plan in power.further
-        for k, added in enumerate(plan.trials, 1)
+        for k, trial in enumerate(plan.trials, 1)
     ]
 
 
-def _size_of(text: str, entry: EffectPower) -> float:
-    """Read the size in `name=size`; return it in SI."""
-    unit, factor = display_unit(entry.unit)
-    try:
-        return float(text.partition("=")[2]) / factor
-    except ValueError:
-        raise _refusal("is not a size", text, f"write a number in {unit or 'the unit of the parameter'}") from None
-
-
-def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator[SimulatedRates]:
+def _simulated_rates(
+    request: PowerRequest, design: CampaignDesign, power: Power, asked: Sequence[tuple[str, float]]
+) -> Iterator[SimulatedRates]:
     """Simulate campaigns of the design and diagnose each in full; yield the rate of each kind, the null first."""
-    power = campaign.power
     wanted: list[tuple[str, tuple[float, ...], float]] = [("", (math.nan,), power.false_alarm_rate)]
-    for text in request.effects:
-        name, _, size = text.partition("=")
+    for name, size in asked:
         if name not in power.not_testable:
             entry = power[name]
-            sizes = [_size_of(text, entry)] if size else [entry.size_at(0.5), entry.size_at(0.9)]
+            sizes = [size] if math.isfinite(size) else [entry.size_at(0.5), entry.size_at(0.9)]
             known = filter(math.isfinite, sizes)
             wanted += [(name, (value, *entry.other_values), entry.probability_at(value)) for value in known]
     seeds = range(request.first_seed, request.first_seed + request.simulate)
@@ -279,8 +265,8 @@ def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator
     with progress(len(wanted) * len(seeds), "simulating", unit="campaign") as bar:
         for effect, values, predicted_rate in wanted:
             diagnoses = []
-            work = partial(simulated_diagnosis, campaign.design, effect, values)
+            work = partial(simulated_diagnosis, design, effect, values)
             for answer in map_unordered(work, seeds, request.jobs):
                 diagnoses.append(answer)
                 bar.advance()
-            yield rates_of(diagnoses, values[0], predicted_rate)
+            yield rates_of(effect, diagnoses, values[0], predicted_rate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.experiment.schema import COLUMNS, CellError, option, read_cell
+from vinetrack.experiment.schema import COLUMNS, CellError, option, read_range
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, PlannedTrials, planned_sheet, planned_trial
 from vinetrack.figures.prediction_figures import draw_choice, draw_predictions, draw_reservoir
@@ -33,17 +33,14 @@ from vinetrack.planning.prediction import (
     GAMMAS,
     TIME,
     Choice,
-    Neglected,
     Quantity,
     Room,
     VinePrediction,
     chambers,
-    design_checks,
     fastest,
     final_speeds,
     final_with,
     gauge_loss,
-    neglected,
     predict_vine,
     supplied_chamber,
     swept_m3,
@@ -67,27 +64,19 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 # After any other verdict there is no prediction, unless the user insists with `--anyway`.
 
 
-@dataclass(frozen=True)
-class ChosenFit:
-    """Content of a fit file, and the heading for everything predicted from it."""
-
-    content: Mapping[str, Any]
-    heading: tuple[str, ...]
-
-
-def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
-    """Choose the fit of a results folder to predict from."""
+def choose_fit(folder: Path, anyway: bool = False) -> tuple[Mapping[str, Any], tuple[str, ...]]:
+    """Choose the fit of a results folder to predict from. Returns its content, heading (over all predicted from it)."""
     results = Results(folder)
     in_use = read_json(results.fit)
     diagnosis = read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
-        return ChosenFit(in_use, (f"! {remark('fit_not_diagnosed', folder=folder)}",))
+        return in_use, (f"! {remark('fit_not_diagnosed', folder=folder)}",)
     if diagnosis.verdict == ADEQUATE:
-        return ChosenFit(in_use, ())
+        return in_use, ()
     final = read_json(results.final_fit) if results.final_fit.exists() else None
     added = " + ".join(diagnosis.effects)
     if diagnosis.final_verdict == ADEQUATE and final is not None:
-        return ChosenFit(final, (str(remark("from_final_model", added=added)),))
+        return final, (str(remark("from_final_model", added=added)),)
     verdict = f"{diagnosis.final_verdict or diagnosis.verdict}: {diagnosis.explanation}"
     if not anyway:
         reason = (
@@ -97,29 +86,11 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
         )
         raise ResultsError(f"{folder}: no prediction, {reason}; or predict from it with --anyway. {verdict}")
     caution = remark("from_refuted_model", model=f"the model with {added} added" if final else "the model in use")
-    return ChosenFit(final or in_use, (f"! {verdict}", f"! {caution}"))
+    return final or in_use, (f"! {verdict}", f"! {caution}")
 
 
 # ------------------------------------------------------------------------------
 # Inputs of the commands about new vines: options or a sheet, a fit, effects; and formatting of their output.
-
-
-@dataclass(frozen=True)
-class PredictionRequest:
-    """Options of a command about new vines; NaN and None for those not given. `cells` are texts by column of the sheet,
-    for the columns that were given. `B_error` is relative. `anyway` allows a fit whose model was refuted.
-    """
-
-    cells: Mapping[str, str] = field(default_factory=dict)
-    sheet: Path | None = None
-    results: Path | None = None
-    anyway: bool = False
-    effects: tuple[str, ...] = ()
-    tail_slack: str | None = None
-    B: float = math.nan
-    B_error: float = 0.0
-    n: float = math.nan
-    n_error: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -137,39 +108,46 @@ class PredictionBasis:
         return [predictive_inputs(trial, self.stated, self.fit) for trial in self.planned.trials]
 
 
-def read_basis(request: PredictionRequest, needed: Sequence[str] = REQUIRED_FOR_PREDICTION) -> PredictionBasis:
-    """Read the sheet or the options, the fit, and the requested effects."""
-    chosen = None if request.results is None else choose_fit(request.results, request.anyway)
-    if request.sheet is None:
-        planned = planned_trial(request.cells, ExperimentSettings(), needed)
+def read_basis(
+    needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
+    *,
+    cells: Mapping[str, str] | None = None,
+    sheet: Path | None = None,
+    results: Path | None = None,
+    anyway: bool = False,
+    effects: Sequence[str] = (),
+    tail_slack: str | None = None,
+    **numbers: Any,
+) -> PredictionBasis:
+    """Read the sheet or the options, the fit, and the requested effects. `cells` are texts by column of the sheet, for
+    the columns that were given; `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
+    """
+    fit: FitNumbers | None = None
+    user_effects: Mapping[str, Effect] | None = None
+    heading: tuple[str, ...] = ()
+    if results is not None:
+        content, heading = choose_fit(results, anyway)
+        fit, user_effects = _read_fit(results, content)
+    if sheet is None:
+        planned = planned_trial(cells or {}, ExperimentSettings(), needed)
     else:
-        planned = planned_sheet(request.sheet)
-        message, remedy = "is given in addition to a sheet", "write it in the sheet"
-        problems = [
-            Problem(message=message, column=option(name), value=text, remedy=remedy)
-            for name, text in request.cells.items()
-        ]
-        if problems:
-            raise ExperimentError(problems)
-    if request.tail_slack is not None:
-        trials = tuple(replace(trial, tail_slack=request.tail_slack) for trial in planned.trials)
-        planned = replace(planned, trials=trials)
-    if request.results is None or chosen is None:
-        fit, user_effects = None, effects_of_plan(planned)
-    else:
-        fit, user_effects = _read_fit(request.results, chosen)
-    sizes = [read_sizes(text, user_effects) for text in request.effects]
+        planned = planned_sheet(sheet)
+        said: dict[str, Any] = {"message": "is given in addition to a sheet", "remedy": "write it in the sheet"}
+        if cells:
+            raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
+    if tail_slack is not None:
+        planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
+    if user_effects is None:
+        user_effects = effects_of_plan(planned)
+    sizes = [read_sizes(text, user_effects) for text in effects]
     stated = StatedValues(
-        B=request.B,
-        B_error=request.B_error,
-        n=request.n,
-        n_error=request.n_error,
+        **numbers,
         model=planned.settings.model,
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
         user_effects=user_effects,
     )
-    return PredictionBasis(planned, stated, fit, () if chosen is None else chosen.heading)
+    return PredictionBasis(planned, stated, fit, heading)
 
 
 def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
@@ -177,11 +155,11 @@ def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def _read_fit(results: Path, chosen: ChosenFit) -> tuple[FitNumbers, Mapping[str, Effect]]:
+def _read_fit(results: Path, content: Mapping[str, Any]) -> tuple[FitNumbers, Mapping[str, Effect]]:
     """Read a fit of a results folder, and the user's own effects if its model contains any."""
     with planning_errors():
-        fit = fit_numbers(FitSummary.from_json(chosen.content), results.as_posix())
-    own_names = [name for name in fit.model if name not in catalogue()]
+        fit = fit_numbers(FitSummary.from_json(content), results.as_posix())
+    own_names = [name for name in fit.fit.names if name not in catalogue()]
     if not own_names:
         return fit, {}
     experiment = Path(str(read_json(Results(results).provenance).get("experiment", "")))
@@ -211,74 +189,60 @@ def planning_errors() -> Iterator[None]:
         raise ResultsError(str(error)) from None
 
 
-def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
-    """Return rows of a table of inputs: symbol, median, 90 % band, unit, origin; constants of nature are left out."""
-    rows = []
-    for entry in inputs:
-        if entry.origin.code != "constant":
-            low, median, high = (value_in_unit(value, entry.unit) for value in (entry.low, entry.median, entry.high))
-            band = "–" if entry.low == entry.high else f"{low} to {high}"
-            rows.append((entry.symbol, median, band, display_unit(entry.unit, PREDICTION_UNITS)[0], str(entry.origin)))
-    return rows
-
-
-@dataclass(frozen=True)
-class ConditionPrediction:
-    """Prediction of one condition, its design checks (`hazards`), and the influence of neglected effects."""
-
-    prediction: VinePrediction
-    hazards: tuple[str, ...]
-    neglected: tuple[Neglected, ...]
-
-
 def predict_conditions(
-    request: PredictionRequest,
-    *,
-    samples: int,
-    seed: int,
-    at_fraction: float,
-    figure: Path | None = None,
-    csv: Path | None = None,
+    *, samples: int, seed: int, at_fraction: float, figure: Path | None = None, csv: Path | None = None, **given: Any
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Predict all conditions; write figure and curves if requested. Returns lines, and JSON content."""
+    """Predict all conditions, see `read_basis`; write figure and curves if requested. Returns lines, JSON content."""
     import pandas as pd
 
     check_figure(figure)
-    basis = read_basis(request)
-    entries = []
+    basis = read_basis(**given)
+    predictions: list[VinePrediction] = []
+    content = []
     with planning_errors():
         for inputs in progress(basis.inputs, "predicting", unit="condition"):
-            prediction = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
-            hazards = tuple(map(str, design_checks(prediction)))
-            entries.append(ConditionPrediction(prediction, hazards, neglected(inputs, at_fraction)))
-    lines = [*basis.heading, *(_condition_lines(entries[0]) if len(entries) == 1 else _table_lines(entries))]
+            predictions.append(predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction))
+            content.append(_json_entry(predictions[-1]))
+    several = len(predictions) > 1
+    lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
-        titles = [trial_text(entry.prediction.inputs.trial) for entry in entries]
-        write_figure(draw_predictions([entry.prediction for entry in entries], titles, at_fraction), figure)
+        titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
+        write_figure(draw_predictions(predictions, titles, at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
-        write_csv(csv, pd.concat([entry.prediction.curve for entry in entries], ignore_index=True))
+        write_csv(csv, pd.concat([prediction.curve for prediction in predictions], ignore_index=True))
         lines.append(f"Curves: {csv}")
-    return lines, [_json_entry(entry) for entry in entries]
+    return lines, content
 
 
-def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
+def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
     """Yield all lines about a single condition."""
-    prediction = entry.prediction
     inputs = prediction.inputs
     yield f"{trial_text(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
-    yield from table(input_rows(inputs.bands()), ("input", "median", "90 % band", "unit", "from"), align="<><<<")
+    rows = []
+    for one in inputs.bands():
+        if one.origin.code != "constant":  # constants of nature are left out
+            low, median, high = (value_in_unit(value, one.unit) for value in (one.low, one.median, one.high))
+            band = "–" if one.low == one.high else f"{low} to {high}"
+            rows.append((one.symbol, median, band, display_unit(one.unit, PREDICTION_UNITS)[0], str(one.origin)))
+    yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
-    rows = [_quantity_row(quantity) for quantity in prediction.quantities]
-    yield from table(rows, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
+    quantities = [_quantity_row(quantity) for quantity in prediction.quantities]
+    yield from table(quantities, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
     yield from table([(share.name, speed_band_text(share), str(share.why)) for share in prediction.shares], head)
-    yield from _left_out(entry)
+    # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
+    listed = [omitted for omitted in prediction.neglected if abs(omitted.change) >= 0.005]
+    speeds = [" → ".join(value_in_unit(m_s, "m/s") for m_s in (one.without_m_s, one.final_m_s)) for one in listed]
+    if listed:
+        yield ""
+        changes = [(o.effect, o.size, f"{m_s} m/s", f"{o.change:+.1%}") for o, m_s in zip(listed, speeds, strict=True)]
+        yield from table(changes, ("not in the model", "at the size", "final speed", "change"))
     yield ""
-    yield from (f"! {warning}" for warning in entry.hazards)
+    yield from (f"! {warning}" for warning in prediction.hazards)
 
 
 def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
@@ -296,55 +260,37 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
 
-def _left_out(entry: ConditionPrediction) -> Iterator[str]:
-    """Yield a table of neglected effects that every vine has, with their influence on the final speed."""
-    # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
-    rows = [
-        (
-            omitted.effect,
-            omitted.size,
-            f"{value_in_unit(omitted.without_m_s, 'm/s')} → {value_in_unit(omitted.final_m_s, 'm/s')} m/s",
-            f"{omitted.change:+.1%}",
-        )
-        for omitted in entry.neglected
-        if abs(omitted.change) >= 0.005
-    ]
-    if rows:
-        yield ""
-        yield from table(rows, ("not in the model", "at the size", "final speed", "change"))
-
-
-def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
+def _table_lines(predictions: Sequence[VinePrediction]) -> Iterator[str]:
     """Yield a table with one row per condition."""
-    first = entries[0].prediction
-    yield str(remark("medians_and_bands", model=first.inputs.model.names, samples=first.samples))
+    yield str(remark("medians_and_bands", model=predictions[0].inputs.model.names, samples=predictions[0].samples))
     rows = [
         (
-            entry.prediction.inputs.trial.condition,
-            *_quantity_row(entry.prediction.final)[1:4],
-            *_quantity_row(entry.prediction[TIME])[2:4],
-            f"{entry.prediction.slack:.0%}",
+            prediction.inputs.trial.condition,
+            *_quantity_row(prediction.final)[1:4],
+            *_quantity_row(prediction[TIME])[2:4],
+            f"{prediction.slack:.0%}",
         )
-        for entry in entries
+        for prediction in predictions
     ]
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
-    if any(entry.prediction.inputs.trial.payload_kg > 0 for entry in entries):
+    if any(prediction.inputs.trial.payload_kg > 0 for prediction in predictions):
         yield str(remark("final_speed"))
     yield ""
     yield "uncertainties included:"
-    sources = dict.fromkeys((share.name, str(share.why)) for entry in entries for share in entry.prediction.shares)
+    sources = dict.fromkeys((share.name, str(share.why)) for prediction in predictions for share in prediction.shares)
     yield from (f"  {name}: {text}" for name, text in sources)
     yield ""
-    hazards = dict.fromkeys(text for entry in entries for text in entry.hazards)
-    for text in hazards:
-        conditions = [entry.prediction.inputs.trial.condition for entry in entries if text in entry.hazards]
-        yield f"! {'all conditions' if len(conditions) == len(entries) else ', '.join(conditions)}: {text}"
+    conditions_of: dict[str, list[str]] = {}
+    for prediction in predictions:
+        for text in dict.fromkeys(map(str, prediction.hazards)):
+            conditions_of.setdefault(text, []).append(prediction.inputs.trial.condition)
+    for text, conditions in conditions_of.items():
+        yield f"! {'all conditions' if len(conditions) == len(predictions) else ', '.join(conditions)}: {text}"
 
 
-def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
+def _json_entry(prediction: VinePrediction) -> dict[str, Any]:
     """Return one condition as JSON content, SI."""
-    prediction = entry.prediction
     return {
         "condition": prediction.inputs.trial.condition,
         "model": list(prediction.inputs.model.names),
@@ -355,13 +301,10 @@ def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
             {"name": s.name, "words": str(s.why), "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
             for s in prediction.shares
         ],
-        "left_out": [
-            {"effect": n.effect, "size": n.size, "final_m_s": n.final_m_s, "without_m_s": n.without_m_s}
-            for n in entry.neglected
-        ],
+        "left_out": [asdict(omitted) for omitted in prediction.neglected],
         "arrives": prediction.arrives,
         "slack": prediction.slack,
-        "warnings": list(entry.hazards),
+        "warnings": list(map(str, prediction.hazards)),
     }
 
 
@@ -372,36 +315,21 @@ def _band(one: Input | Quantity) -> dict[str, Any]:
 # ------------------------------------------------------------------------------
 # Designs: the fastest vine within limits, and the chamber that it needs.
 
-FILMS = "--films-um"
 
-
-def read_range(column: str, text: str) -> tuple[float, float]:
+def read_si_range(column: str, text: str, name: str = "") -> tuple[float, float]:
     """Read `low:high` or one number, each checked like a cell of the column; return both in SI."""
-    values = [_cell(column, part) for part in text.split(":")]
-    if len(values) > 2:
-        raise _refusal(column, text, "is not a range", "write low:high, such as 5:25")
-    if values[0] > values[-1]:
-        raise _refusal(column, text, "ends before it begins", "write the lower value first")
-    return values[0], values[-1]
-
-
-def _cell(column: str, text: str, name: str = "") -> float:
-    """Read one number of a column; return it in SI."""
     try:
-        value = read_cell(COLUMNS[column], text.strip())
+        low, high = read_range(COLUMNS[column], text if ":" in text else (text, text))
     except CellError as error:
-        raise _refusal(column, text, error.message, error.remedy, error.allowed, name) from None
-    assert isinstance(value, float)
-    return COLUMNS[column].to_si(value)
+        raise _refusal(name or option(column), text, error.message, error.remedy, error.allowed) from None
+    return COLUMNS[column].to_si(low), COLUMNS[column].to_si(high)
 
 
-def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "", name: str = "") -> ExperimentError:
-    problem = Problem(message=message, column=name or option(column), value=text, allowed=allowed, remedy=remedy)
-    return ExperimentError([problem])
+def _refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
+    return ExperimentError([Problem(message=message, column=name, value=text, allowed=allowed, remedy=remedy)])
 
 
 def design_vine(
-    request: PredictionRequest,
     *,
     films: str,
     diameter: str,
@@ -412,14 +340,16 @@ def design_vine(
     seed: int,
     at_fraction: float,
     figure: Path | None = None,
+    **given: Any,
 ) -> tuple[list[str], dict[str, Any]]:
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
     check_figure(figure)
-    basis = read_basis(request, needed=("pressure_kPa",))
+    basis = read_basis(("pressure_kPa",), **given)
+    films_m = [read_si_range("thickness_um", part, "--films-um")[0] for part in films.split(",") if part.strip()]
     room = Room(
-        films_m=tuple(dict.fromkeys(_cell("thickness_um", part, FILMS) for part in films.split(",") if part.strip())),
-        diameter_m=read_range("diameter_mm", diameter),
-        length_m=read_range("length_mm", length),
+        films_m=tuple(dict.fromkeys(films_m)),
+        diameter_m=read_si_range("diameter_mm", diameter),
+        length_m=read_si_range("length_mm", length),
         pressure_Pa=basis.planned.trials[0].pressure_Pa,
         rig=basis.planned.trials[0],
         burst_share=burst_share,
@@ -427,11 +357,11 @@ def design_vine(
     )
     max_films = 12  # Largest number of films (chosen)
     if not 0 < len(room.films_m) <= max_films:
-        raise _refusal("thickness_um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}", name=FILMS)
+        raise _refusal("--films-um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}")
     thickest_m = max(room.films_m)
     if thickest_m > room.diameter_m[0] / 4:
         message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"
-        raise _refusal("diameter_mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
+        raise _refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with planning_errors(), waiting("looking for the fastest vine"):
         choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     _refuse_standstill(room, choices)
@@ -439,13 +369,18 @@ def design_vine(
     if figure is not None:
         write_figure(draw_choice(choices), figure)
         lines.append(f"Figure: {figure}")
-    entries = []
-    for choice in choices:
-        trial, final = choice.prediction.inputs.trial, choice.prediction.final
-        entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION}
-        speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
-        chosen = {"fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)}
-        entries.append({**entry, "final_speed_m_s": speed, **chosen})
+    entries = [
+        {
+            **{name: COLUMNS[name].of_trial(choice.prediction.inputs.trial) for name in REQUIRED_FOR_PREDICTION},
+            "final_speed_m_s": {
+                "y_over_L": (final := choice.prediction.final).y_over_L,
+                **{key: value for key, value in _band(final).items() if key not in ("name", "unit")},
+            },
+            "fastest_in_share_of_draws": choice.odds,
+            "limited_by": list(choice.limits),
+        }
+        for choice in choices
+    ]
     return lines, {"warnings": basis.heading, "films": entries}
 
 
@@ -460,7 +395,7 @@ def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
     if highest_Pa < 0.995 * room.pressure_Pa:
         message += f": their walls may carry at most {highest_Pa / 1e3:.3g} kPa"
         remedy = "raise --burst-fraction, or allow thicker films or smaller diameters"
-    raise _refusal("pressure_kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
+    raise _refusal("--pressure-kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
@@ -489,20 +424,15 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield ""
     if choices[0].odds < 0.8 and len(choices) > 1:
         yield str(remark("film_uncertain", um=1e6 * choices[0].thickness_m, odds=choices[0].odds))
-    yield from (f"! {warning}" for warning in design_checks(best))
+    yield from (f"! {warning}" for warning in best.hazards)
 
 
 def design_reservoir(
-    request: PredictionRequest,
-    *,
-    within_percent: float,
-    supply_s: float,
-    at_fraction: float,
-    figure: Path | None = None,
+    *, within_percent: float, supply_s: float, at_fraction: float, figure: Path | None = None, **given: Any
 ) -> tuple[list[str], dict[str, Any]]:
     """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
     check_figure(figure)
-    basis = read_basis(request, needed=("diameter_mm", "length_mm", "pressure_kPa"))
+    basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
     trial = basis.planned.trials[0]
     loss = within_percent / 100
     with planning_errors(), waiting("simulating"):
@@ -516,21 +446,20 @@ def design_reservoir(
     if figure is not None:
         swept = swept_m3(trial)
         drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
-        losses = {
-            law: np.array([gauge_loss(trial, volume_m3, gamma) for volume_m3 in drawn_m3.tolist()])
-            for law, gamma in GAMMAS.items()
-        }
+        drawn = [_losses(trial, volume_m3) for volume_m3 in drawn_m3.tolist()]
+        losses = {law: np.array([one[law] for one in drawn]) for law in GAMMAS}
         write_figure(draw_reservoir(drawn_m3, losses, loss, swept, trial.chamber_m3), figure)
         lines.append(f"Figure: {figure}")
     entries = [
-        {
-            "chamber": name,
-            "volume_l": 1e3 * volume_m3,
-            "loss_of_gauge_pressure": {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()},
-        }
+        {"chamber": name, "volume_l": 1e3 * volume_m3, "loss_of_gauge_pressure": _losses(trial, volume_m3)}
         for name, volume_m3 in chambers(trial, loss).items()
     ]
     return lines, {"warnings": basis.heading, "chambers": entries}
+
+
+def _losses(trial: Trial, volume_m3: float) -> dict[str, float]:
+    """Fraction of the gauge pressure that a chamber loses, by the gas law."""
+    return {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()}
 
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
@@ -541,7 +470,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
     for name, volume_m3 in chambers(trial, loss).items():
         cells = [name, volume_text(volume_m3)]
-        cells += [f"{100 * gauge_loss(trial, volume_m3, gamma):.1f}" for gamma in GAMMAS.values()]
+        cells += [f"{100 * lost:.1f}" for lost in _losses(trial, volume_m3).values()]
         if inputs is not None:
             finals = [final_with(inputs, volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
             cells += [value_in_unit(final, "m/s") for final in finals]

@@ -17,6 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from vinetrack.inference.marginal_likelihood import (
     normal_equations,
     solve_per_trial,
 )
+from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -43,6 +45,8 @@ from vinetrack.inference.sensitivity import (
     RELEASE,
     Job,
     Predictor,
+    align,
+    initial_trial_effects,
 )
 from vinetrack.planning.predictive_inputs import damping_scatter, hoop_stress_Pa, prior_ratio
 from vinetrack.tracks.position_noise import ar1_noise
@@ -72,26 +76,29 @@ class Condition:
 
 def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
     """Return every candidate trial; empty where the limits exclude all."""
-    typical = _typical_trials(trials)
-    if not typical:
+    vines = [(trials[k], k) for k in _typical_trials(trials)]
+    if not vines:
         return []
     used = [trial for trial in trials if trial.travel_ratio != 1]
-    vines = [(trials[k], k) for k in typical]
-    feasible = []
-    for vine, k in vines:
-        if _allowed(vine, limits):
-            for effort, rig in _rigs(vine, used, limits):
-                feasible += _loads(rig, k, effort, used, limits)
-    for vine, k in _new_vines(vines, limits) if limits.new_vines else []:
-        rigs = _rigs(vine, used, limits)
-        least = min((effort for effort, _ in rigs), default=SAME_RIG)
-        for effort, rig in rigs:
-            if effort == least:
-                feasible += _loads(rig, k, NEW_VINE, used, limits)
-    named = [replace(condition.trial, name=f"next_{number}") for number, condition in enumerate(feasible, 1)]
+    rigs = [
+        (rig, like, effort)
+        for vine, like in vines
+        if _allowed(vine, limits)
+        for effort, rig in _rigs(vine, used, limits)
+    ]
+    for vine, like in _new_vines(vines, limits) if limits.new_vines else []:
+        of_vine = _rigs(vine, used, limits)
+        least = min((effort for effort, _ in of_vine), default=SAME_RIG)
+        rigs += [(rig, like, NEW_VINE) for effort, rig in of_vine if effort == least]
+    loaded = [
+        (replace(rig, pressure_Pa=pressure, pressure_sigma_Pa=sigma, payload_kg=payload), like, effort)
+        for rig, like, effort in rigs
+        for payload in _payloads(used, limits)
+        for pressure, sigma in _pressures(rig, payload, used, limits)
+    ]
     return [
-        replace(condition, trial=trial, changed=_changed(trial, trials[condition.like]))
-        for condition, trial in zip(feasible, named, strict=True)
+        Condition(replace(trial, name=f"next_{number}"), like, effort, _changed(trial, trials[like]))
+        for number, (trial, like, effort) in enumerate(loaded, 1)
     ]
 
 
@@ -111,6 +118,27 @@ def conditions_by_effort(
         yield NEW_VINE, np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
+def exchanged(
+    design: Sequence[int],
+    best: float,
+    allowed: NDArray[np.intp],
+    worth_with: Callable[[list[int]], Floats],
+) -> tuple[list[int], float]:
+    """Exchange the trials of a design one at a time until none gains (Fedorov 1972, Theory of Optimal Experiments).
+    `best` is its worth; `worth_with`, shape (n_allowed,), gives that of other trials with one of each `allowed` added.
+    """
+    design = list(design)
+    for _ in range(4):
+        before = best
+        for k in range(len(design)):
+            values = worth_with(design[:k] + design[k + 1 :])
+            if np.max(values) > 1.005 * best:  # a gain, not rounding
+                design[k], best = int(allowed[int(np.argmax(values))]), float(np.max(values))
+        if best <= before:
+            break
+    return design, best
+
+
 def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
     return tuple(column for column, name in RIG.items() if not _alike(rig, before, [name]))
 
@@ -118,23 +146,27 @@ def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
 def _typical_trials(trials: Sequence[Trial]) -> list[int]:
     """Index of a typical trial of each everting vine: the first with its commonest rig and yield pressure."""
     shown = ("vine", "yield_pressure_Pa", "bends", *RIG.values())
-    rigs = [tuple(getattr(trial, name) for name in shown) for trial in trials]
-    texts = [repr(rig) for rig in rigs]
+    texts = [repr([getattr(trial, name) for name in shown]) for trial in trials]
     places = []
     for vine in dict.fromkeys(trial.vine for trial in trials if trial.travel_ratio != 1):
-        of_vine = [texts[i] for i, rig in enumerate(rigs) if rig[0] == vine]
-        places.append(texts.index(Counter(of_vine).most_common(1)[0][0]))
+        of_vine = Counter(text for text, trial in zip(texts, trials, strict=True) if trial.vine == vine)
+        places.append(texts.index(of_vine.most_common(1)[0][0]))
     return places
+
+
+def _stated(limits: Limits, column: str) -> list[float] | None:
+    """Values of a column that the user allows, SI; None for any."""
+    values = getattr(limits, column)
+    return None if values is None else [COLUMNS[column].to_si(value) for value in values]
 
 
 def _allowed(vine: Trial, limits: Limits) -> bool:
     """Whether the user's lists of sizes, where given, contain this vine."""
-    sizes = (
-        (vine.diameter_m * 1e3, limits.diameter_mm),
-        (vine.thickness_m * 1e6, limits.thickness_um),
-        (vine.length_m * 1e3, limits.length_mm),
-    )
-    return all(values is None or not math.isfinite(size) or _is_among(size, values) for size, values in sizes)
+    for column in ("diameter_mm", "thickness_um", "length_mm"):
+        size, values = getattr(vine, COLUMNS[column].field), _stated(limits, column)
+        if values is not None and math.isfinite(size) and not _is_among(size, values):
+            return False
+    return True
 
 
 def _is_among(value: float, values: Iterable[float]) -> bool:
@@ -143,48 +175,37 @@ def _is_among(value: float, values: Iterable[float]) -> bool:
 
 def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
     """The vine on every rig; chamber, connector and angle change one at a time unless the limits require more."""
-    half, twice = math.sqrt(0.5), math.sqrt(2.0)
-    chambers = _choices(vine.chamber_m3, [t.chamber_m3 for t in used], limits.chamber_l, 1e-3, (0.5, 2.0))
-    inlets = _choices(vine.inlet_m, [t.inlet_m for t in used], limits.inlet_mm, 1e-3, (half, twice))
-    angles = _choices(vine.growth_angle_rad, [t.growth_angle_rad for t in used], limits.growth_angle_deg, math.pi / 180)
+    factors_of = {"chamber_l": (0.5, 2.0), "inlet_mm": (math.sqrt(0.5), math.sqrt(2.0)), "growth_angle_deg": ()}
     rigs: list[tuple[int, int, Trial]] = []
-    for chamber, inlet, angle in itertools.product(chambers, inlets, angles):
-        rig = replace(vine, chamber_m3=chamber, inlet_m=inlet, growth_angle_rad=angle)
+    for parts in itertools.product(*(_choices(vine, used, limits, *part) for part in factors_of.items())):
+        changed: dict[str, Any] = {COLUMNS[column].field: part for column, part in zip(factors_of, parts, strict=True)}
+        rig = replace(vine, **changed)
         changes = len(_changed(rig, vine))
-        if changes == 0 or not inlet > vine.diameter_m:
+        if changes == 0 or not rig.inlet_m > vine.diameter_m:
             at_hand = any(_alike(rig, trial, tuple(RIG.values())) for trial in used)
             rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
-    fewest = min((changed for changed, _, _ in rigs), default=0)
-    return [(effort, rig) for changed, effort, rig in rigs if changed <= max(1, fewest)]
+    fewest = min((changes for changes, _, _ in rigs), default=0)
+    return [(effort, rig) for changes, effort, rig in rigs if changes <= max(1, fewest)]
 
 
-def _choices(
-    now: float, used: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float] = ()
-) -> list[float]:
+def _choices(vine: Trial, used: Sequence[Trial], limits: Limits, column: str, factors: Sequence[float]) -> list[float]:
     """Values of one part of the rig: the user's, else those used and multiples of the present one; NaN stays."""
+    field, stated = COLUMNS[column].field, _stated(limits, column)
+    now = getattr(vine, field)
     if not math.isfinite(now):
         return [now]
-    if given is not None:
-        return [value * unit for value in given]
-    values = [now, *(value for value in dict.fromkeys(used) if math.isfinite(value))]
-    values += [_rounded(now * factor) for factor in factors]
+    if stated is not None:
+        return stated
+    before = dict.fromkeys(getattr(trial, field) for trial in used)
+    values = [now, *filter(math.isfinite, before), *(_rounded(now * factor) for factor in factors)]
     return [value for i, value in enumerate(values) if not _is_among(value, values[:i])]
-
-
-def _loads(rig: Trial, like: int, effort: int, used: Sequence[Trial], limits: Limits) -> list[Condition]:
-    """Every pressure and payload for one vine on one rig."""
-    return [
-        Condition(replace(rig, pressure_Pa=pressure, pressure_sigma_Pa=sigma, payload_kg=payload), like, effort)
-        for payload in _payloads(used, limits)
-        for pressure, sigma in _pressures(rig, payload, used, limits)
-    ]
 
 
 def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
     """No payload (or the lightest allowed), the heaviest, and those used in between."""
     payloads = {trial.payload_kg for trial in used}
     heaviest = max(payloads) if max(payloads) > 0 else 0.05  # kg, where none was used yet
-    low, high = (0.0, heaviest) if limits.payload_g is None else (1e-3 * g for g in limits.payload_g)
+    low, high = _stated(limits, "payload_g") or (0.0, heaviest)
     return sorted({low, high, *(payload for payload in payloads if low <= payload <= high)})
 
 
@@ -194,9 +215,8 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
     pressures = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
     if not pressures:
         return []
-    low, high = min(pressures), 1.25 * max(pressures)  # a quarter above the highest used
-    if limits.pressure_kPa is not None:
-        low, high = (1e3 * kPa for kPa in limits.pressure_kPa)
+    # 1.25: a quarter above the highest used
+    low, high = _stated(limits, "pressure_kPa") or (min(pressures), 1.25 * max(pressures))
     stress_Pa = hoop_stress_Pa(1.0, rig.diameter_m, rig.thickness_m)
     if math.isfinite(stress_Pa):
         # The default strength of film must not exclude pressures that this vine has held; a stated strength may.
@@ -220,33 +240,36 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
 def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tuple[Trial, int]]:
     """Vines that could be made, each with the index of the trial whose vine is nearest in size."""
     vines = [trial for trial, _ in models]
-    diameters = _sizes([v.diameter_m for v in vines], limits.diameter_mm, 1e-3, (0.5, 0.75, 1.5))
-    walls = _sizes([v.thickness_m for v in vines], limits.thickness_um, 1e-6, (0.5, 2.0))
+    diameters = _sizes(vines, limits, "diameter_mm", (0.5, 0.75, 1.5))
     new_vines: list[tuple[Trial, int]] = []
-    for diameter, wall in itertools.product(diameters, walls):
+    for diameter, wall in itertools.product(diameters, _sizes(vines, limits, "thickness_um", (0.5, 2.0))):
         if wall > diameter / 4 or not COLUMNS["diameter_mm"].low <= 1e3 * diameter <= COLUMNS["diameter_mm"].high:
             continue
         distances = [math.hypot(math.log(v.diameter_m / diameter), math.log(v.thickness_m / wall)) for v in vines]
         near, like = models[int(np.argmin(distances))]
-        lengths = [near.length_m] if limits.length_mm is None else [1e-3 * mm for mm in limits.length_mm]
-        for length in lengths:
-            unfilmed = replace(near, video=None, track=None, pressure_trace=None)
+        unfilmed = replace(near, video=None, track=None, pressure_trace=None)
+        for length in _stated(limits, "length_mm") or [near.length_m]:
             sized = replace(unfilmed, diameter_m=diameter, thickness_m=wall, length_m=length)
             if not any(_alike(sized, vine) for vine in vines):
                 new_vines.append((with_names([sized])[0], like))
-    # 10: new vines considered, at most; those of the most different sizes are taken (chosen)
-    return _most_different(new_vines, 10)
+    most = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
+    if len(new_vines) <= most:
+        return new_vines
+    # Farthest-point sampling
+    sizes = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in new_vines])
+    chosen = [int(np.argmax(np.linalg.norm(sizes - sizes.mean(axis=0), axis=1)))]
+    while len(chosen) < most:
+        distance = np.linalg.norm(sizes[:, None] - sizes[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return [new_vines[k] for k in sorted(chosen)]
 
 
-def _sizes(
-    before: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float]
-) -> list[float]:
+def _sizes(vines: Sequence[Trial], limits: Limits, column: str, factors: Sequence[float]) -> list[float]:
     """Candidate sizes: the user's, else those used and multiples of the smallest and largest."""
-    if given is not None:
-        return [size * unit for size in given]
-    used = {size for size in before if math.isfinite(size)}
-    if not used:
-        return []
+    stated = _stated(limits, column)
+    used = {size for vine in vines if math.isfinite(size := getattr(vine, COLUMNS[column].field))}
+    if stated is not None or not used:
+        return stated or []
     return sorted(used | {_rounded(f * (min(used) if f < 1 else max(used))) for f in factors})
 
 
@@ -260,18 +283,6 @@ def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "th
     return all(_is_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
-def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Trial, int]]:
-    """At most so many vines, by farthest-point sampling in ln diameter, ln thickness and ln length."""
-    if len(vines) <= most:
-        return vines
-    sizes = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in vines])
-    chosen = [int(np.argmax(np.linalg.norm(sizes - sizes.mean(axis=0), axis=1)))]
-    while len(chosen) < most:
-        distance = np.linalg.norm(sizes[:, None] - sizes[chosen], axis=2).min(axis=1)
-        chosen.append(int(np.argmax(distance)))
-    return [vines[k] for k in sorted(chosen)]
-
-
 # ------------------------------------------------------------------------------
 # Extension of a fitted hypothesis to trials that have not been made.
 #
@@ -280,33 +291,39 @@ def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Tri
 
 
 @dataclass(frozen=True)
-class ScatterLevel:
-    """Likelihood of the trials so far near the best values, for one assumed pair of between-trial standard deviations.
-    `information`, shape (n_free, n_free), and `gradient`, shape (n_free,), of half the sum of squares at the best
-    values; the gradient is not zero at a bound.
+class ScatterLevels:
+    """Likelihood of the trials so far near the best values, for several assumed pairs of between-trial standard
+    deviations, along the first axis. `spread` and `factors` (on the fitted pair), shape (n_levels, 2); `information`,
+    (n_levels, n_free, n_free), and `gradient`, (n_levels, n_free), of half the sum of squares at the best values (not
+    zero at a bound); `rise` of −2 ln L, (n_levels,).
     """
 
-    spread: tuple[float, float]
-    factors: tuple[float, float]
+    spread: Floats
+    factors: Floats
     information: Floats
     gradient: Floats
-    rise: float
+    rise: Floats
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """One of the tied fits, extended to further conditions. `layout` maps the free parameters to the trials of the
     conditions: those of the fit first, then those of new vines. All are scaled as in the fit; `theta`, shape (n_free,),
-    are their best values.
+    are their best values. The experiment films `rest_frames` before release, `frames_behind_end` of the growth, and
+    `longest_s` of motion.
     """
 
     name: str
     fit: Fit
+    conditions: Sequence[Condition]
     layout: ParameterMap
     theta: Floats
-    scatter_levels: tuple[ScatterLevel, ...]
+    levels: ScatterLevels
     sd_of_new: Floats
     variance: float
+    rest_frames: int
+    frames_behind_end: int
+    longest_s: float
 
     @property
     def room(self) -> tuple[Floats, Floats]:
@@ -314,8 +331,31 @@ class Hypothesis:
         lower, upper = self.layout.bounds
         return np.minimum(lower - self.theta, 0.0), np.maximum(upper - self.theta, 0.0)
 
-    def predictor(self, places: Sequence[int], items: Sequence[FitTrial]) -> Predictor:
-        """Return a predictor of these trials, one for each of the conditions at `places`."""
+    def frame_s(self, place: int) -> float:
+        """Frame interval of a condition: that of the trial it is modelled on."""
+        return self.fit.predictor.data[self.conditions[place].like].frame_s
+
+    def predictor(self, places: Sequence[int], times_s: Sequence[Floats]) -> Predictor:
+        """Return a predictor of trials at the conditions at `places`, at these times; a recorded pressure is constant.
+        Their measured positions are placeholders.
+        """
+        items = []
+        for place, time_s in zip(places, times_s, strict=True):
+            condition = self.conditions[place]
+            like = self.fit.predictor.data[condition.like]
+            constant = (np.array([-1e3, 1e3]), np.full(2, condition.trial.pressure_Pa))
+            items.append(
+                FitTrial(
+                    trial=condition.trial,
+                    time_s=time_s,
+                    lead_position_m=time_s,
+                    first=np.arange(time_s.size) == 0,
+                    n_rest=int(np.count_nonzero(time_s <= 0)),
+                    noise_m=like.noise_m,
+                    correlation=like.correlation,
+                    trace=None if like.trace is None else constant,
+                )
+            )
         rows = list(places)
         layout = replace(self.layout, index=self.layout.index[rows], base=self.layout.base[rows])
         predictor = Predictor(layout, items, self.fit.predictor.host)
@@ -325,12 +365,12 @@ class Hypothesis:
 
 def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     """Extend a fit to further conditions; new vines add parameters with priors."""
-    old, state, names = fit.predictor.layout, fit.solution.state, fit.model.parameter_names
+    old, state, names, data = fit.predictor.layout, fit.solution.state, fit.model.parameter_names, fit.predictor.data
     fitted_rows, _ = old.rows(state.theta)
     numbers, index, base = list(old.free), [], []
     places: dict[tuple[str, str], int] = {}
     for condition in conditions:
-        trial, like = condition.trial, fit.predictor.data[condition.like].trial
+        trial, like = condition.trial, data[condition.like].trial
         row, values = old.index[condition.like].copy(), np.array(fitted_rows[condition.like])
         is_new = trial.vine != like.vine
         if is_new and fit.predictor.damping_column >= 0:
@@ -351,67 +391,41 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     precision_of_new = np.array([1 / 1.0**2 + (number.scale / number.prior_sd) ** 2 for number in added])
     stated_sd = [number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0 for number in added]
     sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
+    everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
+    moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
     return Hypothesis(
         name=name,
         fit=fit,
+        conditions=conditions,
         layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index), np.array(base)),
         theta=np.concatenate([state.theta, [number.to_scaled(number.start) for number in added]]),
-        scatter_levels=_scatter_levels(fit, precision_of_new),
+        levels=_scatter_levels(fit, precision_of_new),
         sd_of_new=np.array(sd_of_new),
         variance=float(np.exp(np.mean(np.log(state.variance)))),
+        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
+        frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
+        longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
     )
 
 
-def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, ...]:
+def _scatter_levels(fit: Fit, precision_of_new: Floats) -> ScatterLevels:
     """Likelihood of the trials so far at every scatter that a refit may estimate; new parameters have only priors."""
     state, problem = fit.solution.state, fit.solution.problem
     reduced = marginal(fit.solution.cross_products, problem, state)
     fitted = np.maximum(state.spread, LEAST_BETWEEN_TRIAL_SD)
     may_grow = np.array(fit.solution.estimable) & (np.array(state.spread) > LEAST_BETWEEN_TRIAL_SD)
-    levels: dict[tuple[float, float], ScatterLevel] = {}
-    as_fitted = 0.0
     # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
-    for factors in ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)):
-        pressure, damping = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted).tolist()
-        pair = (pressure, damping)
-        if pair in levels:
-            continue
-        of_old, gradient_of_old, square, log_det = normal_equations(reduced, problem, state, pair)
-        old, size = gradient_of_old.size, gradient_of_old.size + precision_of_new.size
-        information = np.zeros((size, size))
-        information[:old, :old] = of_old
-        information[range(old, size), range(old, size)] = precision_of_new
-        as_fitted = as_fitted if levels else square + log_det
-        ratios = (pressure / float(fitted[0]), damping / float(fitted[1]))
-        gradient = np.concatenate([gradient_of_old, np.zeros(size - old)])
-        levels[pair] = ScatterLevel(pair, ratios, information, gradient, square + log_det - as_fitted)
-    return tuple(levels.values())
-
-
-# ------------------------------------------------------------------------------
-# Simulated tracks of candidate trials, sampled as the camera of the experiment would.
-
-
-@dataclass(frozen=True)
-class TrackSampling:
-    """How the experiment films: frame interval, frames at rest, frames after the end of growth, longest motion."""
-
-    frame_s: float
-    rest_frames: int
-    frames_behind_end: int
-    longest_s: float
-
-
-def sampling_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
-    """Return how the experiment films, at the frame rate of the trial at `like`."""
-    everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
-    moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
-    return TrackSampling(
-        frame_s=data[like].frame_s,
-        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
-        frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
-        longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
-    )
+    factors = np.array([(1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)])
+    spreads = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted)
+    pairs: list[tuple[float, float]] = list(dict.fromkeys(map(tuple, spreads.tolist())))
+    n_old = state.theta.size
+    of_new = np.diag(np.concatenate([np.zeros(n_old), precision_of_new]))
+    information, gradient = np.stack([of_new] * len(pairs)), np.zeros((len(pairs), len(of_new)))
+    level = np.zeros(len(pairs))
+    for k, pair in enumerate(pairs):
+        of_old, gradient[k, :n_old], square, log_det = normal_equations(reduced, problem, state, pair)
+        information[k, :n_old, :n_old], level[k] = of_old, square + log_det
+    return ScatterLevels(np.array(pairs), np.array(pairs) / fitted, information, gradient, level - level[0])
 
 
 def _behind_end(trial_data: FitTrial) -> int:
@@ -425,68 +439,41 @@ def _behind_end(trial_data: FitTrial) -> int:
     return y.size - last if left_out and still else 0
 
 
-@dataclass(frozen=True)
-class GrowthCourse:
-    """Course of growth of a condition: when the first hypothesis nears the end, and when the last one has ended.
-    `ends_s` is infinite where one of them does not end in time.
+# ------------------------------------------------------------------------------
+# Simulated tracks of candidate trials, sampled as the camera of the experiment would.
+
+
+def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float] | None]:
+    """Return when the first hypothesis nears the end of the growth, and when the last has ended it (infinite where one
+    does not in time), for every condition; None where it is not worth filming or the model is in doubt.
     """
-
-    near_end_s: float
-    ends_s: float
-
-
-def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
-    """Return the data of a candidate trial at these times; a recorded pressure is constant. Shapes: time_s,
-    lead_position_m (n_points,).
-    """
-    like = data[condition.like]
-    constant = (np.array([-1e3, 1e3]), np.full(2, condition.trial.pressure_Pa))
-    return FitTrial(
-        trial=condition.trial,
-        time_s=time_s,
-        lead_position_m=lead_position_m,
-        first=np.arange(time_s.size) == 0,
-        n_rest=int(np.count_nonzero(time_s <= 0)),
-        noise_m=like.noise_m,
-        correlation=like.correlation,
-        trace=None if like.trace is None else constant,
-    )
-
-
-def growth_courses(
-    hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
-) -> list[GrowthCourse | None]:
-    """Return the course of growth of every condition; None where it is not worth filming or the model is in doubt."""
-    data = hypotheses[0].fit.predictor.data
-    times = [np.linspace(0.0, camera.longest_s, 400) for camera in cameras]
-    items = [blank_trial(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
-    trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
-    runs: list[list[Trajectory | None]] = []
-    jobs: list[Job] = []
-    for hypothesis in hypotheses:
-        predictor = hypothesis.predictor(range(len(conditions)), items)
-        jobs = predictor.jobs(hypothesis.theta, trial_effects)
-        runs.append(_simulated(predictor, jobs))
+    last = hypotheses[-1]
+    every, longest_s = range(len(last.conditions)), last.longest_s
+    trial_effects = np.zeros((len(every), N_TRIAL_EFFECTS))
+    times = [np.linspace(0.0, longest_s, 400)] * len(every)
+    predictors = [hypothesis.predictor(every, times) for hypothesis in hypotheses]
+    jobs_of = [p.jobs(hypothesis.theta, trial_effects) for p, hypothesis in zip(predictors, hypotheses, strict=True)]
+    runs = [_simulated(predictor, jobs) for predictor, jobs in zip(predictors, jobs_of, strict=True)]
     # 1.05: ratio of tail speed to steady speed at the same pressure above which the model predicts compression in
     # the tail (chosen)
-    largest_ratio = max(1.05, _largest_speed_ratio(hypotheses[-1].fit))
-    growth: list[GrowthCourse | None] = []
-    for i, condition in enumerate(conditions):
+    largest_ratio = max(1.05, _largest_speed_ratio(last.fit))
+    growth: list[tuple[float, float] | None] = []
+    for i, condition in enumerate(last.conditions):
         trajectories = [trajectory for trajectory in (run[i] for run in runs) if trajectory is not None]
         if len(trajectories) < len(runs):
             growth.append(None)
             continue
         length_m = condition.trial.length_m
-        near_m, longest_s = np.nan_to_num(END_FRACTION * length_m, nan=math.inf), cameras[i].longest_s
+        near_m = np.nan_to_num(END_FRACTION * length_m, nan=math.inf)
         near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in trajectories)
         grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in trajectories)
-        ratio = _speed_ratio(hypotheses[-1].fit, condition.trial, jobs[i], trajectories[-1].tail_velocity_m_s)
+        ratio = _speed_ratio(last.fit, condition.trial, jobs_of[-1][i], trajectories[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
         grows_enough = grown_m > 0.3 * (length_m if math.isfinite(length_m) else 0.0)
         is_compressed = condition.trial.tail_slack != "free" and ratio > largest_ratio
-        ends = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
-        is_worth_it = grows_enough and not is_compressed and near_s > 8 * cameras[i].frame_s
-        growth.append(GrowthCourse(near_s, ends) if is_worth_it else None)
+        ends_s = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
+        is_worth_it = grows_enough and not is_compressed and near_s > 8 * last.frame_s(i)
+        growth.append((near_s, ends_s) if is_worth_it else None)
     return growth
 
 
@@ -526,96 +513,212 @@ def _largest_speed_ratio(fit: Fit) -> float:
 
 
 def film_trials(
-    truth: Hypothesis,
-    places: Sequence[int],
-    conditions: Sequence[Condition],
-    cameras: Sequence[TrackSampling],
-    theta: Floats,
-    deviations: Floats,
-    rng: np.random.Generator,
+    truth: Hypothesis, places: Sequence[int], theta: Floats, deviations: Floats, rng: np.random.Generator
 ) -> list[FitTrial | None]:
     """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise, and
     select usable points as for a fit; None where there are too few. Shapes: theta (n_free,); deviations (n_places, 2).
     """
-    chosen, of_chosen = [conditions[k] for k in places], [cameras[k] for k in places]
-    data, rho = truth.fit.predictor.data, truth.fit.solution.state.rho
-    times = [
-        camera.frame_s * np.arange(camera.rest_frames + math.ceil(camera.longest_s / camera.frame_s), dtype=float)
-        for camera in of_chosen
-    ]
-    items = [blank_trial(condition, t, data, t) for condition, t in zip(chosen, times, strict=True)]
-    predictor = truth.predictor(places, items)
-    trial_effects = np.zeros((len(chosen), N_TRIAL_EFFECTS))
-    trial_effects[:, RELEASE] = [(camera.rest_frames - 1 + rng.uniform()) * camera.frame_s for camera in of_chosen]
-    trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
+    rho, frames_s = truth.fit.solution.state.rho, [truth.frame_s(place) for place in places]
+    times = [s * np.arange(truth.rest_frames + math.ceil(truth.longest_s / s), dtype=float) for s in frames_s]
+    predictor = truth.predictor(places, times)
+    trial_effects = np.zeros((len(places), N_TRIAL_EFFECTS))
+    trial_effects[:, RELEASE] = [(truth.rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
+    trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(places))
     trial_effects[:, PRESSURE] = np.where(predictor.has_pressure_deviation, deviations[:, 0], 0.0)
     trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.has_damping_deviation, deviations[:, 1], 0.0)
     tracks: list[FitTrial | None] = []
-    for i, moved in enumerate(predictor.run(predictor.jobs(theta, trial_effects))):
-        stop = times[i].size
+    for i, (blank, moved) in enumerate(
+        zip(predictor.data, predictor.run(predictor.jobs(theta, trial_effects)), strict=True)
+    ):
+        stop = blank.time_s.size
         if moved.status == "ended":
             last_s = trial_effects[i, RELEASE] + moved.end_time_s
-            stop = min(stop, int(np.searchsorted(times[i], last_s)) + of_chosen[i].frames_behind_end)
+            stop = min(stop, int(np.searchsorted(blank.time_s, last_s)) + truth.frames_behind_end)
         noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - rho**2)), rho, rng)
         position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
-        pressure_Pa = None if items[i].trace is None else np.full(stop, chosen[i].trial.pressure_Pa)
+        pressure_Pa = None if blank.trace is None else np.full(stop, blank.trial.pressure_Pa)
         try:
-            track = plain_track(times[i][:stop], position_m, pressure_Pa=pressure_Pa)
-            tracks.append(prepare_trial(chosen[i].trial, track))
+            track = plain_track(blank.time_s[:stop], position_m, pressure_Pa=pressure_Pa)
+            tracks.append(prepare_trial(blank.trial, track))
         except FitError:
             tracks.append(None)
     return tracks
 
 
+# ------------------------------------------------------------------------------
+# Separation by further trials, found by simulating them and refitting the hypotheses to old and new trials.
+#
+# Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
+# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials;
+# between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can explain
+# part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
+#
+# There are two levels of detail. The quick one sets the truth to the best values and treats the old trials as linear in
+# the parameters, which is fast enough to compare designs. The thorough one draws the truth from its distribution given
+# the old trials and simulates every trajectory anew, as a check.
+
+
+class PartlyLinear(Predictor):
+    """Predictor that simulates new trials and treats the old ones as linear, with the sensitivities of their fit."""
+
+    separable = False
+
+    def __init__(self, layout: ParameterMap, old: Predictor, solution: Solution, new: Sequence[FitTrial]) -> None:
+        super().__init__(layout, [*old.data, *new], old.host)
+        self.n_old, self.expansion_point, self.old_columns = len(old.data), solution.state, solution.columns
+        new_layout = replace(layout, index=layout.index[self.n_old :], base=layout.base[self.n_old :])
+        self.new = Predictor(new_layout, new, old.host)
+        self.new.steps = old.steps.copy()
+
+    def linearise(
+        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
+    ) -> list[Floats]:
+        """Sensitivities and residuals, as `Predictor.linearise`; the sensitivities of the old trials are constant.
+        Shapes: theta (n_free,); trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points, n_columns + 1).
+        """
+        residuals = self.residuals_of_old(theta, trial_effects)
+        columns = [np.column_stack([of_fit[:, :-1], r]) for of_fit, r in zip(self.old_columns, residuals, strict=True)]
+        return columns + self.new.linearise(
+            theta, trial_effects[self.n_old :], trial_effects_only=trial_effects_only, past_end=past_end
+        )
+
+    def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
+        """Measured minus predicted positions of all trials, m, for several sets of trial effects. Shapes: theta
+        (n_free,); effect_sets (n_trials, N_TRIAL_EFFECTS) → (n_points,).
+        """
+        return [
+            self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
+            for trial_effects in effect_sets
+        ]
+
+    def residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
+        """Measured minus predicted positions of the old trials, m, to first order. Shapes: theta (n_free,);
+        trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points,).
+        """
+        at = self.expansion_point
+        change = np.append(theta[: at.theta.size] - at.theta, np.zeros(theta.size - at.theta.size + 1))
+        steps = np.hstack([trial_effects[: self.n_old] - at.trial_effects, change[self.layout.index[: self.n_old]]])
+        return [of_fit[:, -1] - of_fit[:, :-1] @ step for of_fit, step in zip(self.old_columns, steps, strict=True)]
+
+
+def simulated_rises(
+    hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
+) -> Floats:
+    """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
+    values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
+    average. If `thorough`, both are random and every trajectory is simulated: only where the pressure was recorded do
+    the old trials stay linear, for to simulate those takes a hundred times as long. Shape (n_draws, n, n).
+    """
+    n = len(hypotheses)
+    # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
+    alternating = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    rises = np.full((len(draws), n, n), math.nan)
+    before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in hypotheses])
+    for k, a in np.ndindex(len(draws), n):
+        rng = np.random.default_rng([seed, int(thorough), draws[k], a])
+        truth = hypotheses[a]
+        theta = draw_parameters(truth, rng) if thorough else truth.theta
+        in_turn = alternating[(np.arange(len(design)) + draws[k]) % 4]
+        deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
+        try:
+            filmed = film_trials(truth, design, theta, deviations * truth.fit.solution.state.spread, rng)
+        except SimulationError:
+            continue
+        new = [(place, trial_data) for place, trial_data in zip(design, filmed, strict=True) if trial_data is not None]
+        if new:
+            after = np.array([_refitted(hypothesis, new, thorough=thorough) for hypothesis in hypotheses])
+            rises[k, a] = after - before - (after[a] - before[a])
+    return rises
+
+
+def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
+    """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
+    Returns free parameters, scaled, within their bounds. Shape (n_free,).
+    """
+    furthest_draw = 2.0  # Standard deviations at which draws are clipped: the linearised fit holds no further (chosen)
+    old = hypothesis.fit.predictor.layout.start.size
+    values, vectors = np.linalg.eigh(hypothesis.levels.information[0, :old, :old])
+    is_determined = values > 1e-9 * values[-1]
+    sd = np.where(is_determined, 1 / np.sqrt(np.where(is_determined, values, 1.0)), 0.0)
+    normal = np.clip(rng.standard_normal(old), -furthest_draw, furthest_draw)
+    of_new = rng.standard_normal(hypothesis.sd_of_new.size) * hypothesis.sd_of_new
+    down, up = hypothesis.room
+    return np.asarray(hypothesis.theta + np.clip(np.concatenate([vectors @ (sd * normal), of_new]), down, up))
+
+
+def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, thorough: bool) -> float:
+    """−2 ln L of a hypothesis fitted to old and new trials; NaN where the fit fails."""
+    most = 20  # Iterations of a refit, at most (chosen)
+    places, data = [place for place, _ in new], [trial_data for _, trial_data in new]
+    layout, old = _extended_layout(hypothesis, places), hypothesis.fit.solution
+    quick = PartlyLinear(layout, hypothesis.fit.predictor, old, data)
+    try:
+        # New releases are aligned, and the noise of the new trials is that of the old.
+        theta = layout.start
+        theta[: old.state.theta.size] = old.state.theta
+        aligned, _ = align(data, quick.new, theta, initial_trial_effects(data))
+        state = replace(
+            old.state,
+            theta=theta,
+            trial_effects=np.concatenate([old.state.trial_effects, aligned]),
+            variance=np.concatenate([old.state.variance, np.full(len(data), hypothesis.variance)]),
+        )
+        problem, before = make_problem(quick, state.trial_effects), old.problem.release_origin_mean
+        means = np.concatenate([before, problem.release_origin_mean[len(before) :]])
+        problem = replace(problem, release_origin_mean=means)
+        # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
+        fixed = FixedTerms(state.spread, (state.rho, state.variance))
+        solution = solve(quick, problem, state, fixed, warm=True, most_iterations=most)
+        whole: Predictor = quick
+        if thorough and all(trial_data.trace is None for trial_data in quick.data[: quick.n_old]):
+            whole = Predictor(layout, quick.data, quick.host)
+            whole.steps = quick.new.steps.copy()
+        solution = solve(whole, problem, solution.state, warm=True, most_iterations=most)
+    except SimulationError:
+        return math.nan
+    return -2 * solution.log_likelihood()
+
+
+def _extended_layout(hypothesis: Hypothesis, places: Sequence[int]) -> ParameterMap:
+    """Parameter map of old and new trials; of the new parameters only those that the new trials depend on are free."""
+    before, wide = hypothesis.fit.predictor.layout, hypothesis.layout
+    old = len(before.free)
+    needed = np.unique(wide.index[list(places)])
+    used = [*range(old), *needed[needed >= old].tolist()]
+    order = {place: k for k, place in enumerate(used)} | {-1: -1}
+    index = np.vectorize(order.__getitem__, otypes=[int])(wide.index[list(places)])
+    return ParameterMap(
+        wide.model,
+        tuple(wide.free[k] for k in used),
+        wide.keys,
+        np.concatenate([before.index, index]),
+        np.concatenate([before.base, wide.base[list(places)]]),
+    )
+
+
+# ------------------------------------------------------------------------------
+# Separation of hypotheses by designs, to first order.
+
+
 @dataclass(frozen=True)
 class RefitTerms:
-    """Quadratic form of −2 ln L of one hypothesis refitted to the trials so far and one trial of every condition. The
-    first axis is that of the scatter levels. From the trials so far: `old_information`, shape (n_levels, n_free,
-    n_free), `old_gradient`, (n_levels, n_free), and `old_rise`, (n_levels,).
+    """Quadratic form of −2 ln L of one hypothesis, refitted to one trial of every condition; beside the information of
+    the trials so far in its `levels`, which are the first axis here too. `information`, shape (n_levels, n_conditions,
+    n_free, n_free); `gradient`, (n_levels, n_conditions, n_free, n_hypotheses), and `misfit`, (n_levels,
+    n_conditions, n_hypotheses), with the rise of the scatter, if each hypothesis is true.
     """
 
-    old_information: Floats
-    old_gradient: Floats
-    old_rise: Floats
+    hypothesis: Hypothesis
     information: Floats
     gradient: Floats
     misfit: Floats
-    scatter_rise: Floats
-    down: Floats
-    up: Floats
-
-    def narrowed(self, allowed: NDArray[np.int_]) -> RefitTerms:
-        """Keep some of the conditions, and the parameters about which they or the trials so far have information.
-        Shapes: allowed (n_allowed,).
-        """
-        has_new = np.any(self.information[0][allowed].diagonal(axis1=1, axis2=2) > 0, axis=0)
-        has_old = (np.abs(self.old_gradient[0]) > 0) | (np.count_nonzero(self.old_information[0], axis=0) > 1)
-        use = np.flatnonzero(has_new | has_old)
-        return RefitTerms(
-            self.old_information[:, use][:, :, use],
-            self.old_gradient[:, use],
-            self.old_rise,
-            self.information[:, allowed][:, :, use][:, :, :, use],
-            self.gradient[:, allowed][:, :, use],
-            self.misfit[:, allowed],
-            self.scatter_rise[:, allowed],
-            self.down[use],
-            self.up[use],
-        )
 
 
-def refit_terms(
-    hypotheses: Sequence[Hypothesis],
-    conditions: Sequence[Condition],
-    cameras: Sequence[TrackSampling],
-    runs: Sequence[GrowthCourse],
-) -> list[RefitTerms]:
+def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[RefitTerms]:
     """Return the quadratic form of each hypothesis, with one trial of each condition, at its best values so far."""
-    data = hypotheses[0].fit.predictor.data
-    times, weights = zip(*(_times(camera, run) for camera, run in zip(cameras, runs, strict=True)), strict=True)
-    placeholders = [blank_trial(condition, t, data, 1e-3 * t) for condition, t in zip(conditions, times, strict=True)]
-    trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
-    predictors = [hypothesis.predictor(range(len(conditions)), placeholders) for hypothesis in hypotheses]
+    times, weights = zip(*(_times(hypotheses[0], k, *course) for k, course in enumerate(courses)), strict=True)
+    trial_effects = np.zeros((len(courses), N_TRIAL_EFFECTS))
+    predictors = [hypothesis.predictor(range(len(courses)), times) for hypothesis in hypotheses]
     columns = [
         np.stack(p.linearise(hypothesis.theta, trial_effects))
         for p, hypothesis in zip(predictors, hypotheses, strict=True)
@@ -625,57 +728,38 @@ def refit_terms(
     motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
     terms = []
     for k, (hypothesis, sensitivities, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
-        has_deviations = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
-        differences = (motions - motions[:, :, [k]]) * root_weights
-        terms.append(_terms_of(hypothesis, sensitivities * root_weights, differences, has_deviations))
+        # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
+        scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
+        differences = motions - motions[:, :, [k]]
+        both = scale * root_weights * np.concatenate([sensitivities[:, :, :-1], differences], axis=2)
+        products = np.swapaxes(both, 1, 2) @ both
+        levels = hypothesis.levels
+        by_level = [_without_trial_effects(hypothesis, spread, products) for spread in levels.spread]
+        information, gradient, misfit = (np.stack(part) for part in zip(*by_level, strict=True))
+        has_deviations = np.stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
+        scatter_rise = (2 * np.log(levels.factors) + 1 / levels.factors**2 - 1) @ has_deviations.astype(float)
+        terms.append(RefitTerms(hypothesis, information, gradient, misfit + scatter_rise[:, :, None]))
     return terms
 
 
-def _times(camera: TrackSampling, run: GrowthCourse) -> tuple[Floats, Floats]:
+def _times(hypothesis: Hypothesis, place: int, near_end_s: float, ends_s: float) -> tuple[Floats, Floats]:
     """Times since release at which a condition is evaluated, and the number of frames that each represents. The first
     represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
     """
     points = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
-    step_s = run.near_end_s / points
+    frame_s, step_s = hypothesis.frame_s(place), near_end_s / points
     moving = (np.arange(points) + 0.5) * step_s
-    ends_filmed = np.isfinite(run.ends_s) and camera.frames_behind_end > 0
-    last_s = 1.05 * run.ends_s if ends_filmed else moving[-1] + step_s  # just past the end
-    weights = np.full(points + 2, step_s / camera.frame_s)
-    weights[0], weights[-1] = camera.rest_frames, camera.frames_behind_end if ends_filmed else 0.0
-    return np.concatenate([[-camera.frame_s], moving, [last_s]]), weights
+    ends_filmed = np.isfinite(ends_s) and hypothesis.frames_behind_end > 0
+    last_s = 1.05 * ends_s if ends_filmed else moving[-1] + step_s  # just past the end
+    weights = np.full(points + 2, step_s / frame_s)
+    weights[0], weights[-1] = hypothesis.rest_frames, hypothesis.frames_behind_end if ends_filmed else 0.0
+    return np.concatenate([[-frame_s], moving, [last_s]]), weights
 
 
-def _terms_of(
-    hypothesis: Hypothesis, columns: Floats, differences: Floats, has_deviations: NDArray[np.bool_]
-) -> RefitTerms:
-    # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
-    scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
-    both = scale * np.concatenate([columns[:, :, :-1], differences], axis=2)
-    products = np.swapaxes(both, 1, 2) @ both
-    levels = hypothesis.scatter_levels
-    by_level = [_without_trial_effects(hypothesis, level, products) for level in levels]
-    information, gradient, misfit = (np.stack(part) for part in zip(*by_level, strict=True))
-    factors = np.array([level.factors for level in levels])
-    down, up = hypothesis.room
-    return RefitTerms(
-        old_information=np.stack([level.information for level in levels]),
-        old_gradient=np.stack([level.gradient for level in levels]),
-        old_rise=np.array([level.rise for level in levels]),
-        information=information,
-        gradient=gradient,
-        misfit=misfit,
-        scatter_rise=(2 * np.log(factors) + 1 / factors**2 - 1) @ has_deviations.T.astype(float),
-        down=down,
-        up=up,
-    )
-
-
-def _without_trial_effects(
-    hypothesis: Hypothesis, level: ScatterLevel, products: Floats
-) -> tuple[Floats, Floats, Floats]:
+def _without_trial_effects(hypothesis: Hypothesis, spread: Floats, products: Floats) -> tuple[Floats, Floats, Floats]:
     """Information, gradient and misfit over all free parameters, trial effects eliminated (Schur complement)."""
     precision = np.full(N_TRIAL_EFFECTS, 1e-9)
-    precision[list(DEVIATION_COLUMNS)] = 1 / np.array(level.spread) ** 2
+    precision[list(DEVIATION_COLUMNS)] = 1 / spread**2
     within_trial = products[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + np.diag(precision)
     reduced = products[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - products[
         :, N_TRIAL_EFFECTS:, :N_TRIAL_EFFECTS
@@ -690,22 +774,27 @@ def _without_trial_effects(
     return information[:, :size, :size], gradient[:, :size], np.einsum("nkk->nk", reduced[:, keys:, keys:])
 
 
-def separations(terms: Sequence[RefitTerms], designs: NDArray[np.int_]) -> Floats:
+def separations(terms: Sequence[RefitTerms], designs: Sequence[Sequence[int]] | NDArray[np.int_]) -> Floats:
     """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal. Shapes:
     designs (n_designs, n_trials) → (n_designs, n, n).
     """
-    n = len(terms)
+    n, designs = len(terms), np.asarray(designs)
+    conditions = np.unique(designs)
     squares = np.zeros((len(designs), n, n))
     for b, refitted in enumerate(terms):
-        for level in range(len(refitted.old_rise)):
-            information = refitted.old_information[level] + _over_trials(refitted.information[level], designs)
-            gradient = refitted.old_gradient[level][:, None] + _over_trials(refitted.gradient[level], designs)
-            misfit = _over_trials(refitted.misfit[level], designs) + refitted.old_rise[level]
-            misfit += _over_trials(refitted.scatter_rise[level], designs)[:, None]
+        levels, (down, up) = refitted.hypothesis.levels, refitted.hypothesis.room
+        # Parameters about which these conditions or the trials so far have information
+        has_new = np.any(refitted.information[0][conditions].diagonal(axis1=1, axis2=2) > 0, axis=0)
+        has_old = (np.abs(levels.gradient[0]) > 0) | (np.count_nonzero(levels.information[0], axis=0) > 1)
+        use = np.flatnonzero(has_new | has_old)
+        for level, old_rise in enumerate(levels.rise):
+            information = _over_trials(refitted.information[level][:, use[:, None], use], designs)
+            information += levels.information[level][use[:, None], use]
+            gradient = levels.gradient[level][use, None] + _over_trials(refitted.gradient[level][:, use], designs)
+            misfit = _over_trials(refitted.misfit[level], designs) + old_rise
             for a in range(n):
                 if a != b:
-                    gain = _largest_gain(information, gradient[:, :, a], refitted.down, refitted.up)
-                    square = misfit[:, a] - gain
+                    square = misfit[:, a] - _largest_gain(information, gradient[:, :, a], down[use], up[use])
                     squares[:, a, b] = square if level == 0 else np.minimum(squares[:, a, b], square)
     return np.sqrt(np.maximum(squares, 0.0))
 
@@ -747,32 +836,26 @@ def worth(between: Floats) -> Floats:
     return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
 
 
-def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.int_], trials: int) -> tuple[NDArray[np.int_], float]:
-    """Find the trials that separate best, by exchange of one trial at a time (Fedorov 1972). Returns design (indices
-    among all conditions, increasing), worth (see `worth`). Shape (trials,).
+def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.intp], trials: int) -> tuple[list[int], float]:
+    """Find the trials that separate best: replicates of one condition, exchanged one at a time. Returns design
+    (indices among all conditions, increasing), worth (see `worth`).
     """
-    of_allowed = [of_hypothesis.narrowed(allowed) for of_hypothesis in terms]
-    replicates = np.repeat(np.arange(allowed.size)[:, None], trials, axis=1)
-    values = worth(separations(of_allowed, replicates))
-    design, best = replicates[int(np.argmax(values))].copy(), float(np.max(values))
-    for _ in range(4):
-        before = best
-        for exchanged in range(trials):
-            designs = np.repeat(design[None], allowed.size, axis=0)
-            designs[:, exchanged] = np.arange(allowed.size)
-            values = worth(separations(of_allowed, designs))
-            if np.max(values) > 1.005 * best:  # a gain, not rounding
-                design, best = designs[int(np.argmax(values))], float(np.max(values))
-        if best <= before:
-            break
-    return np.sort(allowed[design]), best
+
+    def worth_with(others: list[int]) -> Floats:
+        return worth(separations(terms, [[*others, k] for k in allowed]))
+
+    values = _worth_of_replicates(terms, allowed, trials)
+    start = [int(allowed[int(np.argmax(values))])] * trials
+    design, best = exchanged(start, float(np.max(values)), allowed, worth_with)
+    return sorted(design), best
 
 
-def best_new_vines(
-    terms: Sequence[RefitTerms], conditions: Sequence[Condition], places: NDArray[np.int_], trials: int, most: int
-) -> list[str]:
+def best_new_vines(terms: Sequence[RefitTerms], places: NDArray[np.intp], trials: int, most: int) -> list[str]:
     """Return the new vines in order of the worth of replicates at their best condition, best first."""
-    of_new_vines = [of_hypothesis.narrowed(places) for of_hypothesis in terms]
-    replicates = np.repeat(np.arange(places.size)[:, None], trials, axis=1)
-    order = np.argsort(-worth(separations(of_new_vines, replicates)))
+    conditions = terms[0].hypothesis.conditions
+    order = np.argsort(-_worth_of_replicates(terms, places, trials))
     return list(dict.fromkeys(conditions[places[k]].trial.vine for k in order))[:most]
+
+
+def _worth_of_replicates(terms: Sequence[RefitTerms], places: NDArray[np.intp], trials: int) -> Floats:
+    return worth(separations(terms, np.repeat(places[:, None], trials, axis=1)))

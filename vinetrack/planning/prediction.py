@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,8 @@ POINTS = 400  # Times at which each draw is evaluated (derived)
 @dataclass(frozen=True)
 class Runs:
     """Simulated draws, SI. Arrays have shape (n_draws,), or (n_draws, n_places) along `places_m`. At a place that a
-    draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge.
+    draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge. Forces are those of the
+    first draws only; `slack` is whether the tail is compressed or slack.
     """
 
     places_m: Floats
@@ -61,13 +63,30 @@ def run(inputs: PredictiveInputs, places_m: Floats, samples: int, seed: int) -> 
     """Draw predictive inputs and simulate every draw. Shapes: places_m (n_places,)."""
     trials, rows = inputs.laid_out(inputs.draw(samples, seed))
     moved, until_s = grown(inputs.model, trials, rows)
+    n_forces = min(samples, 300)  # Draws whose forces are evaluated, a third of a millisecond each (chosen)
     time_s, velocity_m_s = np.full((samples, places_m.size), math.inf), np.zeros((samples, places_m.size))
-    for i, trajectory in enumerate(moved):
-        position_m, reached = trajectory.lead_position_m, places_m <= trajectory.lead_position_m[-1]
+    tension_N, pressure_Pa = (np.full((n_forces, places_m.size), math.nan) for _ in range(2))
+    least_N, slack = np.full(n_forces, math.nan), np.zeros(n_forces)
+    for i, (trial, trajectory) in enumerate(zip(trials, moved, strict=True)):
+        position_m, lead_m_s = trajectory.lead_position_m, trajectory.lead_velocity_m_s
+        reached = places_m <= position_m[-1]
         time_s[i, reached] = np.interp(places_m[reached], position_m, trajectory.time_s)
-        velocity_m_s[i, reached] = np.interp(places_m[reached], position_m, trajectory.lead_velocity_m_s)
-    # 300: draws whose forces are evaluated, a third of a millisecond each (chosen)
-    tension_N, pressure_Pa, least_N, slack = _forces(inputs, trials[:300], rows, moved, places_m)
+        velocity_m_s[i, reached] = np.interp(places_m[reached], position_m, lead_m_s)
+        if i >= n_forces:
+            continue
+        model = replace(inputs.model, values=dict(zip(inputs.model.parameter_names, rows[i].tolist(), strict=True)))
+        terms = evaluate(model, trial, trajectory.time_s, position_m, lead_m_s)
+        drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
+        tension = np.where(np.abs(terms.tension_N) < 1e-9 * drive_N, 0.0, terms.tension_N)
+        tension_N[i, reached] = np.interp(places_m[reached], position_m, tension)
+        pressure_Pa[i, reached] = np.interp(places_m[reached], position_m, terms.pressure_Pa)
+        moving = (position_m <= places_m[-1]) & (lead_m_s > 0)
+        if moving.any():
+            least_N[i] = np.min(tension[moving])
+        may_go_slack = trial.tail_slack == "free"
+        # 0.01: compression of the tail from which the model is said to be in doubt, as a fraction of the
+        # drive ½PA (chosen)
+        slack[i] = math.isfinite(trajectory.slack_from_s) if may_go_slack else least_N[i] < -0.01 * drive_N
     last_m_s = np.array([trajectory.lead_velocity_m_s[-1] for trajectory in moved])
     return Runs(
         places_m=places_m,
@@ -122,32 +141,6 @@ def drawn_final_speeds(
     """Return the final speed in every draw, m/s, see `final_speeds`. Shape (n_draws,)."""
     trials, rows = inputs.laid_out(inputs.draw(samples, seed, only))
     return final_speeds(inputs.model, trials, at_fraction, rows)
-
-
-def _forces(
-    inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats, moved: Sequence[Trajectory], places_m: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Tension and pressure at the places, least tension so far, and whether the tail is compressed or slack."""
-    names = inputs.model.parameter_names
-    tension_N, pressure_Pa = (np.full((len(trials), places_m.size), math.nan) for _ in range(2))
-    least_N, slack = np.full(len(trials), math.nan), np.zeros(len(trials))
-    for i, trial in enumerate(trials):
-        model = replace(inputs.model, values=dict(zip(names, rows[i].tolist(), strict=True)))
-        trajectory = moved[i]
-        terms = evaluate(model, trial, trajectory.time_s, trajectory.lead_position_m, trajectory.lead_velocity_m_s)
-        drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
-        tension = np.where(np.abs(terms.tension_N) < 1e-9 * drive_N, 0.0, terms.tension_N)
-        reached = places_m <= trajectory.lead_position_m[-1]
-        tension_N[i, reached] = np.interp(places_m[reached], trajectory.lead_position_m, tension)
-        pressure_Pa[i, reached] = np.interp(places_m[reached], trajectory.lead_position_m, terms.pressure_Pa)
-        moving = (trajectory.lead_position_m <= places_m[-1]) & (trajectory.lead_velocity_m_s > 0)
-        if moving.any():
-            least_N[i] = np.min(tension[moving])
-        may_go_slack = trial.tail_slack == "free"
-        # 0.01: compression of the tail from which the model is said to be in doubt, as a fraction of the
-        # drive ½PA (chosen)
-        slack[i] = math.isfinite(trajectory.slack_from_s) if may_go_slack else least_N[i] < -0.01 * drive_N
-    return tension_N, pressure_Pa, least_N, slack
 
 
 def _steady(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> Floats:
@@ -224,6 +217,16 @@ class VinePrediction:
         """Return the quantity of that name; KeyError where there is none."""
         return {quantity.name: quantity for quantity in self.quantities}[name]
 
+    @cached_property
+    def hazards(self) -> tuple[Remark, ...]:
+        """Warnings about the vine, most serious first."""
+        return (*_hazards(self), *self.inputs.notes)
+
+    @cached_property
+    def neglected(self) -> tuple[Neglected, ...]:
+        """The final speed at the medians with each of the universal effects added, see `neglected`."""
+        return neglected(self.inputs, self.at_fraction)
+
     @property
     def table(self) -> pd.DataFrame:
         """A row for each quantity, SI."""
@@ -277,18 +280,18 @@ def predict_vine(
     along = np.union1d([0.0, 0.0005, 0.001, 0.002, 0.004, 0.007, *np.linspace(0.01, 0.99, 99)], [at_fraction])
     runs = run(inputs, along * length_m, samples, seed)
     place = int(np.searchsorted(along, at_fraction))
-    contributions = []
+    shares = []
     for uncertainty in inputs.uncertainties:
         # 400: draws for the band of one uncertainty alone (derived)
         alone = drawn_final_speeds(inputs, at_fraction, min(samples, 400), seed, [uncertainty.name])
         low, _, high = band(alone).tolist()
-        contributions.append(Contribution(uncertainty.name, uncertainty.why, low, high))
+        shares.append(Contribution(uncertainty.name, uncertainty.why, low, high))
     return VinePrediction(
         inputs=inputs,
         at_fraction=at_fraction,
         quantities=tuple(_quantities(inputs, runs, along, place)),
         curve=_curve(inputs, runs, along),
-        shares=tuple(sorted(contributions, key=lambda share: share.low - share.high)),
+        shares=tuple(sorted(shares, key=lambda share: share.low - share.high)),
         arrives=float(np.mean(np.isfinite(runs.end_s))),
         slack=float(np.mean(runs.slack)),
         samples=samples,
@@ -323,8 +326,7 @@ def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int)
         yield quantity("steady tail speed, Eq. (3)", math.nan, runs.steady_tail_m_s, "m/s")
     yield quantity(TENSION, at, runs.tension_N[:, place], "N")
     yield quantity(LEAST_TENSION, math.nan, runs.least_tension_N, "N")
-    trial = inputs.trial
-    stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
+    stress = _hoop_stress_Pa(inputs.trial)
     yield Quantity("hoop stress PD/2t", math.nan, stress, stress, stress, "Pa")
 
 
@@ -359,49 +361,34 @@ class Neglected:
         return self.final_m_s / self.without_m_s - 1 if self.without_m_s > 0 else math.nan
 
 
-def design_checks(prediction: VinePrediction) -> tuple[Remark, ...]:
-    """Return warnings about a planned vine, most serious first."""
-    hazards = (*_burst(prediction.inputs.trial), *_no_growth(prediction), *_slack(prediction), *_rules(prediction))
-    return (*hazards, *prediction.inputs.notes)
-
-
-def _burst(trial: Trial) -> Iterator[Remark]:
-    stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
+def _hazards(prediction: VinePrediction) -> Iterator[Remark]:
+    inputs, trial = prediction.inputs, prediction.inputs.trial
+    stress = _hoop_stress_Pa(trial)
     if stress > 0.9 * BURST_STRESS_PA:
         highest_kPa = burst_pressure_Pa(trial.diameter_m, trial.thickness_m) / 1e3
         facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "burst_kPa": highest_kPa}
         yield remark("bursts" if stress > BURST_STRESS_PA else "nearly_bursts", **facts)
-
-
-def _no_growth(prediction: VinePrediction) -> Iterator[Remark]:
-    trial = prediction.inputs.trial
-    low, median, high = np.quantile(prediction.inputs.draw(2000, 1)[YIELD], BAND) / 1e3
+    low, median, high = np.quantile(inputs.draw(2000, 1)[YIELD], BAND) / 1e3
     if median >= trial.pressure_Pa / 1e3:
         yield remark("below_yield", kPa=trial.pressure_Pa / 1e3, yield_kPa=median, low_kPa=low, high_kPa=high)
     elif prediction.arrives < 1 - WARNING_FRACTION:
         yield remark("stalls", share=1 - prediction.arrives)
-
-
-def _slack(prediction: VinePrediction) -> Iterator[Remark]:
-    trial = prediction.inputs.trial
-    if prediction.slack < WARNING_FRACTION:
-        return
-    if trial.tail_slack == "free":
+    if prediction.slack >= WARNING_FRACTION and trial.tail_slack == "free":
         yield remark("goes_slack", share=prediction.slack)
-    else:
+    elif prediction.slack >= WARNING_FRACTION:
         tension, has_payload = prediction[LEAST_TENSION], trial.payload_kg > 0
         facts = {"median_N": tension.median, "low_N": tension.low, "has_payload": has_payload}
         yield remark("tail_compressed", share=prediction.slack, **facts)
-
-
-def _rules(prediction: VinePrediction) -> Iterator[Remark]:
-    """Warnings of the audit along the median motion, except the one about the tail, which `_slack` gives."""
-    inputs = prediction.inputs
-    (moved,), _ = grown(inputs.model, [inputs.trial])
-    keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
-    motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
+    # The audit along the median motion, except of the tail, whose compression is told above
+    (moved,), _ = grown(inputs.model, [trial])
+    keep = moved.lead_position_m <= prediction.at_fraction * trial.length_m
+    motion = AuditedMotion(trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
     violations = audit(inputs.model, [motion]).violations
     yield from (remark("rule", words=violation.words) for violation in violations if violation.rule != "tension")
+
+
+def _hoop_stress_Pa(trial: Trial) -> float:
+    return hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
 
 
 def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
@@ -438,9 +425,8 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
 #
 # For a given size a higher pressure always gives a higher speed, so the pressure is the highest that supply and wall
 # allow, P = min(P_supply, f · 2tσ/D) with f the allowed fraction of the burst stress σ. Diameter and length are
-# optimised
-# by a grid search at the medians of the predictive inputs. How certain the choice of film is follows from their
-# distributions: every draw has its own fastest film.
+# optimised by a grid search at the medians of the predictive inputs. How certain the choice of film is follows from
+# their distributions: every draw has its own fastest film.
 
 
 @dataclass(frozen=True)
@@ -457,8 +443,7 @@ class Room:
 
     def bearable_Pa(self, diameter_m: float, thickness_m: float) -> float:
         """Return the highest pressure that the wall allows, f · 2tσ/D, Pa."""
-        burst_Pa = burst_pressure_Pa(diameter_m, thickness_m) * self.burst_stress_Pa / BURST_STRESS_PA
-        return self.burst_share * burst_Pa
+        return self.burst_share * burst_pressure_Pa(diameter_m, thickness_m, self.burst_stress_Pa)
 
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
         """Return the trial with a vine of this size at the highest pressure allowed."""

@@ -22,7 +22,7 @@ from vinetrack.core.problems import Problem, Remark, remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.units import convert, number
 from vinetrack.dynamics.model import Model, make_model
-from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, find_effect
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
@@ -102,9 +102,9 @@ def exponent_sigma() -> float:
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
-def burst_pressure_Pa(diameter_m: float, thickness_m: float) -> float:
-    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; a guess from one vine."""
-    return 2 * thickness_m * BURST_STRESS_PA / diameter_m
+def burst_pressure_Pa(diameter_m: float, thickness_m: float, stress_Pa: float = BURST_STRESS_PA) -> float:
+    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; by default a guess from one vine."""
+    return 2 * thickness_m * stress_Pa / diameter_m
 
 
 def hoop_stress_Pa(pressure_Pa: float, diameter_m: float, thickness_m: float) -> float:
@@ -197,52 +197,33 @@ class PredictiveInputs:
         return bands
 
 
-@dataclass(frozen=True)
-class Size:
-    """Assumed value of a parameter: the range of a uniform distribution, of zero width for a fixed value; SI."""
-
-    low: float
-    high: float
-
-    @property
-    def middle(self) -> float:
-        """Middle of the range."""
-        return (self.low + self.high) / 2
-
-
-def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[str, dict[str, Size]]:
+def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[str, dict[str, tuple[float, float]]]:
     """Parse an effect with its sizes: `NAME`, `NAME=value` or `NAME=low:high`, several parameters separated by commas.
-    Returns name (of the effect), sizes (by `effect.parameter`; empty where the text gives none).
+    Returns name (of the effect), sizes (ends of a range by `effect.parameter`, equal for a fixed value; empty where the
+    text gives none).
     """
     name, _, sizes_text = text.partition("=")
     effect = find_effect(name.strip(), further)
     if not sizes_text.strip():
         return effect.name, {}
     cells = [cell.strip() for cell in sizes_text.split(",")]
-    parameters = ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters) or "none"
     if len(cells) > len(effect.parameters):
-        raise EffectError(f"{effect.name} has {len(effect.parameters)} parameters, not {len(cells)}: {parameters}.")
-    return effect.name, {
-        f"{effect.name}.{parameter.name}": _size(effect, parameter.name, cell, parameter.bounds)
-        for parameter, cell in zip(effect.parameters, cells, strict=False)
-    }
-
-
-def _size(effect: Effect, parameter: str, cell: str, bounds: tuple[float, float]) -> Size:
-    try:
-        ends = [float(part) for part in cell.split(":")]
-    except ValueError:
-        ends = []
-    if len(ends) not in (1, 2) or not all(map(math.isfinite, ends)):
-        raise EffectError(
-            f"{parameter} of {effect.name} cannot be {cell!r}: write a number, or a range such as 0.5:1.5."
-        )
-    low, high = min(ends), max(ends)
-    if low < bounds[0] or high > bounds[1]:
-        raise EffectError(
-            f"{parameter} of {effect.name} cannot be {cell}: it lies between {bounds[0]:g} and {bounds[1]:g}."
-        )
-    return Size(low, high)
+        known = ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters) or "none"
+        raise EffectError(f"{effect.name} has {len(effect.parameters)} parameters, not {len(cells)}: {known}.")
+    sizes = {}
+    for parameter, cell in zip(effect.parameters, cells, strict=False):
+        wrong = f"{parameter.name} of {effect.name} cannot be"
+        try:
+            ends = [float(part) for part in cell.split(":")]
+        except ValueError:
+            ends = []
+        if len(ends) not in (1, 2) or not all(map(math.isfinite, ends)):
+            raise EffectError(f"{wrong} {cell!r}: write a number, or a range such as 0.5:1.5.")
+        low, high = parameter.bounds
+        if min(ends) < low or max(ends) > high:
+            raise EffectError(f"{wrong} {cell}: it lies between {low:g} and {high:g}.")
+        sizes[f"{effect.name}.{parameter.name}"] = (min(ends), max(ends))
+    return effect.name, sizes
 
 
 def _varied(name: str, change: Callable[[Floats, np.random.Generator], Floats]) -> Sampler:
@@ -265,10 +246,6 @@ def shifted(name: str, sigma: float) -> Sampler:
     return _varied(name, lambda values, draw: values + sigma * draw.standard_normal(values.size))
 
 
-def _uniform(name: str, size: Size) -> Sampler:
-    return _varied(name, lambda values, draw: draw.uniform(size.low, size.high, values.size))
-
-
 # ------------------------------------------------------------------------------
 # Fitted parameters in the form from which predictions draw: means, covariance, between-trial standard deviations.
 #
@@ -277,33 +254,48 @@ def _uniform(name: str, size: Size) -> Sampler:
 
 @dataclass(frozen=True)
 class FitNumbers:
-    """The parameters of a fit, named by `keys` and `vines`; `log` marks those held as logarithms. `mean` and
+    """The parameters of a fit, in the order of its `numbers`; `log` marks those held as logarithms. `mean` and
     `covariance` are those of the parameters of a new trial, between-trial differences included. Parameters that the fit
     does not determine have a variance of 0 and are listed in `open`.
     """
 
     source: str
-    model: tuple[str, ...]
-    keys: tuple[str, ...]
-    vines: tuple[str, ...]
+    fit: Fit | FitSummary
     log: np.ndarray
     mean: Floats
     covariance: Floats
     open: tuple[str, ...]
-    spreads: Mapping[str, float]
-    spread_dof: Mapping[str, float]
-    n_trials: int
 
     def place(self, key: str, vine: str = "") -> int | None:
         """Return the index of a parameter, shared or of this vine; None where there is none."""
-        named = enumerate(zip(self.keys, self.vines, strict=True))
-        return next((k for k, (name, of_vine) in named if name == key and of_vine in ("", vine)), None)
+        numbers = enumerate(self.fit.numbers)
+        return next((k for k, number in numbers if number.key == key and number.vine in ("", vine)), None)
+
+    def yield_place(self, vine: str, stated_Pa: float) -> int | None:
+        """Return the index of the yield pressure of a fitted vine; of several, the one nearest to the stated value."""
+        places = [
+            k
+            for k, number in enumerate(self.fit.numbers)
+            if number.key == YIELD_PRESSURE and (number.vine == vine or number.vine.startswith(f"{vine}, "))
+        ]
+        # Nothing is nearer than the first to a value that is not stated.
+        return min(places, key=lambda k: np.nan_to_num(abs(float(self.mean[k]) - stated_Pa)), default=None)
 
     def sizes(self) -> dict[str, tuple[float, float]]:
         """Diameter and thickness, m, of every vine with a fitted B and a name that contains them."""
-        vines = (vine for key, vine in zip(self.keys, self.vines, strict=True) if key == DAMPING)
+        vines = (number.vine for number in self.fit.numbers if number.key == DAMPING)
         named = (re.match(r"([\d.]+)mm-([\d.]+)um.*", vine) for vine in vines)
         return {m[0]: (float(m[1]) / 1e3, float(m[2]) / 1e6) for m in named if m}
+
+    def vine_for(self, trial: Trial) -> tuple[str, bool]:
+        """Return the vine from which a trial is predicted, and whether it has the same diameter and wall, at any
+        length, since B belongs to the tip; else the nearest in their logarithms, blank where no name contains a size.
+        """
+        size, sizes = (trial.diameter_m, trial.thickness_m), self.sizes()
+        same = [vine for vine in sizes if _alike(sizes[vine], size)]
+        if same:
+            return (trial.vine if trial.vine in same else same[0]), True
+        return min(sizes, key=lambda vine: float(np.sum((np.log(sizes[vine]) - np.log(size)) ** 2)), default=""), False
 
 
 def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
@@ -312,6 +304,8 @@ def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
         raise FitError(f"{source} holds no fit to predict from: {fit.refused}")
     if not fit.numbers:
         raise FitError(f"{source} holds a fit without numbers: there is nothing to predict from.")
+    if not any(number.key == DAMPING for number in fit.numbers):
+        raise FitError(f"{source} is not a fit of everting vines: it has no B to predict with.")
     values = np.array([number.value for number in fit.numbers])
     log = np.array([number.key == DAMPING and number.value > 0 for number in fit.numbers])
     slopes = np.where(log, 1 / np.where(log, values, 1.0), 1.0)
@@ -320,20 +314,14 @@ def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
     if fit.between is not None and fit.between.shape == covariance.shape:
         # A prediction is of one trial, whose parameters differ from the shared ones.
         covariance = covariance + np.nan_to_num(fit.between)
-    dof = float(max(len(fit.trials) - len(fit.numbers), 3))  # t of fewer degrees of freedom has no variance
     scale = np.where(is_known, slopes * widening, 0.0)
     return FitNumbers(
         source=source,
-        model=fit.names,
-        keys=tuple(number.key for number in fit.numbers),
-        vines=tuple(number.vine for number in fit.numbers),
+        fit=fit,
         log=log,
         mean=np.where(log, np.log(np.where(log, values, 1.0)), values),
         covariance=np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale,
         open=tuple(number.symbol for number, known in zip(fit.numbers, is_known, strict=True) if not known),
-        spreads={name: spread.value for name, spread in fit.spreads.items()},
-        spread_dof={name: dof if spread.estimated else math.inf for name, spread in fit.spreads.items()},
-        n_trials=len(fit.trials),
     )
 
 
@@ -346,31 +334,9 @@ def _widening(number: Number, log: bool) -> float:
     return max(half / (float(ndtri(0.975)) * (sigma / number.value if log else sigma)), 1.0)
 
 
-def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
-    """Return whether two sizes are equal to five digits."""
+def _alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
+    """Whether two sizes are equal to five digits."""
     return all(abs(a / b - 1) < 1e-5 for a, b in zip(first, second, strict=True))
-
-
-def fitted_vine(numbers: FitNumbers, trial: Trial) -> tuple[str, bool]:
-    """Return the vine of a fit from which a trial is predicted, and whether it has the same diameter and wall, at any
-    length, since B belongs to the tip; else the nearest in their logarithms, blank where no name contains a size.
-    """
-    size, sizes = (trial.diameter_m, trial.thickness_m), numbers.sizes()
-    same = [vine for vine in sizes if alike(sizes[vine], size)]
-    if same:
-        return (trial.vine if trial.vine in same else same[0]), True
-    return min(sizes, key=lambda vine: float(np.sum((np.log(sizes[vine]) - np.log(size)) ** 2)), default=""), False
-
-
-def yield_place(numbers: FitNumbers, vine: str, stated_Pa: float) -> int | None:
-    """Return the index of the yield pressure of a fitted vine; of several, the one nearest to the stated value."""
-    places = [
-        k
-        for k, (key, name) in enumerate(zip(numbers.keys, numbers.vines, strict=True))
-        if key == YIELD_PRESSURE and (name == vine or name.startswith(f"{vine}, "))
-    ]
-    # Nothing is nearer than the first to a value that is not stated.
-    return min(places, key=lambda k: np.nan_to_num(abs(float(numbers.mean[k]) - stated_Pa)), default=None)
 
 
 # ------------------------------------------------------------------------------
@@ -397,23 +363,27 @@ class StatedValues:
     n_error: float = 0.0
     model: tuple[str, ...] = BASE_EFFECTS
     effects: tuple[str, ...] = ()
-    sizes: Mapping[str, Size] = field(default_factory=dict)
+    sizes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     user_effects: Mapping[str, Effect] = field(default_factory=dict)
     spreads: tuple[float, float] | None = None
 
 
-class _Sources:
-    """Predictive inputs while they are being assembled."""
+class _Assembly:
+    """Predictive inputs while they are being assembled. `from_fit` are the inputs taken from the fit, and their indices
+    in it; `vine` is the vine of the fit from which the trial is predicted, `is_same` whether it has the same size.
+    """
 
-    def __init__(self, trial: Trial, fit: FitNumbers | None) -> None:
+    def __init__(self, trial: Trial, stated: StatedValues, fit: FitNumbers | None) -> None:
         self.trial = trial if trial.vine else with_names([trial])[0]
-        self.fit = fit
+        self.stated, self.fit = stated, fit
+        self.vine, self.is_same = ("", False) if fit is None else fit.vine_for(self.trial)
+        size = self.trial.diameter_m, self.trial.thickness_m
+        self.printed_scale = next((scale for scale, printed in _printed_sizes().items() if _alike(printed, size)), None)
         self.values: dict[str, float] = {}
         self.origins: dict[str, Remark] = {}
         self.uncertainties: list[Uncertainty] = []
         self.notes: list[Remark] = []
         self.from_fit: dict[str, int] = {}
-        """Inputs taken from the fit, and their indices in it."""
 
     def set(self, name: str, value: float, origin: str, **facts: str) -> None:
         self.values[name], self.origins[name] = value, remark(origin, **facts)
@@ -429,8 +399,160 @@ class _Sources:
     def set_printed(self, name: str, value: float) -> None:
         self.set(name, value, "printed", source=published.SOURCE)
 
-    def add_uncertainty(self, name: str, key: str, sample: Sampler, why: str, **facts: object) -> None:
+    def vary(self, name: str, key: str, sample: Sampler, why: str, **facts: object) -> None:
         self.uncertainties.append(Uncertainty(name, remark(why, **facts), key, sample))
+
+    def damping(self) -> None:
+        """B: as stated, fitted or printed; else by the scaling prior, from the nearest vine of the fit if any."""
+        trial, fit, stated = self.trial, self.fit, self.stated
+        place = fit.place(DAMPING, self.vine) if fit else None
+        if math.isfinite(stated.B):
+            self.set(DAMPING, stated.B, "given")
+            if (error := stated.B_error) > 0:
+                self.vary("error of B", f"B given|{trial.vine}", scaled(DAMPING, error), "B_given", percent=100 * error)
+            return
+        if fit is not None and place is not None and (self.is_same or fit.fit.numbers[place].vine == ""):
+            self.set_fitted(DAMPING, place)
+            return
+        if place is None and self.printed_scale is not None:
+            error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
+            self.set_printed(DAMPING, published.DAMPING_B[self.printed_scale])
+            self.vary("error of B", f"B printed|{trial.vine}", scaled(DAMPING, error), "B_printed", percent=100 * error)
+            return
+        # The uncertainties of the prior are the scatter of the printed values about it, and the exponents of t against
+        # D.
+        size = trial.diameter_m, trial.thickness_m
+        split, scatter = split_leverage(*size), damping_log_sigma(*size)
+        if fit is None or place is None:
+            self.set(DAMPING, damping_prior(*size), "B_guessed")
+        else:
+            like = fit.sizes()[self.vine]
+            factor = damping_prior(*size) / damping_prior(*like)
+            self.set_fitted(DAMPING, place, factor, "B_scaled", vine=self.vine)
+            self.notes.append(remark("B_carried_over", source=fit.source, vine=self.vine))
+            split -= split_leverage(*like)
+        facts = {"printed": 100 * damping_scatter(), "here": 100 * scatter, "dof": SCATTER_DOF}
+        sample = scaled(DAMPING, scatter, SCATTER_DOF)
+        self.vary("guess of B", f"B scatter|{trial.vine}", sample, "printed_B_scatter", **facts)
+        if abs(split) > 1e-9:
+            split_sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
+            here = 100 * abs(split) * split_sigma
+            sample = scaled(DAMPING, split * split_sigma)
+            self.vary("t against D", "B split", sample, "one_t_over_D", sigma=split_sigma, here=here)
+
+    def exponent(self) -> None:
+        """n: as stated, fitted or printed."""
+        stated, sigma = self.stated, exponent_sigma()
+        place = self.fit.place(EXPONENT) if self.fit else None
+        if math.isfinite(stated.n):
+            self.set(EXPONENT, stated.n, "given")
+            if (error := stated.n_error) > 0:
+                self.vary("error of n", "n given", shifted(EXPONENT, error), "n_given", error=error)
+        elif place is not None:
+            self.set_fitted(EXPONENT, place)
+        else:
+            self.set_printed(EXPONENT, published.EXPONENT)
+            self.vary("error of n", "n printed", shifted(EXPONENT, sigma), "n_printed", error=sigma)
+
+    def yield_pressure(self) -> None:
+        """P_y: as fitted for this vine, unless the sheet contradicts it; as stated; as printed, for one vine or all."""
+        trial, fit = self.trial, self.fit
+        stated, sigma = trial.yield_pressure_Pa, max(np.nan_to_num(trial.yield_pressure_sigma_Pa), 0.0)
+        place = fit.yield_place(self.vine, stated) if fit and self.is_same else None
+        if fit is not None and place is not None and math.isfinite(stated):
+            # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
+            tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
+            place = place if abs(stated - float(fit.mean[place])) <= max(tolerance, 1.0) else None
+        printed_Pa = 1000 * published.YIELD_PRESSURE_KPA
+        if place is not None:
+            self.set_fitted(YIELD, place)
+        elif math.isfinite(stated):
+            self.set(YIELD, stated, "given")
+            if sigma > 0:
+                key, sample = f"P_y stated|{trial.vine}", shifted(YIELD, sigma)
+                self.vary("stated P_y", key, sample, "P_y_stated", kPa=sigma / 1e3)
+        elif self.printed_scale == 4:  # the vine whose yield pressure is printed
+            rounding_Pa = 1000 / math.sqrt(12)
+            self.set_printed(YIELD, printed_Pa)
+            sample = shifted(YIELD, rounding_Pa)
+            self.vary("printed P_y", "P_y printed", sample, "P_y_printed", kPa=rounding_Pa / 1e3)
+        else:
+            self.set(YIELD, printed_Pa, "P_y_guessed")
+            # Nine of ten vines within a factor of 3
+            sample = scaled(YIELD, math.log(3.0) / float(ndtri(0.95)))
+            self.vary("guess of P_y", "P_y guess", sample, "P_y_guess", kPa=published.YIELD_PRESSURE_KPA)
+
+    def other_parameters(self, model: Model) -> None:
+        """Parameters of all other effects: as stated, as fitted, or at their typical size."""
+        known = [(effect, p, f"{effect.name}.{p.name}") for effect in model for p in effect.parameters]
+        for effect, parameter, name in known:
+            if name in self.values:
+                continue
+            place = self.fit.place(name, self.vine) if self.fit else None
+            if name in self.stated.sizes:
+                self._stated_size(effect, parameter, name, *self.stated.sizes[name])
+            elif place is not None:
+                self.set_fitted(name, place)
+            else:
+                self.set(name, parameter.default, "constant" if parameter.held else "typical_size")
+
+    def _stated_size(self, effect: Effect, parameter: Parameter, name: str, low: float, high: float) -> None:
+        self.set(name, (low + high) / 2, "given")
+        facts = {"symbol": parameter.symbol, "effect": effect.name}
+        least, most = parameter.plausible or parameter.bounds
+        if low < least or high > most:
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            self.notes.append(remark("implausible", **facts, low=least, high=most, unit=unit))
+        if high > low:
+            sample = _varied(name, lambda values, draw: draw.uniform(low, high, values.size))
+            self.vary(f"{parameter.symbol} ({effect.name})", name, sample, "uniform", **facts, low=low, high=high)
+
+    def joint_draw_of_fit(self) -> None:
+        """Draw all inputs that the fit provides jointly, with their covariance."""
+        fit = self.fit
+        if fit is None or not self.from_fit:
+            return
+        names, places = list(self.from_fit), list(self.from_fit.values())
+        covariance, log = fit.covariance[np.ix_(places, places)], fit.log[places]
+
+        def sample(draws: Draws, draw: np.random.Generator) -> Draws:
+            size = next(iter(draws.values())).size
+            deviations = draw.multivariate_normal(np.zeros(len(places)), covariance, size, method="svd")
+            moved = {
+                name: draws[name] * np.exp(deviations[:, k]) if log[k] else draws[name] + deviations[:, k]
+                for k, name in enumerate(names)
+            }
+            return {**draws, **moved}
+
+        symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
+        shown = ", ".join(symbols.get(name, name) for name in names)
+        why = remark("with_covariance", names=shown, source=fit.source, count=len(fit.fit.trials))
+        self.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", sample))
+        if fit.open:
+            self.notes.append(remark("not_determined", source=fit.source, names=", ".join(fit.open)))
+
+    def between_trials(self) -> tuple[float, float]:
+        """Relative between-trial standard deviations of pressure and B; both become uncertainties."""
+        # Relative between-trial standard deviations of pressure and B (chosen)
+        pressure, damping, origin = 0.01, 0.03, "assumed"
+        trial, dof = self.trial, {"pressure": math.inf, "B": math.inf}
+        if trial.pressure_Pa > 0 and math.isfinite(trial.pressure_sigma_Pa):
+            pressure = trial.pressure_sigma_Pa / trial.pressure_Pa
+        if self.stated.spreads is not None:
+            (pressure, damping), origin = self.stated.spreads, "given"
+        elif self.fit is not None and self.fit.fit.spreads:
+            fit, origin = self.fit.fit, f"estimated in {self.fit.source}"
+            spread = {name: one.value for name, one in fit.spreads.items()}
+            pressure, damping = spread.get("pressure", pressure), spread.get("B", damping)
+            few = float(max(len(fit.trials) - len(fit.numbers), 3))  # t of fewer degrees of freedom has no variance
+            dof |= {name: few for name, one in fit.spreads.items() if one.estimated}
+        self.set(PRESSURE, trial.pressure_Pa, "set")
+        relative = _varied(PRESSURE, lambda P, draw: P * (1 + pressure * _deviates(draw, P.size, dof["pressure"])))
+        for symbol, size, sample in (("P", pressure, relative), ("B", damping, scaled(DAMPING, damping, dof["B"]))):
+            if size > 0:
+                title, key = f"{symbol} from trial to trial", f"{symbol} trial|{trial.vine}"
+                self.vary(title, key, sample, "spread", origin=origin, percent=100 * size)
+        return pressure, damping
 
 
 def predictive_inputs(
@@ -468,201 +590,24 @@ def predictive_inputs(
     if fit is not None and not isinstance(fit, FitNumbers):
         stated = replace(stated, user_effects={**{effect.name: effect for effect in fit.model}, **stated.user_effects})
         fit = fit_numbers(fit)
-    sources = _Sources(trial, fit)
-    names = [*(fit.model if fit else stated.model), *stated.effects]
+    names = [*(fit.fit.names if fit else stated.model), *stated.effects]
     model = make_model(dict.fromkeys(names), stated.user_effects)
-    if fit is not None and DAMPING not in fit.keys:
-        raise FitError(f"{fit.source} is not a fit of everting vines: it has no B to predict with.")
-    anchor = ("", False) if fit is None else fitted_vine(fit, sources.trial)
-    _damping(sources, stated, anchor)
-    _exponent(sources, stated)
-    _yield_pressure(sources, anchor)
-    _other_parameters(sources, stated, model, anchor)
-    _joint_draw_of_fit(sources)
-    spreads = _between_trial(sources, stated)
-    values = {name: value for name, value in sources.values.items() if name in model.parameter_names}
+    made = _Assembly(trial, stated, fit)
+    made.damping()
+    made.exponent()
+    made.yield_pressure()
+    made.other_parameters(model)
+    made.joint_draw_of_fit()
+    spreads = made.between_trials()
+    values = {name: value for name, value in made.values.items() if name in model.parameter_names}
     return PredictiveInputs(
-        trial=replace(sources.trial, yield_pressure_Pa=sources.values[YIELD]),
+        trial=replace(made.trial, yield_pressure_Pa=made.values[YIELD]),
         model=model.with_values(values),
-        origins=sources.origins,
-        uncertainties=tuple(sources.uncertainties),
+        origins=made.origins,
+        uncertainties=tuple(made.uncertainties),
         spreads=spreads,
-        notes=tuple(sources.notes),
+        notes=tuple(made.notes),
     )
-
-
-def _damping(sources: _Sources, stated: StatedValues, anchor: tuple[str, bool]) -> None:
-    printed_error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
-    vine, is_same = anchor
-    trial, fit = sources.trial, sources.fit
-    size = trial.diameter_m, trial.thickness_m
-    place = fit.place(DAMPING, vine) if fit else None
-    if math.isfinite(stated.B):
-        sources.set(DAMPING, stated.B, "given")
-        if stated.B_error > 0:
-            sample = scaled(DAMPING, stated.B_error)
-            sources.add_uncertainty(
-                "error of B", f"B given|{trial.vine}", sample, "B_given", percent=100 * stated.B_error
-            )
-        return
-    if fit is not None and place is not None and (is_same or fit.vines[place] == ""):
-        sources.set_fitted(DAMPING, place)
-        return
-    if place is None and (scale := _printed_scale(trial)) is not None:
-        sources.set_printed(DAMPING, published.DAMPING_B[scale])
-        sample = scaled(DAMPING, printed_error)
-        sources.add_uncertainty(
-            "error of B", f"B printed|{trial.vine}", sample, "B_printed", percent=100 * printed_error
-        )
-        return
-    # The scaling prior, from the nearest vine of the fit where there is one. Its uncertainties are the scatter of the
-    # printed values about it, and the exponents of t against D.
-    split, scatter = split_leverage(*size), damping_log_sigma(*size)
-    if fit is None or place is None:
-        sources.set(DAMPING, damping_prior(*size), "B_guessed")
-    else:
-        like = fit.sizes()[vine]
-        factor = damping_prior(*size) / damping_prior(*like)
-        sources.set_fitted(DAMPING, place, factor, "B_scaled", vine=vine)
-        sources.notes.append(remark("B_carried_over", source=fit.source, vine=vine))
-        split -= split_leverage(*like)
-    sample = scaled(DAMPING, scatter, SCATTER_DOF)
-    facts = {"printed": 100 * damping_scatter(), "here": 100 * scatter, "dof": SCATTER_DOF}
-    sources.add_uncertainty("guess of B", f"B scatter|{trial.vine}", sample, "printed_B_scatter", **facts)
-    if abs(split) > 1e-9:
-        split_sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
-        facts, sample = (
-            {"sigma": split_sigma, "here": 100 * abs(split) * split_sigma},
-            scaled(DAMPING, split * split_sigma),
-        )
-        sources.add_uncertainty("t against D", "B split", sample, "one_t_over_D", **facts)
-
-
-def _printed_scale(trial: Trial) -> int | None:
-    """Scale R of the printed vine of exactly this size; None for other sizes, which use the scaling prior."""
-    size = trial.diameter_m, trial.thickness_m
-    return next((scale for scale, printed in _printed_sizes().items() if alike(printed, size)), None)
-
-
-def _exponent(sources: _Sources, stated: StatedValues) -> None:
-    place, sigma = sources.fit.place(EXPONENT) if sources.fit else None, exponent_sigma()
-    if math.isfinite(stated.n):
-        sources.set(EXPONENT, stated.n, "given")
-        if stated.n_error > 0:
-            sample = shifted(EXPONENT, stated.n_error)
-            sources.add_uncertainty("error of n", "n given", sample, "n_given", error=stated.n_error)
-    elif place is not None:
-        sources.set_fitted(EXPONENT, place)
-    else:
-        sources.set_printed(EXPONENT, published.EXPONENT)
-        sources.add_uncertainty("error of n", "n printed", shifted(EXPONENT, sigma), "n_printed", error=sigma)
-
-
-def _yield_pressure(sources: _Sources, anchor: tuple[str, bool]) -> None:
-    vine, is_same = anchor
-    trial, fit = sources.trial, sources.fit
-    stated, sigma = trial.yield_pressure_Pa, max(np.nan_to_num(trial.yield_pressure_sigma_Pa), 0.0)
-    place = yield_place(fit, vine, stated) if fit and is_same else None
-    printed_Pa = 1000 * published.YIELD_PRESSURE_KPA
-    if fit is not None and place is not None and math.isfinite(stated):
-        # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
-        tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
-        place = place if abs(stated - float(fit.mean[place])) <= max(tolerance, 1.0) else None
-    if place is not None:
-        sources.set_fitted(YIELD, place)
-    elif math.isfinite(stated):
-        sources.set(YIELD, stated, "given")
-        if sigma > 0:
-            sample = shifted(YIELD, sigma)
-            sources.add_uncertainty("stated P_y", f"P_y stated|{trial.vine}", sample, "P_y_stated", kPa=sigma / 1e3)
-    elif _printed_scale(trial) == 4:  # the vine whose yield pressure is printed
-        rounding_Pa = 1000 / math.sqrt(12)
-        sources.set_printed(YIELD, printed_Pa)
-        sample = shifted(YIELD, rounding_Pa)
-        sources.add_uncertainty("printed P_y", "P_y printed", sample, "P_y_printed", kPa=rounding_Pa / 1e3)
-    else:
-        sources.set(YIELD, printed_Pa, "P_y_guessed")
-        # Nine of ten vines within a factor of 3
-        sample = scaled(YIELD, math.log(3.0) / float(ndtri(0.95)))
-        sources.add_uncertainty("guess of P_y", "P_y guess", sample, "P_y_guess", kPa=published.YIELD_PRESSURE_KPA)
-
-
-def _other_parameters(sources: _Sources, stated: StatedValues, model: Model, anchor: tuple[str, bool]) -> None:
-    """Parameters of all other effects: as stated, as fitted, or at their typical size."""
-    for effect in model:
-        for parameter in effect.parameters:
-            name = f"{effect.name}.{parameter.name}"
-            if name in sources.values:
-                continue
-            size = stated.sizes.get(name)
-            place = sources.fit.place(name, anchor[0]) if sources.fit else None
-            if size is not None:
-                sources.set(name, size.middle, "given")
-                low, high = parameter.plausible or parameter.bounds
-                if size.low < low or size.high > high:
-                    facts = {"low": low, "high": high, "unit": "" if parameter.unit == "1" else f" {parameter.unit}"}
-                    sources.notes.append(remark("implausible", symbol=parameter.symbol, effect=effect.name, **facts))
-                if size.high > size.low:
-                    title = f"{parameter.symbol} ({effect.name})"
-                    facts = {"symbol": parameter.symbol, "effect": effect.name, "low": size.low, "high": size.high}
-                    sources.add_uncertainty(title, name, _uniform(name, size), "uniform", **facts)
-            elif place is not None:
-                sources.set_fitted(name, place)
-            else:
-                sources.set(name, parameter.default, "constant" if parameter.held else "typical_size")
-
-
-def _joint_draw_of_fit(sources: _Sources) -> None:
-    """Draw all inputs that the fit provides jointly, with their covariance."""
-    fit = sources.fit
-    if fit is None or not sources.from_fit:
-        return
-    names, places = list(sources.from_fit), list(sources.from_fit.values())
-    covariance = fit.covariance[np.ix_(places, places)]
-    log = fit.log[places]
-
-    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-        size = next(iter(draws.values())).size
-        deviations = draw.multivariate_normal(np.zeros(len(places)), covariance, size, method="svd")
-        moved = {
-            name: draws[name] * np.exp(deviations[:, k]) if log[k] else draws[name] + deviations[:, k]
-            for k, name in enumerate(names)
-        }
-        return {**draws, **moved}
-
-    symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
-    shown = ", ".join(symbols.get(name, name) for name in names)
-    why = remark("with_covariance", names=shown, source=fit.source, count=fit.n_trials)
-    sources.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", sample))
-    if fit.open:
-        sources.notes.append(remark("not_determined", source=fit.source, names=", ".join(fit.open)))
-
-
-def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[float, float]:
-    """Relative between-trial standard deviations of pressure and B; both become uncertainties."""
-    # Relative between-trial standard deviations of pressure and B (chosen)
-    pressure_spread, damping_spread = 0.01, 0.03
-    fit, trial = sources.fit, sources.trial
-    stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else pressure_spread
-    pressure = stated if math.isfinite(stated) else pressure_spread
-    dof: Mapping[str, float] = {}
-    damping, origin = damping_spread, "assumed"
-    if stated_values.spreads is not None:
-        (pressure, damping), origin = stated_values.spreads, "given"
-    elif fit is not None and fit.spreads:
-        pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
-        origin, dof = f"estimated in {fit.source}", fit.spread_dof
-    sources.set(PRESSURE, trial.pressure_Pa, "set")
-    dof_of_pressure = dof.get("pressure", math.inf)
-    relative = _varied(PRESSURE, lambda P, draw: P * (1 + pressure * _deviates(draw, P.size, dof_of_pressure)))
-    for symbol, spread, sampler in (
-        ("P", pressure, relative),
-        ("B", damping, scaled(DAMPING, damping, dof.get("B", math.inf))),
-    ):
-        if spread > 0:
-            title, key = f"{symbol} from trial to trial", f"{symbol} trial|{trial.vine}"
-            sources.add_uncertainty(title, key, sampler, "spread", origin=origin, percent=100 * spread)
-    return pressure, damping
 
 
 # ------------------------------------------------------------------------------
@@ -684,20 +629,17 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
         return []
     psi = convert(1.0, "psi", "kPa")
     factor, wrong, right = (psi, "psi, not kPa", "psi") if as_stated < 1 else (1 / psi, "kPa, not psi", "kPa")
-    in_unit = f"{wrong} (1 psi is {psi:.4g} kPa)", "in the other unit", f"name the column pressure_{right}"
+    other_unit = f"{wrong} (1 psi is {psi:.4g} kPa)", "in the other unit", f"name the column pressure_{right}"
+    absolute = (
+        "absolute pressure",
+        "after the ambient pressure is subtracted",
+        "state gauge pressure, relative to the ambient pressure",
+    )
     gauge = [(replace(t, pressure_Pa=t.pressure_Pa - t.ambient_pressure_Pa), speed) for t, speed in pairs]
     converted = [(replace(t, pressure_Pa=factor * t.pressure_Pa), speed) for t, speed in pairs]
     with_yield = [(replace(t, yield_pressure_Pa=factor * t.yield_pressure_Pa), speed) for t, speed in converted]
-    for meant, what, how, remedy in (
-        (
-            gauge if all(trial.pressure_Pa > 0 for trial, _ in gauge) else [],
-            "absolute pressure",
-            "after the ambient pressure is subtracted",
-            "state gauge pressure, relative to the ambient pressure",
-        ),
-        (converted, *in_unit),
-        (with_yield, *in_unit),
-    ):
+    gauge = gauge if all(trial.pressure_Pa > 0 for trial, _ in gauge) else []
+    for meant, (what, how, remedy) in ((gauge, absolute), (converted, other_unit), (with_yield, other_unit)):
         ratio = _middle_ratio(meant)
         if 1 / near < ratio < near:
             message = (
