@@ -37,6 +37,7 @@ from vinetrack.inference.marginal_likelihood import (
     solve_per_trial,
 )
 from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
+from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
@@ -674,9 +675,10 @@ def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, th
             whole = Predictor(layout, quick.data, quick.host)
             whole.steps = quick.new.steps.copy()
         solution = solve(whole, problem, solution.state, warm=True, most_iterations=most)
+        smooth = smooth_errors(whole, solution)  # which absorb part of what is wrong in a hypothesis, as in every fit
     except SimulationError:
         return math.nan
-    return -2 * solution.log_likelihood()
+    return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))
 
 
 def _extended_layout(hypothesis: Hypothesis, places: Sequence[int]) -> ParameterMap:
