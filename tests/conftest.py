@@ -1,7 +1,5 @@
 """What every test has in common: nothing is remembered beyond a test, so that their order does not matter."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Generator

@@ -1,7 +1,5 @@
 """The package keeps its shape: budgets, imports that flow one way, importing that does nothing, documented names."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """Pages and docstrings: links lead somewhere, commands exist and print what is shown, examples run."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import json

@@ -1,7 +1,5 @@
 """A whole experiment of analytic truth, from sheet and tracks to the report, by Snakemake and stage by stage."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -3,8 +3,6 @@
 The truth is the motion that the virtual laboratory's camera filmed; the analysis sees files alone.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

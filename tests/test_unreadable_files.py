@@ -1,7 +1,5 @@
 """What is no readable file fails its own trial, in a sentence; nothing waits for it; random bytes raise our errors."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """The command line: exit codes and files written; `diagnose`, `add` and `propose` on campaigns of known truth."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

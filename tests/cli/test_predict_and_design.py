@@ -1,7 +1,5 @@
 """`vinetrack predict` and `vinetrack design`: numbers, files, refusals."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Linear algebra of fits uses one thread, and gives the others back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits

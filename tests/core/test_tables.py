@@ -1,7 +1,5 @@
 """Tables in every dialect, strict numbers, safe paths, whole files or none; a key of YAML set in place."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

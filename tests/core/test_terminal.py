@@ -1,7 +1,5 @@
 """Bars and colour on a terminal alone, and what is said of compilation."""
 
-from __future__ import annotations
-
 import io
 import tempfile
 from typing import Any

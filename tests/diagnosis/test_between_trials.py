@@ -1,7 +1,5 @@
 """Wear, tubes and exponents that differ between trials are named as such, and physics keeps its name beside them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace

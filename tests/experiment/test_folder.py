@@ -1,7 +1,5 @@
 """An experiment folder read whole and checked: what becomes a trial, what fails one, and what stops all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import replace

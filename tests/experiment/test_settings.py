@@ -1,7 +1,5 @@
 """Settings of an experiment and of a run, refused with key and line; the reference lists what is read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a sheet says of trials: conditions and order, columns of one trial alone, corrections; and of planned ones."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

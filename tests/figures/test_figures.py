@@ -1,7 +1,5 @@
 """Figures of trials, conditions and predictions, from tables written by hand: values drawn, nothing cut off."""
 
-from __future__ import annotations
-
 import math
 
 import matplotlib.colors as mcolors

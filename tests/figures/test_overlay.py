@@ -1,7 +1,5 @@
 """Clips, strips and the histogram within a pixel: every edge at its position and in its colour."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ test does not name.
 Nothing here but `simulated` uses the package's own physics.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Files as high-speed cameras write them, byte by byte from the vendors' descriptions, without the package."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

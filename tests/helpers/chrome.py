@@ -3,8 +3,6 @@
 What the page complains of and everything it asks the network for is kept, for a test to look at.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json
@@ -16,7 +14,7 @@ import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
@@ -68,7 +66,7 @@ class Chrome:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
             return [page for page in json.load(answer) if page["type"] == "page"]
 
-    def __enter__(self) -> Chrome:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

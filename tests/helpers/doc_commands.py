@@ -1,7 +1,5 @@
 """Commands that a page shows with what they print: `$ vinetrack …` in an indented block, its output below it."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable, Container

@@ -1,7 +1,5 @@
 """What every figure must hold: nothing cut off at its edge, and no legend over its axes."""
 
-from __future__ import annotations
-
 from matplotlib.figure import Figure
 
 from vinetrack.figures.style import look

@@ -1,7 +1,5 @@
 """Campaigns from the virtual laboratory for the tests of where a model fails and what drifts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

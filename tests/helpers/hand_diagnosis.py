@@ -1,7 +1,5 @@
 """Diagnoses written by hand, in the shape of `diagnosis.json`: one of every verdict, and one that was refused."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Vines grown by scipy, for tests: Eq. (2) of the physics written out once more, nothing of the package's own model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -3,8 +3,6 @@
 `python tests/helpers/notebook.py docs/python.ipynb` runs one and writes its outputs into it.
 """
 
-from __future__ import annotations
-
 import ast
 import base64
 import contextlib

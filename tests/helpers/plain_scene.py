@@ -4,8 +4,6 @@ A truth of another hand than the laboratory's: no import of `vinetrack`, another
 `plain_scene` draws frames in memory, `write_video` and `write_images` put them in files.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path

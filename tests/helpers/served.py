@@ -1,7 +1,5 @@
 """A command that serves a page, in a separate process; user actions on the explorer's page in a browser."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess
@@ -11,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from chrome import Chrome, end, until
 
@@ -56,7 +54,7 @@ class Served:
         self._reader.join(10)
         return status
 
-    def __enter__(self) -> Served:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

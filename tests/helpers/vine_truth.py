@@ -4,8 +4,6 @@ m(x) ẍ = ½(P − P_y)A + m g − ½B ẋⁿ with m = λL + m_pay − (λ/2)x,
 integrators or effects take part.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,8 +1,6 @@
 """A results folder in memory: the same quantity has one value in files, report, command line, explorer and Python; the
 story of the README and the notebook of the documentation run on it."""
 
-from __future__ import annotations
-
 import html
 import json
 import math

@@ -1,7 +1,5 @@
 """F = B·x_ssⁿ: the fit, the fit under a model of the pressure, and how its numbers and others change with size."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Release, and the force in a steady window, against sums by hand and vines of known release."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Steady windows against vines integrated by SciPy and against formulas. Scored on seeds 1000 up (tuned on 0–99)."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

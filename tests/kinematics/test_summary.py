@@ -1,7 +1,5 @@
 """One trial from its track to a row, replicates put together, and efficiency, against SciPy and sums by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ They live in `benchmarks/hidden`, share no code with the package's own laborator
 `benchmarks/laboratories.py`. Seeds from 20900 on are these tests'.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The virtual laboratory as tracks: repeatable, with the statistics it states, its truth out of the analysis' sight."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

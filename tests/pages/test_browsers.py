@@ -1,7 +1,5 @@
 """Both pages in a real browser: fill in, drag, track, refit, save; by keyboard, narrow, dark."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The explorer below its page: predictions of a choice, background fits, recordings, its local server."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """The explorer's page without a browser: what a user does, the numbers shown, and the effect proposed."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The set-up page without a browser: names, drafts, pasted blocks, and answers of its server."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

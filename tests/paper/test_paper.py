@@ -1,7 +1,5 @@
 """The paper's numbers: its own arithmetic, its figures found in an experiment, and what departures would cause."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The model in use on a results folder: columns, refusals, tracks read back, recordings along another axis."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterable, Sequence

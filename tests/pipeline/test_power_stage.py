@@ -1,7 +1,5 @@
 """`vinetrack power` on a sheet that nobody has filmed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pandas as pd

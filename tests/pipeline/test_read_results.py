@@ -1,7 +1,5 @@
 """What a results folder holds, read back: fit, diagnosis and its tables, pictures, contradictions of the sheet."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """One recording tracked by command, and clips drawn from a results folder."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

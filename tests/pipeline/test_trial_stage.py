@@ -1,7 +1,5 @@
 """The stage of the trials on recordings: what is tracked again after which change, and after a kill."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """What the Snakefile is told, `vinetrack run`, and whose lock is whose."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

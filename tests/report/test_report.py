@@ -1,7 +1,5 @@
 """The report, from tables written by hand: one file, every part where it belongs, no external requests."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

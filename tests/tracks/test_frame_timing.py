@@ -1,7 +1,5 @@
 """Repeated and dropped frames put into vines integrated by SciPy. Scored on seeds 1000 and up (tuned on 0–99)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Positions and pressures measured elsewhere: CSV, Physics Tracker, TDMS, written by hand here."""
 
-from __future__ import annotations
-
 import io
 import os
 from pathlib import Path

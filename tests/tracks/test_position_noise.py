@@ -1,7 +1,5 @@
 """Noise and outliers of a track against known ones; seeds 1000 and 20000 and up, which tuned nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

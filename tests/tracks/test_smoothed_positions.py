@@ -1,7 +1,5 @@
 """Smoothed positions are distinguished from others; seeds 351 and up, which tuned nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hidden.laboratory_folder import write_experiment

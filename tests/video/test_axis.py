@@ -1,7 +1,5 @@
 """The growth axis and the strip along it: what is growth, where pixels belong, flicker and shake."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -3,8 +3,6 @@
 The truth is the motion that the virtual laboratory filmed, and the same recording undamaged.
 """
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

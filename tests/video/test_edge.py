@@ -1,7 +1,5 @@
 """The leading edge against the truth of recordings drawn by other code; seeds that tuned nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Long recordings: only the frames about the event are decoded, and the track is the one of the whole recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

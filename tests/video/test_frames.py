@@ -1,7 +1,5 @@
 """Reading recordings, those of high-speed cameras too: every value and every frame, rate and exposure."""
 
-from __future__ import annotations
-
 import struct
 import threading
 import zlib

@@ -1,7 +1,5 @@
 """Recordings made by others, read from the folder that VINETRACK_REAL_DATA names; skipped where it is unset."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Clips: what goes in comes out, in the same colours, and nothing half-written is left."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av
