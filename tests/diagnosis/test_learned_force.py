@@ -126,6 +126,9 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     moved, sped = inversion.integrate_responses(time_s, *pushed, inversion.SDIRK_GAMMA)
     assert moved[0, :, 0] == pytest.approx((1 - np.cos(omega * time_s[0])) / omega**2, abs=1e-4 / omega**2)
     assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
+    # A spring far too stiff for the steps is at rest there: the method is L-stable.
+    stiff, _ = inversion.integrate_responses(time_s, -1e10 + 0 * time_s, *pushed[1:], inversion.SDIRK_GAMMA)
+    assert stiff[0, -1, 0] == pytest.approx(1e-10)
 
 
 def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):

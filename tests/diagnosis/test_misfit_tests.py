@@ -18,15 +18,6 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.diagnosis import ladder, score_test, selection
 from vinetrack.diagnosis import misfit_tests as questions
-from vinetrack.diagnosis import score_test as hypotheses
-from vinetrack.diagnosis.misfit_tests import (
-    CAREFUL_DAMPING_SCATTER,
-    STRETCH_FRAMES,
-    between_conditions_p,
-    has_excess_scatter,
-    misfit_tests,
-    noise_in_motion_p,
-)
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
@@ -47,7 +38,7 @@ def careful(payload_g: float, seed: int) -> Pairs:
 def questioned(pairs: Pairs, model: vt.Model, level: float = FIRST):
     candidates = ladder.candidates_of(model, None, None)
     found = vt.fit(model, pairs, host=ladder.host_for(model, candidates), profile=False)
-    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], level)
+    return questions.misfit_tests(found, score_test.testable(candidates, found.predictor.data)[0], level)
 
 
 def misweighed() -> Pairs:
@@ -73,7 +64,7 @@ def test_a_doubt_shared_by_trials_is_no_missing_effect_unless_it_is_left_out(mak
     asked = questioned(make(), vt.base_model())
     assert not asked.rejects_model
     monkeypatch.setattr(questions, "systematics_of", none)
-    assert misfit_tests(asked.fit, asked.effects, FIRST).rejects_model
+    assert questions.misfit_tests(asked.fit, asked.effects, FIRST).rejects_model
 
 
 def through_a_lens(allowance_m: float) -> Pairs:
@@ -189,14 +180,14 @@ def wandering(*, at_rest: bool) -> Pairs:
 
 
 def test_replicates_that_deviate_together_are_seen():
-    assert between_conditions_p(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
+    assert questions.between_conditions_p(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
 
 
 @pytest.mark.slow
 def test_replicates_that_scatter_and_noise_that_is_the_same_at_rest_are_none():
     complete = [fitted(grown(seed=seed)) for seed in (32, 33, 34)]
-    assert all(between_conditions_p(fit) > 0.05 for fit in complete)
-    assert all(noise_in_motion_p(fit) > 1e-2 for fit in [*complete, fitted(wandering(at_rest=True))])
+    assert all(questions.between_conditions_p(fit) > 0.05 for fit in complete)
+    assert all(questions.noise_in_motion_p(fit) > 1e-2 for fit in [*complete, fitted(wandering(at_rest=True))])
 
 
 def test_a_scatter_that_replicates_have_too_is_none_of_the_model():
@@ -204,17 +195,17 @@ def test_a_scatter_that_replicates_have_too_is_none_of_the_model():
     trials = with_names(campaign(isometric_vine(4), (14, 17, 20, 24, 28, 33), 2, prefix="a"))
     loose = fitted(of_another_film({}, 0.08, trials))
     bent = fitted(of_another_film({17: 0.6, 24: 1.5}, 0.02, trials))
-    assert min(loose.state.spread[1], bent.state.spread[1]) > CAREFUL_DAMPING_SCATTER
-    assert not has_excess_scatter(loose)
-    assert has_excess_scatter(bent)
+    assert min(loose.state.spread[1], bent.state.spread[1]) > questions.CAREFUL_DAMPING_SCATTER
+    assert not questions.has_excess_scatter(loose)
+    assert questions.has_excess_scatter(bent)
 
 
 @pytest.mark.parametrize("replicate", [0, 1])
 def test_without_replicates_a_scatter_may_be_that_of_the_model(replicate):
     fit = fitted(of_another_film({}, 0.08)[replicate::2])
     assert len({trial.trial.condition for trial in fit.trials}) == len(fit.trials)
-    assert fit.state.spread[1] > CAREFUL_DAMPING_SCATTER
-    assert has_excess_scatter(fit)
+    assert fit.state.spread[1] > questions.CAREFUL_DAMPING_SCATTER
+    assert questions.has_excess_scatter(fit)
 
 
 def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model():
@@ -225,17 +216,17 @@ def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model()
         replace(trial, damping_deviation=float(np.expm1(0.05 * draw.standard_normal() + 0.02 * (-1) ** (k % 12 // 2))))
         for k, trial in enumerate(50 * fit.trials)
     ]
-    assert not has_excess_scatter(replace(fit, trials=tuple(trials)))
+    assert not questions.has_excess_scatter(replace(fit, trials=tuple(trials)))
 
 
 def test_what_is_louder_in_motion_than_at_rest_is_heard_where_positions_do_not_come_from_a_film():
     spoilt = wandering(at_rest=False)
-    assert noise_in_motion_p(fitted(spoilt)) < 1e-5
+    assert questions.noise_in_motion_p(fitted(spoilt)) < 1e-5
     filmed = [
         (replace(t, video=Path("filmed.mp4")), replace(x, lead_position_systematic_m=np.full(x.time_s.size, 1e-4)))
         for t, x in spoilt
     ]
-    assert noise_in_motion_p(fitted(filmed)) == 1.0
+    assert questions.noise_in_motion_p(fitted(filmed)) == 1.0
 
 
 @pytest.mark.parametrize(("heavy", "most"), [(False, 0.02), (True, 0.04)])
@@ -243,12 +234,12 @@ def test_heavy_tails_alone_are_not_louder_in_motion(heavy, most):
     """600 campaigns in which nothing differs: few alarms at 1 %, also where single stretches are far louder."""
     draw, alarms = np.random.default_rng(20732), 0
     for _ in range(600):
-        white = draw.standard_normal((12, 16, STRETCH_FRAMES))
+        white = draw.standard_normal((12, 16, questions.STRETCH_FRAMES))
         if heavy:
             white /= np.sqrt(draw.chisquare(5, (12, 16, 1)) / 5)
         trials = [SimpleNamespace(whitened=one.ravel()) for one in white]
         seen = {"slow_m": None, "gauge_error": 0.0, "noise_m": 1e-4, "lead_position_m": np.array([0.0, 0.3])}
-        data = SimpleNamespace(n_rest=8 * STRETCH_FRAMES, **seen)
+        data = SimpleNamespace(n_rest=8 * questions.STRETCH_FRAMES, **seen)
         fit = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
-        alarms += noise_in_motion_p(fit) < 0.01
+        alarms += questions.noise_in_motion_p(fit) < 0.01
     assert alarms / 600 < most

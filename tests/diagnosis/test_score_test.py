@@ -10,16 +10,8 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import vinetrack as vt
+from vinetrack.diagnosis import likelihood_ratio as ratios
 from vinetrack.diagnosis import misfit_tests, score_test
-from vinetrack.diagnosis.likelihood_ratio import (
-    LikelihoodRatio,
-    answer_set,
-    likelihood_ratio,
-    log_evidence,
-    posterior_weights,
-    prior_penalty,
-    weights_of,
-)
 from vinetrack.diagnosis.misfit_tests import MisfitTests, structure_from_scores
 from vinetrack.diagnosis.score_test import Scores
 from vinetrack.effects import Parameter, catalogue
@@ -197,23 +189,23 @@ def known_fit(log_likelihood: float, *numbers: fit_result.Number) -> Any:
     return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, **known)
 
 
-def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> LikelihoodRatio:
+def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> ratios.LikelihoodRatio:
     known = (catalogue()[name],), known_fit(log_likelihood), 50.0, 7.0, True, ""
-    return LikelihoodRatio(*known, inflation=inflation, log_evidence=log_likelihood - 2)
+    return ratios.LikelihoodRatio(*known, inflation=inflation, log_evidence=log_likelihood - 2)
 
 
 @pytest.mark.parametrize(("inflation", "names"), [(1.0, ["air_drag"]), (4.0, ["air_drag", "inlet_loss"])])
 def test_hypotheses_are_excluded_by_less_where_trials_scatter_more(inflation, names):
     both = [hypothesis("air_drag", -100.0, inflation), hypothesis("inlet_loss", -110.0)]
-    assert [one.label for one in answer_set(both)[0]] == names
-    weights = weights_of(both)
+    assert [one.label for one in ratios.answer_set(both)[0]] == names
+    weights = ratios.weights_of(both)
     assert weights["inlet_loss"] / weights["air_drag"] == pytest.approx(math.exp(-10 / inflation))
 
 
 @pytest.mark.parametrize(("values", "named"), [([0.5], True), ([2.0], False), ([0.5, 2.0], False), ([0.5, 0.4], True)])
 def test_a_size_smaller_than_its_error_in_every_vine_is_compatible_with_none(values, named):
     after = known_fit(-100.0, *(number_of("air_drag.C_D", value, 0.8) for value in values))
-    found = likelihood_ratio(known_fit(-120.0), [vt.effects.air_drag], after)
+    found = ratios.likelihood_ratio(known_fit(-120.0), [vt.effects.air_drag], after)
     assert (found.reason.code == "size_may_be_zero") == named
     assert found.credible != named
 
@@ -225,7 +217,7 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(rati
     after.trials, after.predictor, after.solution = (None,) * 12, None, None
     scattered = (np.diag([0.01]), np.diag([0.01 * ratio**2]))
     monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_covariance", lambda *_: scattered)
-    found = likelihood_ratio(known_fit(-150.0), [vt.effects.air_drag], after)
+    found = ratios.likelihood_ratio(known_fit(-150.0), [vt.effects.air_drag], after)
     assert found.delta_chi2 == pytest.approx(100.0)
     assert found.sigma == pytest.approx(10.0 / max(ratio, 1.0))
     assert found.inflation == pytest.approx(inflation)
@@ -311,17 +303,17 @@ def test_the_marginal_likelihood_is_the_integral_over_the_prior(value, sigma):
         return math.exp(-10 - 0.5 * ((delta - value) / sigma) ** 2) * norm.pdf(delta, 0.0, 1e3)
 
     whole, _ = quad(inside, -2e4, 2e4, points=[value - 3 * sigma, value, value + 3 * sigma, 0.0], epsabs=0, limit=300)
-    assert log_evidence(fitted(value, sigma), GAUGE) == pytest.approx(math.log(whole), abs=1e-6)
+    assert ratios.log_evidence(fitted(value, sigma), GAUGE) == pytest.approx(math.log(whole), abs=1e-6)
 
 
 def test_a_gauge_seven_kilopascals_off_is_a_surprise_one_within_two_is_none_and_one_unknown_costs_nothing():
     # z² = 7.1² / (1.7² + 1²) = 12.96 with a prior of 1 kPa; less 4 at the edge of the plausible range.
-    assert prior_penalty(fitted(7.1e3, 1.7e3), GAUGE) == pytest.approx(12.96 - 4, abs=0.01)
-    assert prior_penalty(fitted(1.9e3, 100.0), GAUGE) == 0
-    assert prior_penalty(fitted(7.1e3, 5e3), GAUGE) == 0
-    assert log_evidence(fitted(0.0, 1e7), GAUGE) == pytest.approx(-10, abs=1e-6)
-    assert posterior_weights([-10.0, -10.0 - math.log(3), -800.0]) == pytest.approx([0.75, 0.25, 0.0])
-    assert posterior_weights([]) == []
+    assert ratios.prior_penalty(fitted(7.1e3, 1.7e3), GAUGE) == pytest.approx(12.96 - 4, abs=0.01)
+    assert ratios.prior_penalty(fitted(1.9e3, 100.0), GAUGE) == 0
+    assert ratios.prior_penalty(fitted(7.1e3, 5e3), GAUGE) == 0
+    assert ratios.log_evidence(fitted(0.0, 1e7), GAUGE) == pytest.approx(-10, abs=1e-6)
+    assert ratios.posterior_weights([-10.0, -10.0 - math.log(3), -800.0]) == pytest.approx([0.75, 0.25, 0.0])
+    assert ratios.posterior_weights([]) == []
 
 
 def test_any_phase_of_a_swing_is_plausible():
