@@ -24,9 +24,7 @@ from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
 
 
-def planned(
-    replicates: int, spreads=(0.01, 0.03), kPa=(14, 24, 34), candidates=CANDIDATES, **cells: str
-) -> CampaignDesign:
+def planned(replicates, spreads=(0.01, 0.03), kPa=(14, 24, 34), candidates=CANDIDATES, **cells) -> CampaignDesign:
     trials: list[Trial] = []
     known = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "yield_pressure_kPa": "3", **cells}
     for pressure in kPa:

@@ -119,9 +119,7 @@ def callable_parts(effects: tuple[Effect, ...]) -> tuple:
     return njit(lambda arrays: first_chamber(arrays)), acceleration
 
 
-def accelerations(
-    model: vt.Model, trial: Trial, time: np.ndarray, y: np.ndarray, v: np.ndarray, chamber: np.ndarray | None = None
-) -> list[float]:
+def accelerations(model: vt.Model, trial: Trial, time, y, v, chamber=None) -> list[float]:
     chamber_at_release, acceleration = callable_parts(model.effects)
     theta = model.parameters_for(trial.vine)
     on, rig = effects_on(model, theta[None])[0], np.array(TrialInputs.of(trial))

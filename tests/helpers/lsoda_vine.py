@@ -1,7 +1,6 @@
 """Vines grown by scipy, for tests: Eq. (2) of the physics written out once more, nothing of the package's own model."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -25,14 +24,7 @@ def vine_trial(name: str, pressure_kPa: float, diameter_mm: float = 24.0, **more
     return replace(vine.trial(name, pressure_kPa, capture_fps=FPS), **more)  # type: ignore[arg-type]
 
 
-def grown_position(
-    trial: Trial,
-    time_s: np.ndarray,
-    B: float,
-    n: float = N_TRUE,
-    pressure_gain: float = 1.0,
-    pressure_along: Callable[[float], float] | None = None,
-) -> np.ndarray:
+def grown_position(trial: Trial, time_s, B: float, n=N_TRUE, pressure_gain=1.0, pressure_along=None) -> np.ndarray:
     """Lead position at times since release, NaN beyond 96 % of the length; x and ẋ are those of the tail.
 
     `pressure_along` gives the gauge pressure by lead position, in place of the set one.
@@ -59,9 +51,7 @@ def ar1(count: int, rho: float, draw: np.random.Generator) -> np.ndarray:
     return ar1_noise(count, 1.0, rho, draw)
 
 
-def filmed(
-    trial: Trial, draw: np.random.Generator, *, damping: float = 1.0, pressure: float = 1.0, rho: float = 0.0
-) -> tuple[Track, float, float]:
+def filmed(trial: Trial, draw, *, damping=1.0, pressure=1.0, rho=0.0) -> tuple[Track, float, float]:
     """A track of a trial whose B and P are off by these factors, its release, s, and its origin, m."""
     release_s = (20 - draw.uniform()) / FPS
     origin_m = float(draw.uniform(-0.05, 0.05))
@@ -73,16 +63,9 @@ def filmed(
     return as_track(time_s[seen], origin_m + position[seen] + noise), release_s, origin_m
 
 
-def small_campaign(
-    seed: int, damping: float = 0.03, pressure: float = 0.01, rho: float = 0.0, replicates: int = 2
-) -> tuple[list[tuple[Trial, Track]], list[dict[str, float]]]:
-    """Two vines, four pressures; sheet and tracks, and the truth of every trial."""
-    pairs, truth = _small_campaign(seed, damping, pressure, rho, replicates)
-    return list(pairs), list(truth)
-
-
 @lru_cache(maxsize=32)
-def _small_campaign(seed: int, damping: float, pressure: float, rho: float, replicates: int) -> tuple[list, list]:
+def small_campaign(seed: int, damping=0.03, pressure=0.01, rho=0.0, replicates=2) -> tuple[tuple, tuple]:
+    """Two vines, four pressures; sheet and tracks, and the truth of every trial."""
     draw = np.random.default_rng(seed)
     trials = [
         vine_trial(f"D{D:g}_{P:g}_{k}".replace(".", "p"), P, D)
@@ -97,4 +80,4 @@ def _small_campaign(seed: int, damping: float, pressure: float, rho: float, repl
         track, release_s, origin_m = filmed(trial, draw, damping=B_off, pressure=P_off, rho=rho)
         pairs.append((trial, track))
         truth.append({"damping": B_off, "pressure": P_off, "release_s": release_s, "origin_m": origin_m})
-    return pairs, truth
+    return tuple(pairs), tuple(truth)

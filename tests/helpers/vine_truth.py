@@ -10,18 +10,15 @@ from functools import lru_cache
 
 import numpy as np
 from by_hand import followed
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from vinetrack.core.records import Track, plain_track
+from vinetrack.core.records import Floats, Track, plain_track
 
 G = 9.81
 N_EXPONENT = 0.37
 B_PRINTED = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}
 CAPTURE_FPS = 1069.0
 make_track = plain_track
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -88,15 +85,7 @@ def ar1(n: int, sd: float, rho: float, rng: np.random.Generator) -> Floats:
     return lfilter([1.0], [1.0, -rho], innovations)[60:]
 
 
-def record(
-    vine: Vine,
-    rng: np.random.Generator,
-    *,
-    noise_m: float,
-    rho: float = 0.0,
-    rest_frames: int = 40,
-    end_frames: int = 0,
-) -> Recording:
+def record(vine: Vine, rng, *, noise_m: float, rho=0.0, rest_frames=40, end_frames=0) -> Recording:
     """Sample a vine: still frames before release, `end_frames` flat ones once it is grown, arbitrary zeros."""
     solution, duration_s = motion(vine)
     release_s = (rest_frames + rng.uniform()) / CAPTURE_FPS

@@ -23,9 +23,7 @@ def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
     return np.asarray(sigma**2 * toeplitz(rho ** np.arange(count)))
 
 
-def given(
-    n_trials: int, count: int, keys: int, spread: float = 1e-5, *, rho: float = RHO, sigma: float = SIGMA, **more
-) -> tuple[marginal.MixedProblem, marginal.FitState]:
+def given(n_trials: int, count: int, keys: int, spread=1e-5, *, rho=RHO, sigma=SIGMA, **more):
     """A problem whose releases and origins are free, only B deviates and nothing has bounds or priors; its state."""
     own = {"has_deviation": np.tile([False, True], (n_trials, 1)), "gauge_error": np.zeros(n_trials)}
     own |= {"index": np.tile(np.arange(keys), (n_trials, 1)), "release_origin_mean": np.zeros((n_trials, 2))}

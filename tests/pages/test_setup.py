@@ -208,9 +208,7 @@ def server(clips):
         yield made
 
 
-def ask(
-    server: SetupServer, path: str, body: Any = None, headers: dict[str, str] = OURS, secret: str | None = None
-) -> tuple[int, bytes, str]:
+def ask(server: SetupServer, path: str, body=None, headers=OURS, secret=None) -> tuple[int, bytes, str]:
     with contextlib.closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)) as connection:
         method, data = ("GET", None) if body is None else ("POST", json.dumps(body))
         connection.request(method, (server.secret if secret is None else secret) + path, data, headers)

@@ -118,9 +118,7 @@ FIVE = {f"t{k}": LEVEL for k in range(5)}
         ({"t0": LEVEL, "t1": DOOR, "t2": LEVEL, "t3": DOOR}, set()),  # no majority
     ],
 )
-def test_a_recording_along_another_axis_than_most_fails_with_its_remedy_and_enters_no_fit(
-    tracked, tmp_path, axes, failed
-):
+def test_a_recording_along_another_axis_than_most_fails_and_enters_no_fit(tracked, tmp_path, axes, failed):
     experiment, results = tracked[0], Results(shutil.copytree(tracked[1], tmp_path / "results"))
     for name, axis in axes.items():
         path = results.analysed(name)
