@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -452,8 +451,6 @@ def test_steps_and_values_of_a_fit_stay_through_its_diagnosis(plain):
     np.testing.assert_array_equal(plain.solution.state.theta, theta)
 
 
-REAL = os.environ.get("VINETRACK_REAL_DATA", "")
-needs_recordings = pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
 DRAG = 0.5
 TUBES_ALONE = {"capstan_friction", "gas_inertia", "tail_friction", "latch_release", "fold_inertia", "wall_stretch"}
 
@@ -518,18 +515,16 @@ def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_
 
 
 @pytest.mark.real
-@needs_recordings
-def test_the_drag_of_eight_real_paper_cups_is_named():
-    found = vt.diagnose(Path(REAL) / "falling_cups", ladder=False, advice=False)
+def test_the_drag_of_eight_real_paper_cups_is_named(real):
+    found = vt.diagnose(real / "falling_cups", ladder=False, advice=False)
     assert (found.verdict, found.effects) == ("missing", ("air_drag",))
     assert found.fits[-1]["C_D"].value == pytest.approx(1.24, abs=0.03)
 
 
 @pytest.mark.real
-@needs_recordings
-def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_mends_most_of_it(tmp_path):
+def test_a_real_tube_that_sticks_and_slips_is_not_called_adequate_and_friction_mends_most_of_it(real, tmp_path):
     """Its authors fit a pressure to start above one to stop, and drag that rises with the length."""
-    sticking = [one for one in read_recordings(Path(REAL) / "everting_tube") if one.name == "tube2_hi_2"]
+    sticking = [one for one in read_recordings(real / "everting_tube") if one.name == "tube2_hi_2"]
     experiment = vt.read_experiment(write_folder(sticking, tmp_path))
     # Whether a model is adequate is decided before any candidate is tried.
     assert vt.diagnose(experiment, candidates=("tail_friction",), ladder=False, advice=False).verdict != "adequate"

@@ -1,6 +1,5 @@
 """What a sheet says of trials: conditions and order, columns of one trial alone, corrections; and of planned ones."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -111,12 +110,9 @@ def test_frames_and_axis_of_one_trial_alone(tmp_path):
     assert (track.flag[0], track.flag[-1]) == ("rejected", "after_end")
 
 
-REAL = os.environ.get("VINETRACK_REAL_DATA", "")
-
-
-@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
-def test_either_of_two_point_masses_of_a_real_project():
-    path = Path(REAL) / "falling_cups" / "cups.trk"
+@pytest.mark.real
+def test_either_of_two_point_masses_of_a_real_project(real):
+    path = real / "falling_cups" / "cups.trk"
     with pytest.raises(TrackError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
         read_track(path, point_mass="cup")
     third, seventh = (read_track(path, point_mass=name) for name in ("cup 3", "Cup 7"))

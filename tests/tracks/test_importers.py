@@ -1,7 +1,6 @@
 """Positions and pressures measured elsewhere: CSV, Physics Tracker, TDMS, written by hand here."""
 
 import io
-import os
 from pathlib import Path
 
 import numpy as np
@@ -186,11 +185,9 @@ def test_a_trace_is_interpolated_on_the_times_of_the_track_unless_it_is_of_anoth
 
 
 @pytest.mark.real
-def test_a_real_project_is_read_in_its_own_scale():
+def test_a_real_project_is_read_in_its_own_scale(real):
     """Published with the file: 11 points from frame 2, 398.71 px/m, 66 ms a frame."""
-    if "VINETRACK_REAL_DATA" not in os.environ:
-        pytest.skip("VINETRACK_REAL_DATA is not set")
-    track = read_track(Path(os.environ["VINETRACK_REAL_DATA"]) / "balltoss" / "balltoss.trk")
+    track = read_track(real / "balltoss" / "balltoss.trk")
     assert len(track.time_s) == 11
     assert track.time_s[0] == pytest.approx(2 * 0.066)
     np.testing.assert_allclose(np.diff(track.time_s), 0.066)

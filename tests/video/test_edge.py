@@ -20,6 +20,7 @@ from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.strip import cut_strip
 from vinetrack.video.track import Tracking, follow, track_recording, tube_strip
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
@@ -44,7 +45,6 @@ EDGES = {
     "bright": ({}, 0.12, 0.15),
     "dark": ({"film": 15.0}, 0.2, 0.3),
     "door": ({"door": True}, 0.15, 0.2),
-    "flicker": ({"flicker": 0.06}, 0.15, 0.2),
     "low contrast": ({"film": 100.0, "wall_sd": 4.0, "tail_sd": 3.0}, 0.2, 0.25),
     "half-frame exposure": ({"speed": 30.0, "exposure": 0.5, "rise_frames": 4.0}, 0.3, 0.35),
     "sway": ({"wobble": 2.0}, 0.15, 0.2),
@@ -61,6 +61,14 @@ def test_edge_of(name):
     assert error.std() < sd_px
     assert abs(error.mean()) < bias_px
     assert 0.5 < error.std() / np.sqrt(np.mean(stated**2)) < 2.0
+
+
+def test_flicker_is_taken_out_of_every_picture():
+    """Of what lies beyond the end of growth; the light goes up and down by 6 %."""
+    frames = plain_scene(Plan(**SHORT, seed=201, flicker=0.06)).frames
+    strip = cut_strip(frames, Axis((20.0, 80.0), (490.0, 80.0)), 24)
+    beyond = strip.values[:, :, 440:].mean(axis=(1, 2))
+    assert np.std(strip.scale * beyond + strip.offset) < 0.1 < 2 < np.std(beyond)
 
 
 @pytest.mark.parametrize("angle", [90.0, 180.0, 205.0, 270.0])
