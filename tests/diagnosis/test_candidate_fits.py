@@ -53,15 +53,6 @@ def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_foun
     assert climb.yields_Pa == pytest.approx({name: begun[name] for name in climb.yields_Pa})
 
 
-@pytest.mark.slow
-def test_an_effect_that_adds_nothing_makes_no_fit_worse():
-    base = vt.fit(vt.base_model(), grown(seed=32), profile=False)
-    for name in HIDDEN:
-        found = vt.refit(base, base.model + getattr(vt.effects, name))
-        assert found.log_likelihood > base.log_likelihood - 0.5
-        assert np.isfinite(found.chi2_per_dof)
-
-
 P_S_TRUE = 11e3
 
 

@@ -8,9 +8,7 @@ import pytest
 from by_hand import ATM, LEVEL, LOADED, RT_AIR, G, N, Vine, assert_same_motion, followed, simulated
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
-import vinetrack as vt
 from vinetrack.core.records import Bend
-from vinetrack.dynamics.audit import evaluate
 
 
 def test_capstan_friction_as_printed_is_a_constant():
@@ -52,15 +50,6 @@ def test_gauge_then_chamber_then_leak_then_inlet_then_stretch():
         return -1.4 * (P + ATM) * area * (v / 2) / (V0 + area * x / 2) + (P_0 - P) / 0.05
 
     assert_same_motion(vine, sizes, acceleration, chamber=(P_0, rate))
-
-
-def test_the_order_in_which_a_model_is_put_together_does_not_matter():
-    names = ["inlet_loss", "leak", "wall_stretch", "reservoir_depletion", "pressure_gauge", "pressure_gain"]
-    base, motion = vt.base_model().names, [np.linspace(0, end, 30) for end in (0.1, 0.25, 3)]
-    forwards = evaluate(vt.make_model([*base, *names]), LOADED.trial(), *motion)
-    backwards = evaluate(vt.make_model([*names[::-1], *base]), LOADED.trial(), *motion)
-    np.testing.assert_array_equal(forwards.pressure_Pa, backwards.pressure_Pa)
-    np.testing.assert_array_equal(forwards.area_m2, backwards.area_m2)
 
 
 @pytest.mark.parametrize("name", ["reservoir_depletion.gamma", "leak.rate", "supply_refill.tau"])

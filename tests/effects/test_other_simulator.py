@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from by_hand import BARE, LOADED, N, Vine, whole_catalogue
-from hidden import EFFECTS, OUTSIDERS, make, write_folder
+from hidden import EFFECTS, OUTSIDERS, make
 from hidden.motion import Physics, Tube, follow
 from hidden.questions import outsider_values, true_effects
 from hidden.verify import FRAME_S, SIZES, ours, trials
@@ -31,7 +31,6 @@ from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import effects_on, host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, TrialInputs, catalogue
-from vinetrack.inference.fit_data import pairs_of
 
 B = 6.44
 DAMPING = {"eversion_damping.B": B, "eversion_damping.n": N}
@@ -91,20 +90,6 @@ def test_a_force_of_no_catalogue_is_the_one_that_scoring_knows(name):
     assert np.max(np.abs(other[seen, 1] - plain[seen, 1])) > 1e-3
     # A film that changes from one millimetre to the next is a corner to one integrator and a step to the other.
     np.testing.assert_allclose(other[seen, 1], theirs[seen], atol=2e-6 if name == "changed_film" else 1e-7)
-
-
-def test_a_campaign_written_to_a_folder_is_read_back(tmp_path):
-    campaign = make("bends:capstan_friction", 903)
-    write_folder(campaign, tmp_path)
-    experiment = vt.read_experiment(tmp_path)
-    assert not experiment.failed
-    pairs, left_out = pairs_of(experiment)
-    assert not left_out
-    for (trial, track), (read, read_track) in zip(campaign.pairs, pairs, strict=True):
-        for name in ("diameter_m", "pressure_Pa", "payload_kg", "chamber_m3", "inlet_m", "growth_angle_rad", "vine"):
-            assert getattr(read, name) == pytest.approx(getattr(trial, name), nan_ok=True)
-        assert len(read.bends) == len(trial.bends) > 0
-        np.testing.assert_allclose(read_track.lead_position_m, track.lead_position_m, atol=1e-7)
 
 
 PACKAGE = Path(vt.__file__).parent

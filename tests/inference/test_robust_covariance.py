@@ -130,15 +130,6 @@ def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighte
     assert both.sigma == pytest.approx(first.sigma, rel=0.15)
 
 
-@pytest.mark.slow
-def test_intervals_from_few_drops_contain_the_true_drag():
-    held = []
-    for campaign in range(40):
-        drag = vt.fit(FALL, scattering(20300, campaign, 3 + campaign % 4), profile=False)["C_D"]
-        held.append(drag.low < 0.5 < drag.high)
-    assert sum(held) >= 34  # of 40 at 95 %, fewer once in 600
-
-
 @pytest.mark.parametrize(("specimens", "days", "groups"), [(8, 12, 8), (3, 12, 12), (0, 0, 24), (2, 3, 24)])
 def test_the_coarsest_sufficient_groups_are_used(specimens, days, groups):
     told = [(f"s{i % specimens}" if specimens else "", f"{i % days}" if days else "") for i in range(24)]

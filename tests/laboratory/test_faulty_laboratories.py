@@ -4,7 +4,6 @@ They live in `benchmarks/hidden`, share no code with the package's own laborator
 `benchmarks/laboratories.py`. Seeds from 20900 on are these tests'.
 """
 
-import json
 import math
 from dataclasses import replace
 
@@ -14,7 +13,6 @@ from by_hand import LOADED, N, followed
 from hidden import laboratories as faults
 from hidden.balls import fallen
 from hidden.laboratory_kinds import BARE
-from hidden.laboratory_rows import ROWS, campaign
 from hidden.motion import AIR, G, Tube, follow
 from hidden.shots import Laboratory, careful, plan, seen
 from hidden.slack import follow_slack
@@ -31,19 +29,6 @@ FEW = (18, 24)
 def drawn() -> tuple[Laboratory, np.random.Generator]:
     draw = np.random.default_rng(SEED)
     return careful(plan(draw, replace(BARE, trials=FEW), lambda _: True), draw), draw
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ROWS)
-def test_every_row_makes_a_campaign_that_moves(name):
-    made = campaign(name, SEED, FEW, weighed=False)
-    fewest = 2 if name == "few_trials" else 8 if name.startswith("falling") else 16
-    assert fewest <= len(made.recordings) <= 24
-    for one in made.recordings:
-        assert one.time_s.shape == one.position_m.shape
-        assert np.all(np.isfinite(one.position_m))
-        assert np.ptp(one.position_m) > 0.01
-    json.dumps(made.truth, allow_nan=False)
 
 
 def test_wear_follows_the_order_of_each_vine():

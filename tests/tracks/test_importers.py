@@ -1,12 +1,11 @@
 """Positions and pressures measured elsewhere: CSV, Physics Tracker, TDMS, written by hand here."""
 
+import contextlib
 import io
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from nptdms import ChannelObject, TdmsWriter
 from vine_truth import make_track
 
@@ -336,13 +335,10 @@ def test_unsupported_content_is_refused(tmp_path, made):
         read_tdms(tmp_path, made)
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(place=st.integers(0, 10_000), value=st.integers(0, 255))
-def test_a_changed_byte_gives_numbers_or_a_refusal(tmp_path, place, value):
-    damaged = bytearray(BOTH_CHANNELS)
-    damaged[place % len(damaged)] = value
-    try:
-        time_s, pressure_Pa = read_tdms(tmp_path, bytes(damaged))
-    except TrackError:
-        return
-    assert time_s.shape == pressure_Pa.shape
+def test_a_changed_byte_gives_numbers_or_a_refusal(tmp_path):
+    for place in range(len(BOTH_CHANNELS)):
+        damaged = bytearray(BOTH_CHANNELS)
+        damaged[place] ^= 0x5A
+        with contextlib.suppress(TrackError):
+            time_s, pressure_Pa = read_tdms(tmp_path, bytes(damaged))
+            assert time_s.shape == pressure_Pa.shape
