@@ -21,7 +21,7 @@ from hidden_truth import sheet
 import vinetrack
 from vinetrack.diagnosis.propose import add, propose
 from vinetrack.dynamics.model import Model
-from vinetrack.effects import catalogue, own_effects
+from vinetrack.effects import own_effects
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow, write_experiment
 from vinetrack.pipeline import effects_stage, model_stage
@@ -56,12 +56,6 @@ def test_check_names_file_trial_and_column_and_says_what_two_hundred_trials_shar
     assert done.exit_code == 1
     assert all(word in done.output for word in ("trials.csv", "t0 and 199 more", "pressure_kPa", "9999"))
     assert len(done.output.splitlines()) == 2
-
-
-def test_effects_lists_every_effect_with_its_formula_and_units():
-    output = run("effects").output
-    assert all(effect.name in output and effect.formula in output for effect in catalogue().values())
-    assert "N·(s/m)ⁿ" in output
 
 
 def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path):

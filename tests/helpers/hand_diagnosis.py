@@ -59,22 +59,12 @@ def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
         parameters.append(number("reservoir_depletion.gamma", "γ", 1.17, 0.004))
     if "final_verdict" in changes:
         rounds[-1]["verdict"] = changes["final_verdict"]
-    content = {
-        "verdict": verdict,
-        "effects": added,
-        "answer_set": named,
-        "explanation": rounds[0]["explanation"],
-        "final_verdict": rounds[-1]["verdict"],
-        "rounds": rounds,
-        "parameters": parameters,
-        "cosines": rounds[0]["cosines"],
-        "where": ["The model fails most at 24 kPa."],
-        "drift": [{"parameter": "eversion_damping.B", "sentence": "B rises by 39 ± 3 % from 60 kPa to 24 kPa."}],
-        "next_experiment": next_experiment() if verdict == "ambiguous" else None,
-        "missing_force": missing_force() if verdict == "unexplained" else None,
-        "notes": [],
-        "refused": None,
-    }
+    content = {"verdict": verdict, "effects": added, "answer_set": named, "rounds": rounds, "parameters": parameters}
+    content |= {name: rounds[0][name] for name in ("explanation", "cosines")} | {"notes": [], "refused": None}
+    drift = {"parameter": "eversion_damping.B", "sentence": "B rises by 39 ± 3 % from 60 kPa to 24 kPa."}
+    content |= {"final_verdict": rounds[-1]["verdict"], "where": ["The model fails most at 24 kPa."], "drift": [drift]}
+    content["next_experiment"] = next_experiment() if verdict == "ambiguous" else None
+    content["missing_force"] = missing_force() if verdict == "unexplained" else None
     return content | changes
 
 
@@ -93,14 +83,9 @@ def next_experiment() -> dict[str, Any]:
     trial = {"replicates": 4, "pressure_kPa": 30.0, "payload_g": 0.0, "diameter_mm": 24.0, "thickness_um": 100.0}
     trial |= {"length_mm": 200.0, "chamber_l": 2.0, "inlet_mm": None, "growth_angle_deg": 0.0, "new_vine": True}
     pair = "air_drag | inlet_loss"
-    return {
-        "text": "Make four trials on a tube of half the wall.",
-        "trials": [trial],
-        "separation_sigma": {pair: 21.0},
-        "simulated_sigma": {pair: {"mean": 20.0, "sd": 1.4}},
-        "alternatives": [],
-        "calibration": "film a ruler and a strobe",
-    }
+    found = {"text": "Make four trials on a tube of half the wall.", "trials": [trial], "alternatives": []}
+    found |= {"separation_sigma": {pair: 21.0}, "simulated_sigma": {pair: {"mean": 20.0, "sd": 1.4}}}
+    return found | {"calibration": "film a ruler and a strobe"}
 
 
 def ladder(*added: str) -> pd.DataFrame:
@@ -114,12 +99,7 @@ def ladder(*added: str) -> pd.DataFrame:
 
 def moved() -> pd.DataFrame:
     n = {"model": "m", "vine": "", "unit": "1", "symbol": "n", "parameter": "eversion_damping.n", "added": ""}
+    n |= {"value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52}
     after = n | {"added": "reservoir_depletion", "value": 0.37, "sigma": 0.004, "low_95": 0.36, "high_95": 0.38}
-    gamma = after | {"parameter": "reservoir_depletion.gamma", "symbol": "γ"}
-    return pd.DataFrame(
-        [
-            n | {"value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52},
-            after,
-            gamma | {"value": 1.17, "low_95": 1.16, "high_95": 1.18},
-        ]
-    )
+    gamma = {"parameter": "reservoir_depletion.gamma", "symbol": "γ", "value": 1.17, "low_95": 1.16, "high_95": 1.18}
+    return pd.DataFrame([n, after, after | gamma])

@@ -33,21 +33,11 @@ def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_
     damping = Number("eversion_damping.B", "v", "B", "N·(s/m)ⁿ", 6.4, 0.1, 6.2, 6.6, free, "linear")
     onset = Number("yield_pressure.P_y", "", "P_y", "Pa", 3000.0, free, free, free, free, "none", 0.0)
     fit = FitSummary(
-        names=("gravity", "eversion_damping"),
-        numbers=(damping, onset),
-        covariance=np.array([[0.01, 0.0], [0.0, free]]),
-        spreads={"B": BetweenTrialSpread(0.03, True)},
-        noise_m=1e-4,
-        noise_correlation=0.4,
-        chi2_per_dof=1.2,
-        log_likelihood=-12.5,
-        converged=True,
-        messages=("a",),
-        warnings=("b",),
-        left_out={"c": "never moves"},
-        trials={"t": TrialEstimates(*(0.1 * i for i in range(8)))},
-        between=np.array([[0.04, 0.0], [0.0, 0.0]]),
-    )
+        names=("gravity", "eversion_damping"), numbers=(damping, onset), covariance=np.array([[0.01, 0], [0, free]]),
+        spreads={"B": BetweenTrialSpread(0.03, True)}, noise_m=1e-4, noise_correlation=0.4, chi2_per_dof=1.2,
+        log_likelihood=-12.5, converged=True, messages=("a",), warnings=("b",), left_out={"c": "never moves"},
+        trials={"t": TrialEstimates(*(0.1 * i for i in range(8)))}, between=np.array([[0.04, 0.0], [0.0, 0.0]]),
+    )  # fmt: skip
     results = Results(tmp_path)
     write_json(results.fit, fit.to_json())
     back = read_fit(results)
