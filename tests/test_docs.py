@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer.main
-from commanded import run, succeed
-from doc_commands import Shown, pieces, printed
+from commanded import Shown, pieces, printed, run, succeed
 from own_effect import PAGE as OWN_EFFECT
 from own_effect import block, write_effect
 from PIL import Image

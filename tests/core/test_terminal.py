@@ -1,11 +1,15 @@
-"""Bars and colour on a terminal alone, and what is said of compilation."""
+"""Bars and colour on a terminal alone, what is said of compilation, and threads of linear algebra."""
 
 import io
 import tempfile
 from typing import Any
 
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
 from vinetrack.core.terminal import progress, severity_first, waiting
-from vinetrack.core.threads import njit
+from vinetrack.core.threads import in_one_blas_thread, njit
 from vinetrack.dynamics.kernel import _cache_folder
 from vinetrack.pipeline.stages import COMPILING, compilation_told
 
@@ -66,3 +70,26 @@ def test_a_model_is_kept_in_a_folder_of_ones_own_where_no_other_can_be_written(m
     assert folder.stat().st_mode & 0o777 == 0o700
     monkeypatch.setenv("VINETRACK_CACHE", str(tmp_path))
     assert _cache_folder.__wrapped__() == tmp_path / "vinetrack" / "kernels"
+
+
+def threads() -> set[int]:
+    """Numbers of threads of the loaded libraries of linear algebra."""
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_threads_are_limited_within_a_function_only():
+    np.ones((2, 2)) @ np.ones((2, 2))
+
+    @in_one_blas_thread
+    def asked(text: str, *, fails: bool = False) -> tuple[str, set[int]]:
+        if fails:
+            raise ValueError(text)
+        return text, threads()
+
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        assert asked("kept") == ("kept", {1})
+        with pytest.raises(ValueError, match="kept"):
+            asked("kept", fails=True)
+        assert threads() == before
+    assert asked.__name__ == "asked"

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from figure_frames import assert_nothing_is_cut_off
 from hand_diagnosis import ladder
 from matplotlib.colors import to_hex
+from test_figures import assert_nothing_is_cut_off
 
 from vinetrack.figures import damping_figures as paper_figures
 from vinetrack.figures import diagnosis_figures as figures

@@ -6,8 +6,8 @@ import matplotlib.colors as mcolors
 import numpy as np
 import pandas as pd
 import pytest
-from figure_frames import assert_nothing_is_cut_off
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from vinetrack.dynamics.simulate import effect_motion
@@ -15,7 +15,7 @@ from vinetrack.effects import catalogue
 from vinetrack.figures import damping_figures, motion_figures
 from vinetrack.figures.damping_figures import draw_damping_law, draw_exponents, draw_scaling
 from vinetrack.figures.prediction_figures import draw_effect
-from vinetrack.figures.style import BLUE, RULE_COLOURS, render
+from vinetrack.figures.style import BLUE, RULE_COLOURS, look, render
 
 N = 0.4
 
@@ -217,3 +217,14 @@ def test_every_effect_shows_on_the_reference_vine(name):
         assert found["difference_m"].iloc[-1] < 0
     if name in FASTER:
         assert found["difference_m"].iloc[-1] > 0
+
+
+def assert_nothing_is_cut_off(figure: Figure) -> None:
+    with look():
+        figure.draw_without_rendering()
+        drawn, edge = figure.get_tightbbox(), figure.bbox_inches.padded(0.02)
+        assert edge.x0 <= drawn.x0 <= drawn.x1 <= edge.x1
+        assert edge.y0 <= drawn.y0 <= drawn.y1 <= edge.y1
+        for legend in [*figure.legends, *(ax.get_legend() for ax in figure.axes if ax.get_legend())]:
+            for ax in figure.axes:
+                assert not legend.get_window_extent().padded(-1).overlaps(ax.get_window_extent().padded(-1))

@@ -1,22 +1,28 @@
-"""Reading recordings, those of high-speed cameras too: every value and every frame, rate and exposure."""
+"""Recordings read, those of high-speed cameras too, and written: every value, rate, exposure, and the event alone."""
 
 import struct
 import threading
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
+import av
 import av.logging
 import cv2
 import numpy as np
 import pytest
 from camera_files import write_cine, write_mraw, write_side_file
-from plain_scene import write_images, write_video
+from plain_scene import Plan, Scene, plain_scene, write_images, write_video
 
-from vinetrack.core.records import Trial
+from vinetrack.core.records import Track, Trial
 from vinetrack.video import frames as module
+from vinetrack.video import small_pictures
 from vinetrack.video.frames import PHANTOM_TABLE, RecordingError, inspect_recording, read_frames
 from vinetrack.video.images import capture_exposure, capture_rate
+from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.strip import camera_unit
+from vinetrack.video.track import track_recording
+from vinetrack.video.write import write_clip
 
 RNG = np.random.default_rng(5)
 FRAMES = (np.add.outer(np.arange(24) * 3, np.add.outer(np.arange(48), np.arange(64))) % 200 + 20).astype(np.uint8)
@@ -245,3 +251,145 @@ def test_a_sheet_that_contradicts_the_recording_is_refused(tmp_path):
         capture_rate(replace(trial, capture_fps=1000.0), recording)
     with pytest.raises(RecordingError):
         capture_exposure(replace(trial, exposure_s=400e-6), recording)
+
+
+BEFORE, AFTER = 300, 180
+"""Frames of rest beyond those of the scene."""
+
+
+Filmed = tuple[Scene, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    """A scene, and its frames with rest before and after it, each frame of rest with grain of its own."""
+    scene = plain_scene(
+        Plan(seed=20942, width=384, height=96, from_px=(24.0, 48.0), end_px=320.0, radius=14.0, speed=9.0)
+    )
+    first, last = np.repeat(scene.frames[:1], BEFORE, 0), np.repeat(scene.frames[-1:], AFTER, 0)
+    frames, rng = np.concatenate([first, scene.frames, last]), np.random.default_rng(20943)
+    for rest in (slice(None, BEFORE), slice(-AFTER, None)):
+        grain = np.rint(rng.normal(0, 2.0, frames[rest].shape))
+        frames[rest] = np.clip(frames[rest] + grain, 0, 255).astype(np.uint8)
+    return scene, frames
+
+
+def tracked(path: Path, **stated: object) -> Track:
+    return track_recording(replace(Trial(name="t", video=path, capture_fps=1000.0, exposure_s=2e-4), **stated)).track
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key_frames", ["30", "5000", "1"])
+def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monkeypatch, key_frames):
+    """With a key frame every 30, with one, and with key frames alone; tracked as the whole film is."""
+    scene, long_frames = filmed
+    film = write_video(tmp_path / "long.mp4", long_frames, options={"crf": "14", "g": key_frames})
+    whole, whole_track = read_frames(film), tracked(film)
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    frames, part = read_event(inspect_recording(film)), tracked(film)
+    moving = np.flatnonzero(scene.moving) + BEFORE
+    assert frames.first <= moving[0] - 40
+    assert frames.first + len(frames) > moving[-1] + 40
+    assert len(frames) < len(moving) + 2 * (MARGIN_FRAMES + 60)
+    assert frames.n_recorded == len(long_frames)
+    same = slice(frames.first, frames.first + len(frames))
+    assert np.array_equal(frames.luma, whole.luma[same])
+    assert np.array_equal(frames.slot, whole.slot[same])
+    assert len(part.time_s) == len(whole_track.time_s)
+    assert part.time_s == pytest.approx(whole_track.time_s)
+    known = np.isfinite(part.edge_px[moving]) & np.isfinite(whole_track.edge_px[moving])
+    assert known.mean() > 0.95
+    assert np.std((part.edge_px - whole_track.edge_px)[moving][known]) < 0.05
+    assert set(part.flag[: BEFORE - 150]) == {"before_release"}
+    assert set(part.flag[-100:]) == {"after_end"}
+    assert np.std(part.edge_px[moving][known] - scene.edge_px[moving - BEFORE][known]) < 0.3
+    # Frames that the sheet names are those that are decoded.
+    wanted = (BEFORE - 20, BEFORE + len(scene.frames) - 1)
+    frames = read_event(inspect_recording(film), wanted)
+    assert (frames.first, frames.first + len(frames) - 1) == wanted
+    made = tracked(film, frames_used=wanted)
+    assert np.isfinite(made.edge_px).sum() > 0.9 * scene.moving.sum()
+    assert not np.isfinite(made.edge_px[: wanted[0]]).any()
+
+
+@pytest.mark.slow
+def test_of_a_long_cine_the_event_is_read_and_no_more(filmed, tmp_path, monkeypatch):
+    scene, long_frames = filmed
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    missing = np.delete(np.arange(len(long_frames) + 1), BEFORE + 30) / 1000 + 0.2
+    deep = long_frames.astype(np.uint16) * 16
+    path = write_cine(tmp_path / "long.cine", deep, rate=1000, exposure_ns=200_000, times_s=missing)
+    frames = read_event(inspect_recording(path))
+    same = slice(frames.first, frames.first + len(frames))
+    assert len(frames) < len(scene.frames) + 2 * (MARGIN_FRAMES + 20)
+    assert np.array_equal(frames.luma, deep[same])
+    assert np.array_equal(frames.slot, np.rint((missing - 0.2) * 1000)[same])
+    made = tracked(path, capture_fps=np.nan, exposure_s=np.nan)
+    assert len(made.time_s) == len(long_frames)
+    assert made.time_s[-1] == pytest.approx(len(long_frames) / 1000 + 1e-4)
+
+
+def test_the_event_lies_between_the_pictures_that_differ_from_either_end():
+    rng = np.random.default_rng(8)
+    pictures = [rng.normal(80, 1.5, (48, 64)).clip(0, 255).astype(np.uint8) for _ in range(60)]
+    for i in range(20, 60):
+        pictures[i][20:30, : min(60, 4 * (i - 19))] = 170
+    numbers = np.arange(60) * 50
+    # From picture 19, the last at rest, to 34, the first at the end, and a margin of MARGIN_PART of that.
+    assert event_range(pictures, numbers, 3000) == (19 * 50 - 112, 34 * 50 + 112)
+    assert event_range(pictures[:20], numbers[:20], 1000) is None
+
+
+def clip_pictures(n: int, height: int = 64, width: int = 96) -> list[np.ndarray]:
+    made = []
+    for i in range(n):
+        picture = np.full((height, width, 3), 60, np.uint8)
+        picture[:, 8 * i : 8 * i + 8] = (240, 228, 66)
+        made.append(picture)
+    return made
+
+
+def test_pictures_come_back_in_order_and_in_colour(tmp_path):
+    path = tmp_path / "overlays" / "a.mp4"
+    assert write_clip(path, iter(clip_pictures(10)), 12.5) == 10
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert float(stream.average_rate) == 12.5
+        back = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(back) == 10
+    for i, picture in enumerate(back):
+        middle = picture[20:40, 8 * i + 2 : 8 * i + 6].astype(float).mean(axis=(0, 1))
+        assert middle == pytest.approx([240, 228, 66], abs=14)
+
+
+def broken_off():  # type: ignore[no-untyped-def]
+    yield clip_pictures(1)[0]
+    raise RuntimeError("the recording ends here")
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [([], ValueError), ([np.zeros((63, 96, 3), np.uint8)], ValueError), (broken_off(), RuntimeError)],
+    ids=["nothing", "odd", "broken_off"],
+)
+def test_a_failed_write_leaves_the_old_clip_and_no_other_file(tmp_path: Path, given, error) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"the old one")
+    with pytest.raises(error):
+        write_clip(path, given, 10)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+    assert path.read_bytes() == b"the old one"
+
+
+@pytest.mark.slow
+def test_the_same_pictures_are_the_same_bytes_whatever_the_memory_held(tmp_path):
+    draw = np.random.default_rng(20701)
+    noisy = [np.clip(p + draw.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in clip_pictures(30, 198, 480)]
+    written = []
+    for k in range(6):
+        held = [draw.bytes(int(draw.integers(1, 2_000_000))) for _ in range(20)]
+        del held
+        write_clip(tmp_path / f"{k}.mp4", iter(noisy), 9.0)
+        written.append((tmp_path / f"{k}.mp4").read_bytes())
+    assert len(set(written)) == 1
