@@ -17,7 +17,6 @@ from PIL import Image
 import vinetrack
 from vinetrack.cli.main import app
 
-# README and docs: links and pictures lead somewhere, commands exist, nothing names the machine it was written on.
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]

@@ -17,7 +17,6 @@ from lsoda_vine import grown_position, vine_trial
 
 import vinetrack
 
-# A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
 ROOT = Path(__file__).parents[1]
 N = 0.4
 B = {12: 2.0, 24: 6.0}

@@ -16,8 +16,6 @@ from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.sheet import planned_sheet, planned_trial
 from vinetrack.tracks.importers import TrackError, load_track, read_track
 
-# Corrections by hand are read, refused in words, and reach the trial.
-
 
 def corrected(folder: Path, text: str) -> Path:
     row = "a.mp4,12,100,140,24,3,"

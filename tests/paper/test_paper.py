@@ -16,8 +16,6 @@ from vinetrack.kinematics.summary import CONDITION_COLUMNS
 from vinetrack.paper import motions
 from vinetrack.paper import rows as lines
 
-# What follows from the paper's own numbers, each worked out by hand.
-
 
 def test_what_the_chamber_the_injector_and_the_sizes_say():
     """π × 12² mm² × 280 mm = 126.67 mL of 3700 mL; the gas law holds for absolute pressure.

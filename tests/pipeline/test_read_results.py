@@ -27,7 +27,6 @@ from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 
 
-# The fit and the diagnosis of a results folder, read back as they were written.
 def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_sentence(tmp_path):
     free = math.nan
     damping = Number("eversion_damping.B", "v", "B", "N·(s/m)ⁿ", 6.4, 0.1, 6.2, 6.6, free, "linear")

@@ -13,7 +13,6 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
 
-# What the Snakefile is told before anything runs.
 ROOT = Path(__file__).parents[2]
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
 
