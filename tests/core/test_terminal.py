@@ -2,7 +2,6 @@
 
 import io
 import tempfile
-from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +41,7 @@ def test_nothing_is_shown_where_nobody_looks(capfd):
 def test_compilation_is_told_once_and_code_is_compiled_where_no_folder_can_be_written(monkeypatch):
     import numba
 
-    def unwritable(cache: bool = False, **flags: Any) -> Any:
+    def unwritable(cache: bool = False, **flags):
         if cache:
             raise RuntimeError("cannot cache function: no locator available")
         return plain(**flags)

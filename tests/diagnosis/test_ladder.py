@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -406,5 +405,5 @@ def test_only_differences_that_follow_the_conditions_are_confounded(trials):
     ],
 )
 def test_a_verdict_says_whether_any_physics_may_be_missing(kinds, verdict):
-    rivals: list[Any] = [SimpleNamespace(effects=(SimpleNamespace(kind=kind),)) for kind in kinds]
+    rivals: list = [SimpleNamespace(effects=(SimpleNamespace(kind=kind),)) for kind in kinds]
     assert verdict_of(rivals) == verdict

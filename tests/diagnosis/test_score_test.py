@@ -2,7 +2,6 @@
 
 import math
 from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ def summed(single: np.ndarray, informations: np.ndarray, groups=()) -> Scores:
     return Scores(single.sum(axis=0), informations.sum(axis=0), single, informations, 1, named)
 
 
-def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float = 1.0, sizes: Any = 0.0) -> Scores:
+def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float = 1.0, sizes=0.0) -> Scores:
     """What a linear campaign says of shapes of true `sizes`."""
     root = draw.standard_normal((trials, 3 * shapes, shapes)) / math.sqrt(3 * shapes)
     informations = np.einsum("nkj,nkl->njl", root, root)
@@ -34,11 +33,11 @@ def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float =
     return summed(noise + informations @ np.broadcast_to(sizes, (shapes,)), informations)
 
 
-def questioned(of: Scores, structure: Any = QUIET, level: float = FIRST, effects=()) -> MisfitTests:
+def questioned(of: Scores, structure=QUIET, level: float = FIRST, effects=()) -> MisfitTests:
     shape = SimpleNamespace(effect=SimpleNamespace(parameters=(1,)), size=SimpleNamespace(sign=0))
     named = tuple(effects) or tuple(f"effect_{k}" for k in range(of.score.size))
-    answers: Any = SimpleNamespace(shapes=[shape] * of.score.size, effects=named)
-    fit: Any = None
+    answers = SimpleNamespace(shapes=[shape] * of.score.size, effects=named)
+    fit = None
     return MisfitTests(fit, (), answers, fit, of, structure, level)
 
 
@@ -133,7 +132,7 @@ def test_a_misfit_no_larger_than_slow_errors_of_tracks_is_not_far_off(chi2, resi
     seen = {"lead_position_m": np.array([0.0, 0.1]), "slow_m": 0.0 if slow else None, "trace": None}
     track = SimpleNamespace(position_systematic_m=systematic_m, **seen)
     solution = SimpleNamespace(columns=[np.full((4, 1), residual_m)] * 3)
-    fit: Any = SimpleNamespace(chi2_per_dof=chi2, predictor=SimpleNamespace(data=[track] * 3), solution=solution)
+    fit = SimpleNamespace(chi2_per_dof=chi2, predictor=SimpleNamespace(data=[track] * 3), solution=solution)
     assert misfit_tests.exceeds_slow_errors(fit) == exceeds
 
 
@@ -154,7 +153,7 @@ def test_scores_that_a_specimen_shares_count_once():
 def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter):
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
-    friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, cast(Any, None)
+    friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, None
     answers = score_test.EffectSensitivities((score_test.CandidateShape(friction, (), 1e-3),), [], ())
     held = []
     for _ in range(2000):
@@ -183,7 +182,7 @@ def number_of(key: str, value: float, sigma: float) -> fit_result.Number:
     return fit_result.Number(key, "", "s", "1", value, sigma, value - 2 * sigma, value + 2 * sigma, math.inf, "linear")
 
 
-def known_fit(log_likelihood: float, *numbers: fit_result.Number) -> Any:
+def known_fit(log_likelihood: float, *numbers: fit_result.Number):
     """What a likelihood ratio asks of a fit of few trials, whose film is free already."""
     known = {"covariance": np.diag([number.sigma**2 for number in numbers]), "trials": (), "model": ("film_mass",)}
     return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, **known)
@@ -276,9 +275,9 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
     problem = SimpleNamespace(**{name: np.array(values) for name, values in arrays.items()})
     state = marginal_likelihood.FitState(np.zeros(2), np.zeros((1, 4)), (1e-5, 1e-5), 0.0, np.ones(1))
     numbers = [SimpleNamespace(bound=math.nan), SimpleNamespace(bound=bound)]
-    fit: Any = SimpleNamespace(solution=SimpleNamespace(state=state, problem=problem), numbers=numbers)
+    fit = SimpleNamespace(solution=SimpleNamespace(state=state, problem=problem), numbers=numbers)
     sizes = {"n_keys": 2, "n_shapes": 1, "n_tested": 1}
-    products: Any = SimpleNamespace(parts=[np.array([0])], tested_indices=np.array([[0]]), **sizes)
+    products = SimpleNamespace(parts=[np.array([0])], tested_indices=np.array([[0]]), **sizes)
     gain, size = score_test.linear_gains(fit, products, 0.0)
 
     def squares(of: list[int]) -> tuple[float, float]:
@@ -293,7 +292,7 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
 GAUGE = {"g.delta": Parameter("delta", "δ", "Pa", 500.0, plausible=(-2e3, 2e3))}
 
 
-def fitted(value: float, sigma: float) -> Any:
+def fitted(value: float, sigma: float):
     return known_fit(-10.0, number_of("g.delta", value, sigma))
 
 

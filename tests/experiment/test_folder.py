@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -391,7 +390,7 @@ def test_a_value_that_is_not_allowed_is_named_with_its_key(tmp_path, key, value)
     assert problem.column.startswith(key)
 
 
-def _keys(model: type[BaseModel]) -> dict[str, Any]:
+def _keys(model: type[BaseModel]) -> dict:
     return {
         name: _keys(type(field.default)) if isinstance(field.default, BaseModel) else None
         for name, field in model.model_fields.items()

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -60,7 +59,7 @@ how well its numbers are known, not what was done to the vine."""
 OTHER_VALUES = {"bends": (Bend(0.1, 0.05, 0.03),), "travel_ratio": 1.0}
 
 
-def conditions(field: str, value: Any) -> set[str]:
+def conditions(field: str, value) -> set[str]:
     """Names of the conditions of a trial and of one with another value of a field."""
     return {trial.condition for trial in with_names([TRIAL, replace(TRIAL, **{"name": "b", field: value})])}
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from chrome import Chrome, end, until
 
@@ -93,7 +93,7 @@ class Visitor:
         """JavaScript expression of a widget or figure."""
         return f"Bokeh.documents[0].get_model_by_name({name!r})"
 
-    def value(self, name: str, what: str) -> Any:
+    def value(self, name: str, what: str):
         """A property of a widget."""
         return self.chrome.run(f"{self.model(name)}.{what}")
 

@@ -4,7 +4,6 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -239,7 +238,7 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model():
     found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs, profile=False)
     before, after = (redo_damping(model, motions, settings) for model in (vt.base_model(), found.model))
 
-    def worst_B(law: Mapping[str, Any]) -> float:
+    def worst_B(law: Mapping) -> float:
         return max(abs(vine["B"] / PAPER_B[round(vine["diameter_mm"] / 6)] - 1) for vine in law["vines"].values())
 
     assert before["both_axes"]["refused"]

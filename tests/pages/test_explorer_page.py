@@ -11,7 +11,6 @@ import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 from urllib.parse import urlsplit
 
@@ -55,7 +54,7 @@ class Browser:
         self.page = Page(background, self.document, reopen)
         self.turn()
 
-    def model(self, name: str) -> Any:
+    def model(self, name: str):
         found = self.document.get_model_by_name(name)
         assert found is not None, name
         return found
@@ -302,7 +301,7 @@ def test_the_proposed_effect_is_opened_fitted_and_saved(opened, tmp_path, monkey
     browser, reopened = opened
     folder, going_on = tmp_path / "vines", threading.Event()
 
-    def search(experiment: Any, results: Path, to: Path | None, told: Callable[[str], None]) -> WrittenProposal:
+    def search(experiment, results: Path, to: Path | None, told: Callable[[str], None]) -> WrittenProposal:
         assert (experiment.folder, results, to) == (folder, tmp_path / "results", None)
         told("learning the missing force as a table")
         assert going_on.wait(60)
@@ -343,7 +342,7 @@ def test_a_stopped_or_failed_search_can_be_restarted(opened, monkeypatch):
     browser, _ = opened
     begun, ended = threading.Event(), threading.Event()
 
-    def endless(*given: Any) -> None:
+    def endless(*given) -> None:
         begun.set()
         try:
             while True:
@@ -359,7 +358,7 @@ def test_a_stopped_or_failed_search_can_be_restarted(opened, monkeypatch):
 
     torn = browser.page.campaign.experiment.folder / "no law.py"
     torn.write_text("def tail_force(", encoding="utf-8")
-    failures: list[Callable[..., Any]] = [Mock(side_effect=ResultsError("no law"))]
+    failures: list[Callable] = [Mock(side_effect=ResultsError("no law"))]
     for search in (*failures, lambda *_: WrittenProposal(("no law",), ()), lambda *_: WrittenProposal((), (torn,))):
         monkeypatch.setattr(controls, "propose_effect", search)
         browser.click("propose")
@@ -462,7 +461,7 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign, tmp_p
     head = "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag"
     results.track(trial.name).write_text(f"{head}\n0,0,5,0,0,\n")
 
-    def along(**axis: Any) -> RecordingView | str:
+    def along(**axis) -> RecordingView | str:
         results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
         return recording_view(results, trial)
 

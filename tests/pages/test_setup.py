@@ -4,7 +4,6 @@ import contextlib
 import http.client
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -155,7 +154,7 @@ def test_decimal_commas_are_read_and_written_as_the_sheet_has_them():
     assert draft.read_block("late,36") == [["late", "36"]]
 
 
-def sent(folder: Path, **more: Any) -> dict[str, Any]:
+def sent(folder: Path, **more) -> dict:
     """The content that an unchanged page sends."""
     state = page_state(folder)
     return {key: state[key] for key in ("sheet", "shared", "calibration", "axis", "stamp")} | more
@@ -164,7 +163,7 @@ def sent(folder: Path, **more: Any) -> dict[str, Any]:
 FILLED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
 
 
-def problems(folder: Path, **more: Any) -> list[dict[str, Any]]:
+def problems(folder: Path, **more) -> list[dict]:
     return draft_problems(folder, draft_from_json(folder, sent(folder, **more)))["problems"]
 
 
