@@ -79,22 +79,14 @@ def effect_file(folder: Path) -> Path:
     )
     text = f'''"""Forces that no catalogue has.
 
-Its size is a.
-
     tail force a · shape
 """
-
 import numpy as np
-
 from vinetrack.effects import Parameter
-
-KIND = "physical"
 PARAMETERS = (
     Parameter("a", "a", "N", 0.0, bounds=(-100.0, 100.0), meaning="size"),
     Parameter("kind", "kind", "1", 0.0, bounds=(0.0, 100.0), meaning="which"),
 )
-
-
 def tail_force(s, rig, a, kind):
 {choices}
     return 0.0 * s.time

@@ -25,7 +25,7 @@ from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
-from vinetrack.inference.whitening import at_correlation, products, whiten
+from vinetrack.inference.whitening import products, whiten
 
 
 @pytest.fixture(scope="module")
@@ -391,15 +391,6 @@ def test_origins_of_rounded_tracks_have_the_stated_errors():
         errors += [(t.origin_m - known[t.name]["origin_m"]) / t.origin_sigma_m for t in fit.trials]
         assert abs(fit["n"].value - N_TRUE) < 3 * fit["n"].sigma
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
-
-
-def test_weighted_products_are_those_of_columns_divided_by_their_noise():
-    draw = np.random.default_rng(20000)
-    first = np.isin(np.arange(60), [0, 25])
-    columns, relative_sd = draw.standard_normal((60, 3)), np.exp(draw.uniform(-1, 1, 60))
-    weighted, white = products(columns, first, relative_sd), whiten(columns, first, 0.4, relative_sd)
-    np.testing.assert_array_equal(weighted, products(columns / relative_sd[:, None], first))
-    np.testing.assert_allclose(at_correlation(weighted[None], 0.4)[0], white.T @ white, rtol=1e-12)
 
 
 def test_trials_are_weighted_where_noise_grows_with_speed():

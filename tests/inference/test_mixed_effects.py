@@ -51,8 +51,10 @@ def crossed(columns: list[np.ndarray]) -> np.ndarray:
 
 
 def test_cross_products_agree_with_the_dense_inverse_covariance():
+    """Of columns divided by their noise."""
     columns, first = np.random.default_rng(0).standard_normal((30, 4)), np.isin(np.arange(30), [0, 17])
-    white = at_correlation(products(columns, first)[None], RHO)[0]
+    noise = np.linspace(0.5, 2.0, 30)
+    white = at_correlation(products(columns * noise[:, None], first, noise)[None], RHO)[0]
     dense = block_diag(covariance(17, RHO, 1.0), covariance(13, RHO, 1.0))
     assert white / (1 - RHO**2) == pytest.approx(columns.T @ np.linalg.solve(dense, columns))
 

@@ -508,8 +508,8 @@ def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign):
             socket.create_connection((own, urlsplit(address).port), timeout=5)
         IOLoop(make_current=False).run_sync(from_elsewhere)
         assert served.interrupt() == 0
-    assert served.lines[-1] == "Explorer ended."
-    assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
+        assert served.lines[-1] == "Explorer ended."
+        assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
 
 
 def test_no_route_answers_under_another_name_or_without_the_secret():

@@ -16,14 +16,14 @@ from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import preset
 from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video import track
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, front_share
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.edge import BANDS, leap_error_px
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import cut_strip
-from vinetrack.video.track import Tracking, follow, track_recording, tube_strip
+from vinetrack.video.track import Tracking, follow, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
 
@@ -266,14 +266,6 @@ def tube() -> np.ndarray:
     for i in range(n):
         luma[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & (across <= 20))
     return np.clip(luma, 0, 255).astype(np.uint8)
-
-
-def test_the_strip_is_centred_on_the_tube():
-    small = SmallPictures(tube())
-    strip, sides = tube_strip(tube(), AXIS, small)
-    assert sides.width_px == pytest.approx(41, abs=2)
-    assert strip.axis.from_px[1] == pytest.approx(60, abs=0.8)
-    assert front_share(small, strip.axis) > 0.9
 
 
 @pytest.mark.parametrize(("on_axis", "beside"), [(-0.01, 1.0), (1.0, -0.01), (0.0, 0.0)])
