@@ -67,12 +67,8 @@ def filmed(trial: Trial, draw, *, damping=1.0, pressure=1.0, rho=0.0) -> tuple[T
 def small_campaign(seed: int, damping=0.03, pressure=0.01, rho=0.0, replicates=2) -> tuple[tuple, tuple]:
     """Two vines, four pressures; sheet and tracks, and the truth of every trial."""
     draw = np.random.default_rng(seed)
-    trials = [
-        vine_trial(f"D{D:g}_{P:g}_{k}".replace(".", "p"), P, D)
-        for D, pressures in ((24.0, (12, 16, 22, 30)), (18.0, (16, 22, 30, 42)))
-        for P in pressures
-        for k in range(replicates)
-    ]
+    settings = [(24.0, P) for P in (12, 16, 22, 30)] + [(18.0, P) for P in (16, 22, 30, 42)]
+    trials = [vine_trial(f"D{D:g}_{P:g}_{k}", P, D) for D, P in settings for k in range(replicates)]
     pairs, truth = [], []
     for trial in with_names(trials):
         B_off = math.exp(damping * draw.standard_normal())

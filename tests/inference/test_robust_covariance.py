@@ -26,9 +26,8 @@ def misread(seed: int) -> Pairs:
     """Trials that hardly scatter, and a gauge read wrong by 30 Pa or so, anew for every condition."""
     pairs, _ = small_campaign(seed, damping=5e-4, pressure=5e-4, replicates=5)
     draw = np.random.default_rng(seed)
-    wrong = {
-        one: sandwich.PRESSURE_ERROR_PA * draw.standard_normal() for one in sorted({t.condition for t, _ in pairs})
-    }
+    conditions = sorted({trial.condition for trial, _ in pairs})
+    wrong = {one: sandwich.PRESSURE_ERROR_PA * draw.standard_normal() for one in conditions}
     return [(replace(trial, pressure_Pa=trial.pressure_Pa + wrong[trial.condition]), track) for trial, track in pairs]
 
 

@@ -15,11 +15,7 @@ from vinetrack.kinematics.summary import TrialResult, summarise_trial
 from vinetrack.kinematics.velocity import estimate_kinematics, fit_all_windows
 
 SEEDS, LIMITS = range(1000, 1010), SteadySettings()
-STEADY = [
-    pytest.param(Vine(scale, speed), noise_m, rho, id=f"R{scale}-{speed}m_s-{noise_m * 1e3}mm-{rho}")
-    for scale, speed in ((1, 0.2), (1, 3.0), (2, 1.0), (3, 5.0), (4, 0.3), (4, 3.0))
-    for noise_m, rho in ((3e-5, 0.0), (1e-4, 0.6))
-]
+STEADY = [Vine(1, 0.2), Vine(1, 3.0), Vine(2, 1.0), Vine(3, 5.0), Vine(4, 0.3), Vine(4, 3.0)]
 
 
 def gated(track, travel_ratio=2.0, length_m=math.nan):
@@ -37,7 +33,8 @@ def inside(trial, window) -> np.ndarray:
     return np.flatnonzero((trial.track.time_s >= window.from_s - 1e-9) & (trial.track.time_s <= window.to_s + 1e-9))
 
 
-@pytest.mark.parametrize(("vine", "noise_m", "rho"), STEADY)
+@pytest.mark.parametrize("vine", STEADY, ids=str)
+@pytest.mark.parametrize(("noise_m", "rho"), [(3e-5, 0.0), (1e-4, 0.6)])
 def test_speed_is_the_true_mean_and_the_speed_of_balance(vine, noise_m, rho):
     from_mean, from_balance = [], []
     for seed in SEEDS:
@@ -221,14 +218,11 @@ def test_the_run_is_the_longest_there_is(seed):
 
 
 SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
-TRIALS = [
-    (vine, noise_m, rho)
-    for vine in (Vine(1, 0.2), Vine(2, 1.0), Vine(3, 5.0), Vine(4, 3.0), Vine(4, 10.0))
-    for noise_m, rho in ((3e-5, 0.0), (1e-4, 0.6), (3e-4, 0.3))
-]
+VINES = [Vine(1, 0.2), Vine(2, 1.0), Vine(3, 5.0), Vine(4, 3.0), Vine(4, 10.0)]
 
 
-@pytest.mark.parametrize(("vine", "noise_m", "rho"), TRIALS)
+@pytest.mark.parametrize("vine", VINES, ids=str)
+@pytest.mark.parametrize(("noise_m", "rho"), [(3e-5, 0.0), (1e-4, 0.6), (3e-4, 0.3)])
 def test_as_good_as_the_best_single_window_with_the_truth_in_hand_and_its_error_is_stated(vine, noise_m, rho):
     """The stated error holds within a factor of two from four frames after release on."""
     ours, single, pulls = [], {width: [] for width in SINGLE_WINDOWS}, []
