@@ -15,7 +15,7 @@ from hidden import make, shots
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 from hidden_truth import grown, sheet
-from lsoda_vine import as_track, small_campaign
+from lsoda_vine import as_track, fallen_m, small_campaign
 from own_effect import NAME, write_effect
 from tube.folder import write_folder
 from tube.models import fit_tubes, models, threshold_kPa
@@ -23,8 +23,8 @@ from tube.recordings import read_recordings, thresholds
 
 import vinetrack as vt
 from vinetrack.core.problems import Remark, remark
-from vinetrack.core.records import Floats, Trial, plain_track
-from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2, with_error
+from vinetrack.core.records import Trial, plain_track
+from vinetrack.core.units import with_error
 from vinetrack.diagnosis import likelihood_ratio, misfit_tests, result, score_test
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
@@ -449,12 +449,6 @@ DRAG = 0.5
 TUBES_ALONE = {"capstan_friction", "gas_inertia", "tail_friction", "latch_release", "fold_inertia", "wall_stretch"}
 
 
-def fallen_m(time_s: Floats, trial: Trial) -> Floats:
-    """Of a ball in air, y = (v²/g) ln cosh(g t/v) with the terminal speed v = √(2 m g / (ρ A C_D))."""
-    terminal_m_s = math.sqrt(2 * trial.payload_kg * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * DRAG))
-    return terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * np.maximum(time_s, 0.0) / terminal_m_s))
-
-
 def of_ball(name: str, diameter_m: float, mass_kg: float) -> Trial:
     still = {"pressure_Pa": 0.0, "yield_pressure_Pa": 0.0, "travel_ratio": 1.0, "condition": f"{1e3 * mass_kg:g} g"}
     return Trial(name=name, diameter_m=diameter_m, payload_kg=mass_kg, **still)
@@ -469,7 +463,7 @@ def test_the_drag_of_falling_balls_is_named(model):
         for repeat in range(3):
             trial = of_ball(f"d{kind}_{repeat}", *size)
             noise_m = np.random.default_rng(20100 + 10 * kind + repeat).normal(0, 2e-3, time_s.size)
-            balls.append((trial, as_track(time_s, fallen_m(time_s - 0.0513, trial) + 0.004 + noise_m)))
+            balls.append((trial, as_track(time_s, fallen_m(time_s - 0.0513, trial, DRAG) + 0.004 + noise_m)))
     found = vt.diagnose(balls, model=vt.make_model(model), ladder=False, advice=False)
     assert (found.verdict, found.effects) == ("missing", ("air_drag",))
     drag = found.fits[-1]["C_D"]
@@ -499,7 +493,7 @@ def test_a_lens_that_is_off_by_centimetres_in_a_drop_of_47_m_is_no_fault_of_the_
     drops = []
     for seed in (10, 11):
         trial, noise_m = of_ball(f"d{seed}", 0.074, 0.145), np.random.default_rng(seed).normal(0, 5e-3, 68)
-        y = fallen_m(time_s, trial)
+        y = fallen_m(time_s, trial, DRAG)
         seen, part = y < 47, 2 * y / 47 - 1
         lens_m = 0.018 * (part**3 - 0.6 * part) + 0.01 * (part**2 - 1)
         drops.append((trial, plain_track(time_s[seen], (y + lens_m + noise_m)[seen])))

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from grown import Pairs, pairs_of
 from hidden_truth import grown, sheet
-from lsoda_vine import ar1
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -31,6 +30,7 @@ from vinetrack.inference.fit_result import YIELD_PRESSURE
 from vinetrack.inference.optimiser import relative_residual
 from vinetrack.inference.solving import solve_onward
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
+from vinetrack.tracks.position_noise import ar1_noise
 
 FIRST, LATER = questions.FALSE_ALARM_LEVEL_FIRST_ROUND, questions.FALSE_ALARM_LEVEL_LATER_ROUNDS
 
@@ -180,7 +180,7 @@ def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials=(
 def wandering(*, at_rest: bool) -> Pairs:
     draw, spoilt = np.random.default_rng(3), []
     for trial, track in grown(seed=31):
-        wander_m = WANDER_M * ar1(track.time_s.size, 0.9, draw)
+        wander_m = ar1_noise(track.time_s.size, WANDER_M, 0.9, draw)
         moves = track.lead_position_m > track.lead_position_m[:5].mean() + 2e-3
         wander_m[: int(np.argmax(moves))] *= at_rest
         spoilt.append((trial, replace(track, lead_position_m=track.lead_position_m + wander_m)))

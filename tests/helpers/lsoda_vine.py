@@ -8,6 +8,7 @@ import numpy as np
 from by_hand import followed
 
 from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import Vine
 from vinetrack.tracks.position_noise import ar1_noise
@@ -46,9 +47,10 @@ def as_track(time_s: np.ndarray, position_m: np.ndarray, pressure_Pa: np.ndarray
     return plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
 
 
-def ar1(count: int, rho: float, draw: np.random.Generator) -> np.ndarray:
-    """Stationary noise of standard deviation 1."""
-    return ar1_noise(count, 1.0, rho, draw)
+def fallen_m(time_s: np.ndarray, trial: Trial, drag: float) -> np.ndarray:
+    """Of a ball in air, y = (v²/g) ln cosh(g t/v) with the terminal speed v = √(2 m g / (ρ A C_D))."""
+    terminal_m_s = math.sqrt(2 * trial.payload_kg * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * drag))
+    return terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * np.maximum(time_s, 0.0) / terminal_m_s))
 
 
 def filmed(trial: Trial, draw, *, damping=1.0, pressure=1.0, rho=0.0) -> tuple[Track, float, float]:
@@ -59,7 +61,7 @@ def filmed(trial: Trial, draw, *, damping=1.0, pressure=1.0, rho=0.0) -> tuple[T
     B = B_TRUE[round(trial.diameter_m * 1e3, 3)] * damping
     position = grown_position(trial, time_s - release_s, B, N_TRUE, pressure)
     seen = np.isfinite(position)
-    noise = NOISE_M * ar1(int(seen.sum()), rho, draw)
+    noise = NOISE_M * ar1_noise(int(seen.sum()), 1.0, rho, draw)
     return as_track(time_s[seen], origin_m + position[seen] + noise), release_s, origin_m
 
 

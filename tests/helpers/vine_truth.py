@@ -18,7 +18,6 @@ G = 9.81
 N_EXPONENT = 0.37
 B_PRINTED = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}
 CAPTURE_FPS = 1069.0
-make_track = plain_track
 
 
 @dataclass(frozen=True)
@@ -97,5 +96,5 @@ def record(vine: Vine, rng, *, noise_m: float, rho=0.0, rest_frames=40, end_fram
     lead_speed = np.where((time_s <= release_s) | (time_s > release_s + duration_s), 0.0, lead_speed)
     offset_s, origin_m = rng.uniform(-3, 3), rng.uniform(-0.1, 0.1)
     noisy = lead + origin_m + ar1(n, noise_m, rho, rng)
-    track = make_track(time_s + offset_s, noisy)
+    track = plain_track(time_s + offset_s, noisy)
     return Recording(track, lead + origin_m, lead_speed, release_s + offset_s, release_s + duration_s + offset_s)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from grown import grown, pairs_of
 from hidden_truth import sheet
-from lsoda_vine import B_TRUE, FPS, N_TRUE, NOISE_M, ar1, as_track, filmed, grown_position, small_campaign, vine_trial
+from lsoda_vine import B_TRUE, FPS, N_TRUE, NOISE_M, as_track, filmed, grown_position, small_campaign, vine_trial
 from vine_truth import Vine, record
 
 import vinetrack as vt
@@ -212,7 +212,7 @@ def test_trials_without_usable_motion_are_left_out_and_named(campaign):
     """One that never moves, one that moves below its yield pressure, one with three usable points in motion of four."""
     pairs, at_rest = campaign[1], 1e-5 * np.random.default_rng(2).standard_normal(40)
     tracks = {name: np.concatenate([at_rest, 2e-3 * np.arange(1, n + 1)]) for name, n in (("few", 3), ("enough", 4))}
-    tracks["still"] = NOISE_M * ar1(200, 0.0, np.random.default_rng(1))
+    tracks["still"] = NOISE_M * np.random.default_rng(1).standard_normal(200)
     below = replace(pairs[0][0], name="below", pressure_Pa=1.5e3, pressure_sigma_Pa=15.0)
     odd = [(vine_trial(name, 20), as_track(np.arange(y.size) / FPS, y)) for name, y in tracks.items()]
     fit = vt.fit(vt.base_model(), [*pairs, *odd, (below, pairs[0][1])], profile=False)

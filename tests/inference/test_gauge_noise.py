@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
-from lsoda_vine import N_TRUE, ar1, as_track, small_campaign
+from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
@@ -17,6 +17,7 @@ from vinetrack.inference.fit import predict_prepared
 from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.robust_covariance import recorded_pressures, systematics_of
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
+from vinetrack.tracks.position_noise import ar1_noise
 
 TIMES_S = np.arange(0.0, 0.6, 1e-3)
 FRAMES = np.arange(TIMES_S.size)
@@ -212,7 +213,7 @@ def test_noise_behind_a_filter_is_detected_as_correlated():
     draw = np.random.default_rng(5)
     for rho in (0.0, 0.5, 0.85):
         falls = 20e3 * (1 + TIMES_S[:300] / 0.4) ** -0.3
-        traces = [falls + 100.0 * ar1(300, rho, draw) for _ in range(24)]
+        traces = [falls + ar1_noise(300, 100.0, rho, draw) for _ in range(24)]
         told = gauge.noise_correlation(traces)
         assert told == pytest.approx(rho, abs=0.05)
         sigmas = [noise.sigma_Pa for noise in gauge.noise_of_traces(gauge.gauge_readings(traces), told)]

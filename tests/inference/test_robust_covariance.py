@@ -6,12 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, N_TRUE, as_track, filmed, small_campaign, vine_trial
+from lsoda_vine import B_TRUE, N_TRUE, as_track, fallen_m, filmed, small_campaign, vine_trial
 from scipy.stats import t as student
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.drift import against_the_sheet
 from vinetrack.inference import fit_result, optimiser, position_errors
 from vinetrack.inference import robust_covariance as sandwich
@@ -98,12 +97,11 @@ def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials):
 
 
 def dropped(name: str, seed: int, drag: float, noise_m: float = 2e-3) -> tuple[Trial, Track]:
-    """A ball of 100 mm and 20 g that falls in air, y = (v²/g) ln cosh(g t/v), filmed with 2 mm of noise or so."""
+    """A ball of 100 mm and 20 g that falls in air, filmed with 2 mm of noise or so."""
     trial = Trial(name=name, diameter_m=0.1, pressure_Pa=0.0, yield_pressure_Pa=0.0, payload_kg=20e-3, travel_ratio=1.0)
-    terminal_m_s = float(np.sqrt(2 * 20e-3 * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * drag)))
     time_s = np.arange(100) / 120
-    fallen_m = terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * time_s / terminal_m_s))
-    return trial, as_track(time_s, fallen_m + np.random.default_rng(seed).normal(0, noise_m, time_s.size))
+    noise = np.random.default_rng(seed).normal(0, noise_m, time_s.size)
+    return trial, as_track(time_s, fallen_m(time_s, trial, drag) + noise)
 
 
 def scattering(seed: int, campaign: int, count: int) -> Pairs:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from vine_truth import B_PRINTED, CAPTURE_FPS, N_EXPONENT, G, Recording, Vine, ar1, make_track, motion, record
+from vine_truth import B_PRINTED, CAPTURE_FPS, N_EXPONENT, G, Recording, Vine, ar1, motion, record
 
 from vinetrack import effects
 from vinetrack.core.records import Kinematics, Track, Trial, Window, plain_track
@@ -135,12 +135,12 @@ def test_origin_is_within_its_error():
 def test_motion_from_the_first_frame_is_said_and_a_start_just_missed_is_extrapolated():
     time_s = np.arange(8, 200) / 1000
     noise_m = ar1(192, 2e-5, 0.0, np.random.default_rng(1000))
-    even = make_track(time_s, 0.02 + 0.5 * time_s + noise_m)
+    even = plain_track(time_s, 0.02 + 0.5 * time_s + noise_m)
     assert release_of(even).moving_from_start
     assert release_of(even).time_s == time_s[0]
     assert release_of(even).lead_position_m == pytest.approx(0.024, abs=4e-4)
     np.testing.assert_array_equal(flag_rest(even, release_of(even)).flag, even.flag)
-    release = release_of(make_track(time_s, 0.5 * 9.81 * time_s**2 + noise_m), travel_ratio=1)
+    release = release_of(plain_track(time_s, 0.5 * 9.81 * time_s**2 + noise_m), travel_ratio=1)
     assert release.moving_from_start
     assert release.time_s == pytest.approx(0.0, abs=1e-3)
     assert abs(release.lead_position_m) < 3e-4
@@ -195,7 +195,7 @@ def test_a_falling_ball_is_measured_but_has_no_place_in_the_law():
     fallen = 0.5 * G * np.maximum(time_s - 0.05, 0) ** 2
     noise = 1e-4 * np.random.default_rng(4).standard_normal(150)
     ball = Trial(name="ball", travel_ratio=1.0, payload_kg=0.05, pressure_Pa=0.0, yield_pressure_Pa=0.0)
-    result = summary.summarise_trial(ball, make_track(time_s, 0.3 + fallen + noise), RunSettings(), base_model())
+    result = summary.summarise_trial(ball, plain_track(time_s, 0.3 + fallen + noise), RunSettings(), base_model())
     assert result.point["used"] is False
     assert result.row["final_lead_velocity_m_s"] == pytest.approx(G * (time_s[-1] - 0.05), rel=0.05)
     assert math.isnan(float(result.row["efficiency"]))  # type: ignore[arg-type]

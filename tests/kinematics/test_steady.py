@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lsoda_vine import as_track, grown_position, vine_trial
-from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
+from vine_truth import CAPTURE_FPS, Vine, ar1, record
 
+from vinetrack.core.records import plain_track
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.experiment.settings import RunSettings, SteadySettings
 from vinetrack.kinematics.steady import WindowMoments, gated_window, paper_window, user_window
@@ -26,7 +27,7 @@ def ramp(drop: float, noise_m: float, seed: int = 1000, n: int = 300):
     """Lead speed falling evenly from 0.5 m/s by the fraction `drop` over n frames."""
     time_s = np.arange(n) / 1000
     y = 0.5 * time_s * (1 - drop / 2 * time_s / time_s[-1])
-    return make_track(time_s, y + ar1(n, noise_m, 0.0, np.random.default_rng(seed)))
+    return plain_track(time_s, y + ar1(n, noise_m, 0.0, np.random.default_rng(seed)))
 
 
 def inside(trial, window) -> np.ndarray:
@@ -74,7 +75,7 @@ def test_still_frames_oscillation_and_acceleration_are_never_steady_motion(noise
     for seed in range(1000, 1020):
         for y in motions:
             noise = ar1(y.size, noise_m, rho, np.random.default_rng(seed))
-            assert not gated(make_track(time_s[: y.size], y + noise)).accepted
+            assert not gated(plain_track(time_s[: y.size], y + noise)).accepted
 
 
 def test_a_plateau_declining_by_two_per_cent_is_accepted_and_its_drift_reported():
@@ -101,7 +102,7 @@ def test_error_of_the_speed_is_honest_at_constant_speed(rho):
     time_s, pulls = np.arange(200) / 1069, []
     for seed in range(1000, 1080):
         y = 0.5 * time_s + ar1(200, 1e-4, rho, np.random.default_rng(seed))
-        window = gated(make_track(time_s, y))
+        window = gated(plain_track(time_s, y))
         assert window.accepted
         pulls.append((window.x_ss_m_s - 1.0) / window.x_ss_sigma_m_s)
     assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.4
@@ -111,7 +112,7 @@ def test_a_long_plateau_does_not_swallow_its_start_up():
     time_s = np.arange(600) / 1000
     moving = np.maximum(time_s - 0.05, 0)
     y = 0.5 * (moving - 0.02 * (1 - np.exp(-moving / 0.02)))
-    window = gated(make_track(time_s, y + ar1(600, 3e-5, 0.0, np.random.default_rng(1000))))
+    window = gated(plain_track(time_s, y + ar1(600, 3e-5, 0.0, np.random.default_rng(1000))))
     assert window.accepted
     assert window.from_s > 0.05 + 3 * 0.02
     assert window.x_ss_m_s == pytest.approx(1.0, rel=1e-3)
@@ -147,7 +148,7 @@ def test_a_speed_that_bends_within_the_window_is_known_no_better_than_the_bend()
     u = 2 * time_s / time_s[-1] - 1
     bend_m_s = 4e-3
     y = 0.5 * time_s + bend_m_s * time_s[-1] / 2 * np.polynomial.legendre.legval(u, [0, 0, 0, 1])
-    track = make_track(time_s, y + ar1(200, 1e-6, 0.0, np.random.default_rng(1000)))
+    track = plain_track(time_s, y + ar1(200, 1e-6, 0.0, np.random.default_rng(1000)))
     window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.0, 1.0), LIMITS, math.nan)
     assert window.x_ss_m_s == pytest.approx(1.0, abs=5e-4)
     assert window.x_ss_sigma_m_s == pytest.approx(2 * bend_m_s, rel=0.05)
@@ -207,7 +208,7 @@ def test_the_run_is_the_longest_there_is(seed):
     time_s = np.arange(n) / 1000
     speed = np.where(np.arange(n) < rng.integers(0, n), rng.uniform(0, 1), 1.0)
     y = np.cumsum(speed) / 1000 + rng.choice([1e-6, 1e-5, 5e-5]) * rng.standard_normal(n)
-    window = paper_window(make_track(time_s, y), travel_ratio=2)
+    window = paper_window(plain_track(time_s, y), travel_ratio=2)
     velocity = (y[2:] - y[:-2]) / 0.002
     assert window.n_points == longest_by_brute_force(velocity)
     assert window.accepted == (window.n_points > 0)
@@ -249,7 +250,7 @@ def test_exact_cubic_is_returned_exactly_and_points_without_position_or_with_a_f
     cubic = np.polynomial.Polynomial([0.2, 0.4, 3.0, -11.0])
     y = cubic(time_s)
     y[50], y[[0, 40, 41, 99]] = 7.0, np.nan
-    track = make_track(time_s, y)
+    track = plain_track(time_s, y)
     flagged = replace(track, flag=np.where(np.arange(100) == 50, "rejected", track.flag))
     kinematics = estimate_kinematics(flagged, travel_ratio=2)
     kept_s = np.delete(time_s, [0, 40, 41, 50, 99])
@@ -267,7 +268,7 @@ def test_where_points_jump_about_the_velocity_is_known_as_badly_as_they_say():
         time_s = np.arange(300) / 1000
         y = 0.2 * time_s + 1e-6 * draw.standard_normal(300)
         y[150:162] += 1e-3 * draw.standard_normal(12)
-        kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=2)
+        kinematics = estimate_kinematics(plain_track(time_s, y), travel_ratio=2)
         off = kinematics.lead_velocity_m_s[150:162] - 0.2
         pulls.append(off / kinematics.lead_velocity_sigma_m_s[150:162])
     assert 0.2 < np.median(np.abs(pulls)) < 2

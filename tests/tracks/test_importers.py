@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nptdms import ChannelObject, TdmsWriter
-from vine_truth import make_track
 
-from vinetrack.core.records import Trial, with_flag
+from vinetrack.core.records import Trial, plain_track, with_flag
 from vinetrack.tracks import importers
 from vinetrack.tracks.importers import TrackError, read_pressure_trace, read_track
 
@@ -173,7 +172,7 @@ def test_projects_that_cannot_be_used(tmp_path, text):
 def test_a_trace_is_interpolated_on_the_times_of_the_track_unless_it_is_of_another_clock(tmp_path):
     time_s, pressure_Pa = read_pressure_trace(write(tmp_path, "time_s;pressure_kPa\n-1;30,5\n0,5;29\n10;10\n"))
     np.testing.assert_allclose(pressure_Pa, [30500, 29000, 10000])
-    track = make_track(np.arange(5.0), np.arange(5.0))
+    track = plain_track(np.arange(5.0), np.arange(5.0))
     np.testing.assert_allclose(
         importers.attach_pressure(track, time_s, pressure_Pa).pressure_Pa, [29500, 28000, 26000, 24000, 22000]
     )
@@ -239,7 +238,7 @@ CLOCK_S = np.arange(120) / 200
 def ended(position_m: np.ndarray, seed: int = 620, **stated: float):
     trial = Trial(name="t", **({"travel_ratio": 1.0} | stated))
     noise = np.random.default_rng(seed).normal(0, 2e-4, position_m.size)
-    track = importers.flag_end_of_motion(trial, make_track(CLOCK_S, position_m + noise))
+    track = importers.flag_end_of_motion(trial, plain_track(CLOCK_S, position_m + noise))
     return np.flatnonzero(with_flag(track.flag, "after_end")), track.notes
 
 

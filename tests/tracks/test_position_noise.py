@@ -9,10 +9,10 @@ from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter, savgol_filter
-from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
+from vine_truth import CAPTURE_FPS, Vine, ar1, record
 
 import vinetrack as vt
-from vinetrack.core.records import Track, Trial, with_flag
+from vinetrack.core.records import Track, Trial, plain_track, with_flag
 from vinetrack.tracks import position_noise as module
 from vinetrack.tracks.frame_timing import correct_frames, count_missing, frames_surely_missing
 from vinetrack.tracks.position_noise import (
@@ -147,7 +147,7 @@ def steady_track(rows: np.ndarray, by_m: np.ndarray | float, seed: int = 20001, 
     time_s = np.arange(300) * FRAME_S
     y = 0.6 * np.maximum(time_s - time_s[30], 0) + ar1(300, noise_m, 0.0, np.random.default_rng(seed))
     y[rows] += by_m
-    return make_track(time_s, y)
+    return plain_track(time_s, y)
 
 
 def rejected(track: Track) -> list[int]:
@@ -186,7 +186,7 @@ def test_an_outlier_near_the_point_before_is_rejected_and_not_a_copy(row, uneven
     time_s = time_s + unevenness * FRAME_S * np.sin(700 * time_s)
     y = 6.0 * time_s + ar1(300, 3e-5, 0.0, np.random.default_rng(20003))
     y[row] = y[row - 1] + 0.2 * (y[row + 1] - y[row - 1]) / 2
-    track = make_track(time_s, y)
+    track = plain_track(time_s, y)
     assert not find_outliers(track.time_s, y, spare_copies=True)[row]
     out = correct_frames(track)
     assert rejected(out) == [row]
@@ -200,7 +200,7 @@ def test_at_the_ends_a_motion_may_have_stopped_or_begun_and_not_the_other_way(ro
     time_s = np.arange(300) * FRAME_S
     y = 6.0 * time_s + ar1(300, 3e-5, 0.0, np.random.default_rng(20004))
     y[row] += steps * 6.0 * FRAME_S
-    assert rejected(reject_outliers(make_track(time_s, y))) == ([row] if (steps > 0) == (row > 1) else [])
+    assert rejected(reject_outliers(plain_track(time_s, y))) == ([row] if (steps > 0) == (row > 1) else [])
 
 
 def test_a_point_placed_by_hand_is_not_an_outlier():
@@ -216,7 +216,7 @@ def test_rounded_positions_have_no_outliers_or_missing_frames(step_m, every):
     """Clicked to the millimetre, or written with few decimals, and at rest mostly: the noise is that of rounding."""
     for track in (track for seed in range(20020, 20026) for track in recorded(seed)):
         position_m = np.round(track.lead_position_m[::every] / step_m) * step_m
-        assert not correct_frames(reject_outliers(make_track(track.time_s[::every], position_m))).notes
+        assert not correct_frames(reject_outliers(plain_track(track.time_s[::every], position_m))).notes
 
 
 TIME_S = np.arange(150) / 1000.0
@@ -267,12 +267,8 @@ def test_a_model_is_smoothed_as_its_positions_were(tmp_path):
 
 
 CLEAR = [  # speeds at which one frame's step is at least 8 standard deviations of a position
-    (Vine(1, 1.0), 3e-5, 0.0),
-    (Vine(2, 5.0), 1e-4, 0.0),
-    (Vine(2, 5.0), 1e-4, 0.6),
-    (Vine(3, 10.0), 1e-4, 0.6),
-    (Vine(4, 3.0), 1e-4, 0.0),
-    (Vine(4, 10.0), 3e-4, 0.3),
+    *((Vine(1, 1.0), 3e-5, 0.0), (Vine(2, 5.0), 1e-4, 0.0), (Vine(2, 5.0), 1e-4, 0.6)),
+    *((Vine(3, 10.0), 1e-4, 0.6), (Vine(4, 3.0), 1e-4, 0.0), (Vine(4, 10.0), 3e-4, 0.3)),
 ]
 
 
@@ -286,13 +282,13 @@ def stale(track: Track, row: int) -> Track:
 def inserted(track: Track, row: int) -> Track:
     """A copy of the frame before `row` stands at `row`, and all later ones are a frame late."""
     y = np.insert(track.lead_position_m, row, track.lead_position_m[row - 1])
-    return make_track(np.append(track.time_s, track.time_s[-1] + FRAME_S), y)
+    return plain_track(np.append(track.time_s, track.time_s[-1] + FRAME_S), y)
 
 
 def dropped(track: Track, row: int, count: int = 1) -> Track:
     """`count` frames from `row` on are missing, and all later ones are as many frames early."""
     y = np.delete(track.lead_position_m, range(row, row + count))
-    return make_track(track.time_s[: y.size], y)
+    return plain_track(track.time_s[: y.size], y)
 
 
 def flags(track: Track) -> dict[int, str]:
@@ -302,7 +298,7 @@ def flags(track: Track) -> dict[int, str]:
 def still_then_even(noise_m: float = 2e-5, n: int = 120) -> Track:
     time_s = np.arange(n) * FRAME_S
     y = 1.0 * np.maximum(time_s - time_s[30], 0) + ar1(n, noise_m, 0.0, np.random.default_rng(1000))
-    return make_track(time_s, y)
+    return plain_track(time_s, y)
 
 
 @pytest.mark.parametrize(("row", "noise_m", "sure"), [(70, 1e-4, True), (110, 1e-4, False), (110, 1e-5, True)])
@@ -320,7 +316,7 @@ def test_after_dropped_frames_times_go_on_by_as_many(count):
     out = correct_frames(dropped(clean, 70, count))
     assert flags(out) == {70: "gap;retimed"}
     np.testing.assert_allclose(out.time_s, clean.time_s[rows], atol=1e-12)
-    gapped = make_track(clean.time_s[rows], clean.lead_position_m[rows])
+    gapped = plain_track(clean.time_s[rows], clean.lead_position_m[rows])
     for timed, flag in ((out, "gap;retimed"), (gapped, "gap")):
         again = correct_frames(timed)
         assert flags(again) == {70: flag}
@@ -402,7 +398,7 @@ def test_noise_that_grows_along_the_way_is_told_from_a_dropped_frame():
         position_m = np.concatenate([np.zeros(40), 5e-3 * np.arange(1, 141)])
         noise_m = 2e-5 + 8e-4 * position_m / position_m[-1]
         noisy_m = position_m + noise_m * np.random.default_rng(seed).standard_normal(180)
-        track = make_track(np.arange(180) * FRAME_S, noisy_m)
+        track = plain_track(np.arange(180) * FRAME_S, noisy_m)
         assert not with_flag(correct_frames(track).flag, "retimed").any()
         found += "retimed" in flags(correct_frames(dropped(track, 80))).get(80, "")
     assert found >= 36
