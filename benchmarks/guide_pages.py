@@ -27,7 +27,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 
 import pandas as pd
-from doc_commands import Shown, printed, rewritten
+from commanded import Shown, printed, rewritten
 from grown import grown, sheet
 
 from vinetrack.core.tables import write_csv, write_json

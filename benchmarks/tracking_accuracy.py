@@ -221,10 +221,32 @@ def hard_rows(seeds: list[int], folder: Path, names: tuple[str, ...] = HARD + BO
     return rows
 
 
+HARDER: dict[str, dict] = {
+    "plain": {},
+    "door": {"door": True},
+    "flicker": {"flicker": 0.05},
+    "shake": {"shake": 1.2},
+    "wobble": {"wobble": 3.0},
+    "dark": {"film": 20.0},
+    "low_contrast": {"film": 95.0, "wall_sd": 4.0, "tail_sd": 3.0},
+    "half_exposure": {"speed": 40.0, "exposure": 0.5, "rise_frames": 4.0},
+    "payload": {"payload": True, "door": True},
+    "slow": {"speed": 3.0, "rise_frames": 30.0},
+    "reversal": {"gradient": 110.0, "film": 130.0},
+    "oblique": {"angle_deg": 12.0, "from_px": (30.0, 45.0), "end_px": 700.0},
+    "leftward": {"angle_deg": 180.0, "from_px": (920.0, 120.0)},
+    "no_rest": {"rest_frames": 0, "start_px": 80.0},
+    "flat_tip": {"tip_depth": 0.0},
+    "round_tip": {"tip_depth": 28.0},
+    "strong_tail": {"tail_sd": 30.0},
+}
+"""Changes to the plan of a plain scene that make recordings harder, by name."""
+
+
 def plain_rows(seeds: list[int], folder: Path) -> list[Row]:
     """Recordings drawn by other code, H.264 at a camera's rate."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
-    from plain_scene import HARDER, Plan, plain_scene, write_video
+    from plain_scene import Plan, plain_scene, write_video
 
     rows = []
     for name, changes in HARDER.items():

@@ -1,11 +1,10 @@
 """What every test has in common: nothing is remembered beyond a test, so that their order does not matter."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Generator
 from itertools import count
+from pathlib import Path
 
 import pytest
 
@@ -39,6 +38,14 @@ def _folder_of_memories(tmp_path_factory):
         folder = tmp_path_factory.mktemp("state")
         patch.setenv("XDG_STATE_HOME", str(folder / "fixtures"))
         yield folder
+
+
+@pytest.fixture(scope="session")
+def real():
+    """The folder of recordings made by others."""
+    if not os.environ.get("VINETRACK_REAL_DATA"):
+        pytest.skip("VINETRACK_REAL_DATA is unset: no real recordings to try")
+    return Path(os.environ["VINETRACK_REAL_DATA"])
 
 
 @pytest.fixture(autouse=True)

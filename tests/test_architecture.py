@@ -1,7 +1,5 @@
 """The package keeps its shape: budgets, imports that flow one way, importing that does nothing, documented names."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re
@@ -42,7 +40,7 @@ BUDGETS = {
     "pages": (3363, 8, 24),
     "paper": (842, 3, 15),
     "pipeline": (3027, 10, 13),
-    "planning": (2145, 4, 18),
+    "planning": (2147, 4, 18),
     "report": (747, 2, 3),
     "results": (251, 2, 8),
     "tracks": (1629, 4, 19),

@@ -1,7 +1,5 @@
 """Pages and docstrings: links lead somewhere, commands exist and print what is shown, examples run."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import json
@@ -11,8 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer.main
-from commanded import run, succeed
-from doc_commands import Shown, pieces, printed
+from commanded import Shown, pieces, printed, run, succeed
 from own_effect import PAGE as OWN_EFFECT
 from own_effect import block, write_effect
 from PIL import Image
@@ -21,7 +18,6 @@ import vinetrack
 from vinetrack.cli.main import app
 from vinetrack.pipeline.stages import STAGES
 
-# README and docs: links and pictures lead somewhere, commands exist, nothing names the machine it was written on.
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]

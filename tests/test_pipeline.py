@@ -1,7 +1,5 @@
 """A whole experiment of analytic truth, from sheet and tracks to the report, by Snakemake and stage by stage."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json
@@ -20,7 +18,6 @@ from lsoda_vine import grown_position, vine_trial
 import vinetrack
 from vinetrack.pipeline.stages import STAGES
 
-# A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
 ROOT = Path(__file__).parents[1]
 N = 0.4
 B = {12: 2.0, 24: 6.0}

@@ -3,10 +3,7 @@
 The truth is the motion that the virtual laboratory's camera filmed; the analysis sees files alone.
 """
 
-from __future__ import annotations
-
 import json
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -192,15 +189,11 @@ def test_a_scale_that_is_given_serves_as_well(tmp_path):
         assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35
 
 
-REAL = os.environ.get("VINETRACK_REAL_DATA", "")
-
-
 @pytest.mark.real
-@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
-def test_a_falling_ball_gives_g_through_the_whole_chain(tmp_path):
+def test_a_falling_ball_gives_g_through_the_whole_chain(real, tmp_path):
     folder = tmp_path / "fall"
     folder.mkdir()
-    shutil.copy(Path(REAL) / "freefall_1000fps" / "freefall.mp4", folder)
+    shutil.copy(real / "freefall_1000fps" / "freefall.mp4", folder)
     (folder / "trials.csv").write_text(
         "trial,video,diameter_mm,travel_ratio,mm_per_px,capture_fps\nball,freefall.mp4,20,1,0.27307,1000\n"
     )

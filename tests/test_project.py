@@ -1,7 +1,5 @@
 """The make targets, the lock, the file for hosted machines and Snakemake's profiles name what is here."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -12,14 +12,8 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis import campaign_power, linear_power
+from vinetrack.diagnosis import further_trials as advice
 from vinetrack.diagnosis.campaign_power import CampaignDesign, FilmingPlan, make, planned_tests
-from vinetrack.diagnosis.further_trials import (
-    NextExperiment,
-    _alone_and_distinct,
-    exploratory_trials,
-    further_trials,
-    next_experiment,
-)
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
@@ -29,9 +23,7 @@ from vinetrack.planning.predictive_inputs import damping_prior
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
 
 
-def planned(
-    replicates: int, spreads=(0.01, 0.03), kPa=(14, 24, 34), candidates=CANDIDATES, **cells: str
-) -> CampaignDesign:
+def planned(replicates, spreads=(0.01, 0.03), kPa=(14, 24, 34), candidates=CANDIDATES, **cells) -> CampaignDesign:
     trials: list[Trial] = []
     known = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "yield_pressure_kPa": "3", **cells}
     for pressure in kPa:
@@ -156,7 +148,7 @@ def few():
 
 def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_come_in_pairs_and_are_few(few):
     design, power = few
-    further = further_trials(design, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
+    further = advice.further_trials(design, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
     assert further.before < 0.9 <= further.after
     pressures = [1e3 * added["pressure_kPa"] for added in further.trials]
     like = design.trials[0]
@@ -172,8 +164,8 @@ def test_further_trials_have_the_power_of_a_sheet_with_them_stay_within_limits_c
 
 def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_reported(few):
     design, power = few
-    assert further_trials(design, power["leak"], 1.5 * power["leak"].size_at(0.98), 0.9, LIMITS).trials == ()
-    never = further_trials(design, power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
+    assert advice.further_trials(design, power["leak"], 1.5 * power["leak"].size_at(0.98), 0.9, LIMITS).trials == ()
+    never = advice.further_trials(design, power["air_drag"], 0.05, 0.9, LIMITS.model_copy(update={"trials": 4}))
     assert not never.is_reached
     assert never.unlimited < 0.9
 
@@ -195,7 +187,7 @@ def sizes_with(design: campaign_power.CampaignDesign, settings: list[tuple[float
 def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promised():
     """After three trials of one vine at each of two pressures, through a connector that is always the same."""
     design = planned(3, (0.005, 0.02), (14, 24), NAMES, chamber_l="3.7", inlet_mm="8")
-    found = exploratory_trials(design, power_with(design, nonlinear=True), CONNECTOR_LIMITS)
+    found = advice.exploratory_trials(design, power_with(design, nonlinear=True), CONNECTOR_LIMITS)
     settings = [(t["pressure_kPa"], t["inlet_mm"]) for t in found.trials for _ in range(t["replicates"])]
     assert len(settings) == 4
     recommended = np.array([found.then[name].size_at(0.9) for name in NAMES])
@@ -208,7 +200,7 @@ def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promise
 
 
 def test_information_apart_from_the_most_similar_rival():
-    alone, apart = _alone_and_distinct(np.array([[[4.0, 2.0, 1.0], [2.0, 5.0, 0.0], [1.0, 0.0, 0.5]]]))
+    alone, apart = advice._alone_and_distinct(np.array([[[4.0, 2.0, 1.0], [2.0, 5.0, 0.0], [1.0, 0.0, 0.5]]]))
     assert alone.tolist() == [[4.0, 5.0, 0.5]]
     assert apart[0] == pytest.approx([4 - 1 / 0.5, 5 - 4 / 4, 0.5 - 1 / 4])
 
@@ -233,7 +225,7 @@ def fits_of(pairs: Pairs, *effects: str):
     return [vt.refit(base, base.model + getattr(vt.effects, name)) for name in effects]
 
 
-def as_trials(found: NextExperiment, like: Trial) -> list[Trial]:
+def as_trials(found: advice.NextExperiment, like: Trial) -> list[Trial]:
     columns = {
         "pressure_Pa": ("pressure_kPa", 1e3), "pressure_sigma_Pa": ("pressure_kPa", 10),
         "payload_kg": ("payload_g", 1e-3), "diameter_m": ("diameter_mm", 1e-3), "thickness_m": ("thickness_um", 1e-6),
@@ -272,7 +264,7 @@ def dragged():
 @pytest.mark.slow
 def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_without_a_new_vine(dragged):
     pairs, fits = dragged
-    advised = next_experiment(fits)
+    advised = advice.next_experiment(fits)
     assert not any(trial["new_vine"] for trial in advised.trials)
     assert {trial["inlet_mm"] for trial in advised.trials} - {8.0}
     assert sum(trial["replicates"] for trial in advised.trials) == 4
@@ -289,7 +281,7 @@ def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_witho
 @pytest.mark.slow
 def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(dragged):
     pairs, fits = dragged
-    found = next_experiment(fits, Limits(inlet_mm=(8.0,), trials=5))
+    found = advice.next_experiment(fits, Limits(inlet_mm=(8.0,), trials=5))
     assert any(trial["new_vine"] for trial in found.trials)
     new = grown(as_trials(found, pairs[0][0]), 4102, off=1.15)
     predicted = found.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
@@ -303,7 +295,7 @@ def test_trials_respect_every_limit(dragged):
         trials=3, pressure_kPa=(10.0, 30.0), payload_g=(0.0, 0.0), diameter_mm=(18.0, 24.0),
         thickness_um=(120.0, 200.0), inlet_mm=(5.0, 8.0), chamber_l=(3.7,), hoop_stress_MPa=1.6,
     )  # fmt: skip
-    found = next_experiment(dragged[1], limits)
+    found = advice.next_experiment(dragged[1], limits)
     assert found.trials
     for entry in found.trials:
         assert 10 <= entry["pressure_kPa"] <= 30
@@ -318,6 +310,6 @@ def test_trials_respect_every_limit(dragged):
 
 @pytest.mark.slow
 def test_tied_measurement_errors_call_for_a_measurement_instead_of_trials(dragged):
-    found = next_experiment(fits_of(dragged[0], "length_scale", "time_base"))
+    found = advice.next_experiment(fits_of(dragged[0], "length_scale", "time_base"))
     assert found.trials == ()
     assert (found.advice.code, found.advice.facts["faults"]) == ("measure_first", ["length_scale", "time_base"])

@@ -22,9 +22,7 @@ from vinetrack.inference.fit_result import TrialFit
 STEP_S = 1e-3
 
 
-def trial_fit(
-    name: str, time_s: Floats, position_m: Floats, speed_m_s: float, release_s: float, origin_m: float
-) -> TrialFit:
+def trial_fit(name: str, time_s: Floats, position_m: Floats, speed_m_s, release_s, origin_m) -> TrialFit:
     since_s = np.maximum(time_s - release_s, 0.0)
     model_m = origin_m + speed_m_s * since_s
     off_m = position_m - model_m
@@ -37,9 +35,7 @@ def trial_fit(
     )  # fmt: skip
 
 
-def grown(
-    name: str, *, speed: float = 1.0, noise_m: float = 0.0, rest: int = 30, clock_s: float = 0.0, origin_m: float = 0.0
-) -> TrialFit:
+def grown(name: str, *, speed=1.0, noise_m=0.0, rest=30, clock_s=0.0, origin_m=0.0) -> TrialFit:
     """A vine that speeds up as 1 − exp(−t / 20 ms) towards 2 m/s times `speed`, begun `clock_s` after its time 0."""
     time_s = clock_s + STEP_S * np.arange(-rest, 151)
     since_s = np.maximum(time_s - clock_s - 0.0004, 0.0)

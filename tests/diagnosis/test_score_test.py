@@ -2,7 +2,6 @@
 
 import math
 from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -10,16 +9,8 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import vinetrack as vt
+from vinetrack.diagnosis import likelihood_ratio as ratios
 from vinetrack.diagnosis import misfit_tests, score_test
-from vinetrack.diagnosis.likelihood_ratio import (
-    LikelihoodRatio,
-    answer_set,
-    likelihood_ratio,
-    log_evidence,
-    posterior_weights,
-    prior_penalty,
-    weights_of,
-)
 from vinetrack.diagnosis.misfit_tests import MisfitTests, structure_from_scores
 from vinetrack.diagnosis.score_test import Scores
 from vinetrack.effects import Parameter, catalogue
@@ -34,7 +25,7 @@ def summed(single: np.ndarray, informations: np.ndarray, groups=()) -> Scores:
     return Scores(single.sum(axis=0), informations.sum(axis=0), single, informations, 1, named)
 
 
-def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float = 1.0, sizes: Any = 0.0) -> Scores:
+def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float = 1.0, sizes=0.0) -> Scores:
     """What a linear campaign says of shapes of true `sizes`."""
     root = draw.standard_normal((trials, 3 * shapes, shapes)) / math.sqrt(3 * shapes)
     informations = np.einsum("nkj,nkl->njl", root, root)
@@ -42,11 +33,11 @@ def scores(draw: np.random.Generator, trials: int, shapes: int, scatter: float =
     return summed(noise + informations @ np.broadcast_to(sizes, (shapes,)), informations)
 
 
-def questioned(of: Scores, structure: Any = QUIET, level: float = FIRST, effects=()) -> MisfitTests:
+def questioned(of: Scores, structure=QUIET, level: float = FIRST, effects=()) -> MisfitTests:
     shape = SimpleNamespace(effect=SimpleNamespace(parameters=(1,)), size=SimpleNamespace(sign=0))
     named = tuple(effects) or tuple(f"effect_{k}" for k in range(of.score.size))
-    answers: Any = SimpleNamespace(shapes=[shape] * of.score.size, effects=named)
-    fit: Any = None
+    answers = SimpleNamespace(shapes=[shape] * of.score.size, effects=named)
+    fit = None
     return MisfitTests(fit, (), answers, fit, of, structure, level)
 
 
@@ -141,7 +132,7 @@ def test_a_misfit_no_larger_than_slow_errors_of_tracks_is_not_far_off(chi2, resi
     seen = {"lead_position_m": np.array([0.0, 0.1]), "slow_m": 0.0 if slow else None, "trace": None}
     track = SimpleNamespace(position_systematic_m=systematic_m, **seen)
     solution = SimpleNamespace(columns=[np.full((4, 1), residual_m)] * 3)
-    fit: Any = SimpleNamespace(chi2_per_dof=chi2, predictor=SimpleNamespace(data=[track] * 3), solution=solution)
+    fit = SimpleNamespace(chi2_per_dof=chi2, predictor=SimpleNamespace(data=[track] * 3), solution=solution)
     assert misfit_tests.exceeds_slow_errors(fit) == exceeds
 
 
@@ -162,7 +153,7 @@ def test_scores_that_a_specimen_shares_count_once():
 def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter):
     """Also where few trials scatter five times as widely as their noise: the normal quantile held it 9 times of 10."""
     draw = np.random.default_rng(20608)
-    friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, cast(Any, None)
+    friction, true, unit, fit = vt.effects.tail_friction, 0.05, 300.0, None
     answers = score_test.EffectSensitivities((score_test.CandidateShape(friction, (), 1e-3),), [], ())
     held = []
     for _ in range(2000):
@@ -191,29 +182,29 @@ def number_of(key: str, value: float, sigma: float) -> fit_result.Number:
     return fit_result.Number(key, "", "s", "1", value, sigma, value - 2 * sigma, value + 2 * sigma, math.inf, "linear")
 
 
-def known_fit(log_likelihood: float, *numbers: fit_result.Number) -> Any:
+def known_fit(log_likelihood: float, *numbers: fit_result.Number):
     """What a likelihood ratio asks of a fit of few trials, whose film is free already."""
     known = {"covariance": np.diag([number.sigma**2 for number in numbers]), "trials": (), "model": ("film_mass",)}
     return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, **known)
 
 
-def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> LikelihoodRatio:
+def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> ratios.LikelihoodRatio:
     known = (catalogue()[name],), known_fit(log_likelihood), 50.0, 7.0, True, ""
-    return LikelihoodRatio(*known, inflation=inflation, log_evidence=log_likelihood - 2)
+    return ratios.LikelihoodRatio(*known, inflation=inflation, log_evidence=log_likelihood - 2)
 
 
 @pytest.mark.parametrize(("inflation", "names"), [(1.0, ["air_drag"]), (4.0, ["air_drag", "inlet_loss"])])
 def test_hypotheses_are_excluded_by_less_where_trials_scatter_more(inflation, names):
     both = [hypothesis("air_drag", -100.0, inflation), hypothesis("inlet_loss", -110.0)]
-    assert [one.label for one in answer_set(both)[0]] == names
-    weights = weights_of(both)
+    assert [one.label for one in ratios.answer_set(both)[0]] == names
+    weights = ratios.weights_of(both)
     assert weights["inlet_loss"] / weights["air_drag"] == pytest.approx(math.exp(-10 / inflation))
 
 
 @pytest.mark.parametrize(("values", "named"), [([0.5], True), ([2.0], False), ([0.5, 2.0], False), ([0.5, 0.4], True)])
 def test_a_size_smaller_than_its_error_in_every_vine_is_compatible_with_none(values, named):
     after = known_fit(-100.0, *(number_of("air_drag.C_D", value, 0.8) for value in values))
-    found = likelihood_ratio(known_fit(-120.0), [vt.effects.air_drag], after)
+    found = ratios.likelihood_ratio(known_fit(-120.0), [vt.effects.air_drag], after)
     assert (found.reason.code == "size_may_be_zero") == named
     assert found.credible != named
 
@@ -225,7 +216,7 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(rati
     after.trials, after.predictor, after.solution = (None,) * 12, None, None
     scattered = (np.diag([0.01]), np.diag([0.01 * ratio**2]))
     monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_covariance", lambda *_: scattered)
-    found = likelihood_ratio(known_fit(-150.0), [vt.effects.air_drag], after)
+    found = ratios.likelihood_ratio(known_fit(-150.0), [vt.effects.air_drag], after)
     assert found.delta_chi2 == pytest.approx(100.0)
     assert found.sigma == pytest.approx(10.0 / max(ratio, 1.0))
     assert found.inflation == pytest.approx(inflation)
@@ -284,9 +275,9 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
     problem = SimpleNamespace(**{name: np.array(values) for name, values in arrays.items()})
     state = marginal_likelihood.FitState(np.zeros(2), np.zeros((1, 4)), (1e-5, 1e-5), 0.0, np.ones(1))
     numbers = [SimpleNamespace(bound=math.nan), SimpleNamespace(bound=bound)]
-    fit: Any = SimpleNamespace(solution=SimpleNamespace(state=state, problem=problem), numbers=numbers)
+    fit = SimpleNamespace(solution=SimpleNamespace(state=state, problem=problem), numbers=numbers)
     sizes = {"n_keys": 2, "n_shapes": 1, "n_tested": 1}
-    products: Any = SimpleNamespace(parts=[np.array([0])], tested_indices=np.array([[0]]), **sizes)
+    products = SimpleNamespace(parts=[np.array([0])], tested_indices=np.array([[0]]), **sizes)
     gain, size = score_test.linear_gains(fit, products, 0.0)
 
     def squares(of: list[int]) -> tuple[float, float]:
@@ -301,7 +292,7 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
 GAUGE = {"g.delta": Parameter("delta", "δ", "Pa", 500.0, plausible=(-2e3, 2e3))}
 
 
-def fitted(value: float, sigma: float) -> Any:
+def fitted(value: float, sigma: float):
     return known_fit(-10.0, number_of("g.delta", value, sigma))
 
 
@@ -311,17 +302,17 @@ def test_the_marginal_likelihood_is_the_integral_over_the_prior(value, sigma):
         return math.exp(-10 - 0.5 * ((delta - value) / sigma) ** 2) * norm.pdf(delta, 0.0, 1e3)
 
     whole, _ = quad(inside, -2e4, 2e4, points=[value - 3 * sigma, value, value + 3 * sigma, 0.0], epsabs=0, limit=300)
-    assert log_evidence(fitted(value, sigma), GAUGE) == pytest.approx(math.log(whole), abs=1e-6)
+    assert ratios.log_evidence(fitted(value, sigma), GAUGE) == pytest.approx(math.log(whole), abs=1e-6)
 
 
 def test_a_gauge_seven_kilopascals_off_is_a_surprise_one_within_two_is_none_and_one_unknown_costs_nothing():
     # z² = 7.1² / (1.7² + 1²) = 12.96 with a prior of 1 kPa; less 4 at the edge of the plausible range.
-    assert prior_penalty(fitted(7.1e3, 1.7e3), GAUGE) == pytest.approx(12.96 - 4, abs=0.01)
-    assert prior_penalty(fitted(1.9e3, 100.0), GAUGE) == 0
-    assert prior_penalty(fitted(7.1e3, 5e3), GAUGE) == 0
-    assert log_evidence(fitted(0.0, 1e7), GAUGE) == pytest.approx(-10, abs=1e-6)
-    assert posterior_weights([-10.0, -10.0 - math.log(3), -800.0]) == pytest.approx([0.75, 0.25, 0.0])
-    assert posterior_weights([]) == []
+    assert ratios.prior_penalty(fitted(7.1e3, 1.7e3), GAUGE) == pytest.approx(12.96 - 4, abs=0.01)
+    assert ratios.prior_penalty(fitted(1.9e3, 100.0), GAUGE) == 0
+    assert ratios.prior_penalty(fitted(7.1e3, 5e3), GAUGE) == 0
+    assert ratios.log_evidence(fitted(0.0, 1e7), GAUGE) == pytest.approx(-10, abs=1e-6)
+    assert ratios.posterior_weights([-10.0, -10.0 - math.log(3), -800.0]) == pytest.approx([0.75, 0.25, 0.0])
+    assert ratios.posterior_weights([]) == []
 
 
 def test_any_phase_of_a_swing_is_plausible():

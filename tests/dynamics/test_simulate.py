@@ -112,9 +112,7 @@ MU = 0.5
 FALL_AND_RISE = (np.array([0.0, 0.05, 0.06, 0.10, 0.11, 1.0]), np.array([28e3, 28e3, 12e3, 12e3, 28e3, 28e3]))
 
 
-def by_hand(
-    times: np.ndarray, pressure, first_Pa: float, tau: float, down: float, mu: float
-) -> tuple[np.ndarray, list[float]]:
+def by_hand(times, pressure, first_Pa: float, tau: float, down: float, mu: float) -> tuple[np.ndarray, list[float]]:
     """Lead positions, and when the tail went slack and taut in turn.
 
     State (x, ẋ, y, P of a chamber of 3.7 L filled within τ): taut while T₁ = ½(P − P_y)A − ½Bẋⁿ ≥ 0, slack until
@@ -198,11 +196,8 @@ def test_removing_by_effect_or_by_name_removes_its_values():
     for smaller in (larger - effects.reservoir_depletion, larger - "reservoir_depletion"):
         assert smaller.names == BASE_EFFECTS
         assert dict(smaller.values) == {"eversion_damping.B": 2.0}
-    assert (
-        vt.base_model() + effects.leak - effects.leak
-        == vt.base_model()
-        != vt.base_model().with_values({"gravity.g": 2.0})
-    )
+    base = vt.base_model()
+    assert base + effects.leak - effects.leak == base != base.with_values({"gravity.g": 2.0})
     for twice in (lambda: vt.base_model() + effects.gravity, lambda: vt.make_model(["gravity", "gravity"])):
         with pytest.raises(EffectError):
             twice()

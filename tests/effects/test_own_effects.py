@@ -149,6 +149,8 @@ def test_the_command_lists_it_and_draws_the_effects_of_the_catalogue(tmp_path):
     done = run("effects", "--experiment", tmp_path)
     named = {line.split()[0] for line in done.stdout.splitlines()[1:] if not line.startswith("    ")}
     assert (done.exit_code, named) == (0, {*catalogue(), "brush"})
+    assert all(effect.formula in done.stdout for effect in catalogue().values())
+    assert "N·(s/m)ⁿ" in done.stdout
     assert run("effects", "--experiment", tmp_path / "in").exit_code == 1  # it lies outside the experiment
     assert run("effects", "air_drag", "--figure", tmp_path / "drag.png").exit_code == 0
     assert (tmp_path / "drag.png").read_bytes().startswith(b"\x89PNG")

@@ -1,11 +1,7 @@
-"""What a sheet says of trials: conditions and order, columns of one trial alone, corrections; and of planned ones."""
+"""What a sheet says of trials: conditions, order, columns of one alone, other units, corrections; planned ones."""
 
-from __future__ import annotations
-
-import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +9,11 @@ from hand_sheet import GOOD, HEADER, TRACK, one, two_vines, write
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
+from vinetrack.core.units import convert, other_units, split_unit
 from vinetrack.experiment import folder
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.sheet import planned_sheet, planned_trial
 from vinetrack.tracks.importers import TrackError, load_track, read_track
-
-# Corrections by hand are read, refused in words, and reach the trial.
 
 
 def corrected(folder: Path, text: str) -> Path:
@@ -64,7 +59,7 @@ how well its numbers are known, not what was done to the vine."""
 OTHER_VALUES = {"bends": (Bend(0.1, 0.05, 0.03),), "travel_ratio": 1.0}
 
 
-def conditions(field: str, value: Any) -> set[str]:
+def conditions(field: str, value) -> set[str]:
     """Names of the conditions of a trial and of one with another value of a field."""
     return {trial.condition for trial in with_names([TRIAL, replace(TRIAL, **{"name": "b", field: value})])}
 
@@ -113,12 +108,9 @@ def test_frames_and_axis_of_one_trial_alone(tmp_path):
     assert (track.flag[0], track.flag[-1]) == ("rejected", "after_end")
 
 
-REAL = os.environ.get("VINETRACK_REAL_DATA", "")
-
-
-@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
-def test_either_of_two_point_masses_of_a_real_project():
-    path = Path(REAL) / "falling_cups" / "cups.trk"
+@pytest.mark.real
+def test_either_of_two_point_masses_of_a_real_project(real):
+    path = real / "falling_cups" / "cups.trk"
     with pytest.raises(TrackError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
         read_track(path, point_mass="cup")
     third, seventh = (read_track(path, point_mass=name) for name in ("cup 3", "Cup 7"))
@@ -196,3 +188,59 @@ def test_a_sheet_needs_no_recordings_and_an_unknown_column_is_not_passed_over(tm
     assert ([trial.name for trial in planned.trials], planned.folder) == (["a"], tmp_path)
     (problem,) = planned.problems
     assert "payload_gr" in str(problem)
+
+
+PSI = 6894.757293168361
+
+
+def test_other_units_of_sheet_and_settings_are_converted_and_said(tmp_path):
+    own = {"diameter_in": "1", "pressure_psi": "4", "payload_oz": "2", "diameter_mm": None, "pressure_kPa": None}
+    read = one(tmp_path, "yield_pressure_psi: 0.435\n", yield_pressure_kPa=None, payload_g=None, **own)
+    (trial,) = read.trials
+    assert trial.diameter_m == pytest.approx(0.0254, rel=1e-14)
+    assert trial.payload_kg == pytest.approx(0.05669904625, rel=1e-14)
+    assert (trial.pressure_Pa, trial.yield_pressure_Pa) == pytest.approx((4 * PSI, 0.435 * PSI), rel=1e-12)
+    said = {problem.column: problem for problem in read.problems}
+    assert {(problem.code, problem.severity) for problem in said.values()} == {("unit", "warning")}
+    assert said.keys() == {"diameter_in", "pressure_psi", "payload_oz", "yield_pressure_psi"}
+    assert "6.89476" in said["pressure_psi"].message
+    assert (said["yield_pressure_psi"].file, said["yield_pressure_psi"].line) == ("experiment.yaml", 1)
+
+
+def test_the_bounds_hold_after_conversion_and_of_two_units_that_with_a_value_counts(tmp_path):
+    assert "diameter_mm '635' is above 300 mm" in one(tmp_path, diameter_mm=None, diameter_in="25").failed["a"]
+    read = one(tmp_path, diameter_in="2")
+    assert read.trials[0].diameter_m == 24 / 1000
+    assert ("twice", "diameter_in") in [(problem.code, problem.column) for problem in read.problems]
+    (trial,) = one(tmp_path, pressure_kPa="", pressure_psi="4").trials
+    assert trial.pressure_Pa == pytest.approx(4 * PSI, rel=1e-14)
+    # As the set-up page writes keys: the unit of a quantity is changed, the line of the other one stays.
+    for blank in ("yield_pressure_kPa:\nyield_pressure_psi: 0.435", "yield_pressure_kPa: 3\nyield_pressure_psi:"):
+        (trial,) = one(tmp_path, blank, yield_pressure_kPa=None).trials
+        assert trial.yield_pressure_Pa == pytest.approx(3000, rel=1e-3)
+    with pytest.raises(ExperimentError):
+        one(tmp_path, "yield_pressure_psi: 0.435\nyield_pressure_kPa: 3\n", yield_pressure_kPa=None)
+
+
+NUMBERS = [column for column in COLUMNS.values() if column.kind == "number" and other_units(column.name)]
+
+
+@pytest.mark.parametrize("column", NUMBERS, ids=lambda column: column.name)
+@pytest.mark.parametrize("place", ["sheet", "settings"])
+def test_every_unit_of_every_column_is_read(tmp_path, column, place):
+    usual = {"diameter_mm": 24, "thickness_um": 200, "length_mm": 280, "pressure_kPa": 28, "yield_pressure_kPa": 3}
+    in_own_unit = {**usual, "film_density_kg_m3": 1100}.get(column.name, 12)
+    for name, unit in other_units(column.name).items():
+        value = f"{convert(in_own_unit, split_unit(column.name)[1], unit):.15g}"
+        settings = f"{name}: {value}\n{column.name}:\n" if place == "settings" else ""
+        cells = {name: value} if place == "sheet" else {}
+        (trial,) = one(tmp_path, settings, **{column.name: None, **cells}).trials
+        assert column.of_trial(trial) == pytest.approx(in_own_unit, rel=1e-12)
+
+
+def test_keys_of_groups_and_ranges_are_converted(tmp_path):
+    text = "limits: {pressure_psi: '1:5', diameter_in: [1, 2], hoop_stress_kPa: 7000}\nambient_pressure_bar: 1\n"
+    settings = one(tmp_path, text + "axis: {from_px: [1, 2], to_px: [9, 90], width_cm: 2}\n").settings
+    assert settings.limits.pressure_kPa == pytest.approx((6.894757, 34.473786))
+    assert (settings.limits.diameter_mm, settings.limits.hoop_stress_MPa) == ((25.4, 50.8), 7)
+    assert (settings.ambient_pressure_kPa, settings.axis.width_mm) == (100, 20)

@@ -1,13 +1,14 @@
 """Figures of a diagnosis and of the paper's numbers, from tables written by hand."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pandas as pd
 import pytest
-from figure_frames import assert_nothing_is_cut_off
 from hand_diagnosis import ladder
 from matplotlib.colors import to_hex
+from test_figures import assert_nothing_is_cut_off
 
 from vinetrack.figures import damping_figures as paper_figures
 from vinetrack.figures import diagnosis_figures as figures
@@ -40,15 +41,12 @@ def test_a_condition_is_drawn_before_and_after_with_its_errors():
 
 
 def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour():
-    table = pd.DataFrame(
-        [
-            ("air_drag", "physical", "refitted", 400.0, 20.0, True),
-            ("leak", "physical", "refitted", 100.0, 10.0, False),
-            ("time_base", "measurement", "screened", 25.0, 5.0, False),
-            ("payload_drag", "physical", "not testable here", math.nan, math.nan, False),
-        ],
-        columns=["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set"],
-    )
+    columns = {
+        "effect": ["air_drag", "leak", "time_base", "payload_drag"], "sigma": [20.0, 10.0, 5.0, math.nan],
+        "kind": ["physical", "physical", "measurement", "physical"], "delta_chi2": [400.0, 100.0, 25.0, math.nan],
+        "status": ["refitted", "refitted", "screened", "not testable here"], "in_answer_set": [True] + [False] * 3,
+    }  # fmt: skip
+    table = pd.DataFrame(columns)
     (ax,) = figures.draw_candidates([("What is missing?", table.assign(plausible=True, size="k = 1.0 ± 0.1"))]).axes
     assert [bar.get_width() for bar in ax.patches] == pytest.approx([20, 10, 5])
     assert [to_hex(bar.get_edgecolor()) for bar in ax.patches] == [BLUE.lower(), MUTED, ORANGE.lower()]
@@ -62,8 +60,7 @@ def test_a_drifting_parameter_is_drawn_against_the_condition():
     row = {"parameter": "eversion_damping.B", "vine": "v", "symbol": "B", "against": "pressure_Pa", "n_trials": 2}
     rows = [
         row | {"model": model, "level": 1e3 * kPa, "ratio": 1 + slope * (kPa - 40) / 40, "ratio_sigma": 0.02}
-        for model, slope in (("before", -0.3), ("after", 0.0))
-        for kPa in (24, 36, 60)
+        for (model, slope), kPa in product((("before", -0.3), ("after", 0.0)), (24, 36, 60))
     ]
     gamma = {"parameter": "reservoir_depletion.gamma", "symbol": "γ", "against": "vine", "level": math.nan}
     (ax,) = figures.draw_drift(pd.DataFrame([*rows, rows[-1] | gamma]), "air drag").axes
@@ -89,8 +86,7 @@ def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter():
     cells = [
         {"condition_label": f"12 mm, {k} kPa", "n_trials": 2, "growth_from": g / 4, "growth_to": (g + 1) / 4}
         | {"misfit_before_m": sign * 1e-3 * (g + 1), "misfit_after_m": 0.1e-3, "scatter_m": 0.6e-3}
-        for k, sign in ((24, 1), (60, -1))
-        for g in range(4)
+        for (k, sign), g in product(((24, 1), (60, -1)), range(4))
     ]
     before, after = figures.draw_where(pd.DataFrame(cells), "air drag").axes
     sides = [to_hex(patch.get_facecolor()) for patch in before.patches]
@@ -142,13 +138,10 @@ NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "d
 
 def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points():
     way, time_s = np.linspace(0, 1, 30), np.linspace(0, 1 / 7, 100)
-    parts = [
-        pd.DataFrame({"time_s": way * (1 + 0.3 * k) / kPa, "lead_position_m": 0.28 * way * (1 - 0.05 * k)}).assign(
-            pressure_kPa=float(kPa), departure=name
-        )
-        for kPa in (7, 14, 28)
-        for k, name in enumerate(("eq2", *NAMES))
-    ]
+    parts = []
+    for kPa, (k, name) in product((7, 14, 28), enumerate(("eq2", *NAMES))):
+        moved = {"time_s": way * (1 + 0.3 * k) / kPa, "lead_position_m": 0.28 * way * (1 - 0.05 * k)}
+        parts.append(pd.DataFrame(moved).assign(pressure_kPa=float(kPa), departure=name))
     mean = pd.DataFrame({"time_s": time_s, "lead_position_m": 0.28 * 7 * time_s, "pressure_kPa": 7.0})
     mean = mean.assign(lead_position_sigma_m=0.002, n_trials=4)
     errors = pd.DataFrame({"pressure_kPa": [7.0], "rms_mean_m": [0.0032]})
@@ -161,11 +154,8 @@ def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points():
 
 
 def test_printed_lines_have_the_printed_slope():
-    rows = [
-        (f"v{scale}", 6.0 * scale, 50.0 * scale, speed, B * speed**0.37)
-        for scale, B in ((1, 0.57), (4, 6.44))
-        for speed in (0.5, 1.0, 2.0, 4.0)
-    ]
+    laws = product(((1, 0.57), (4, 6.44)), (0.5, 1.0, 2.0, 4.0))
+    rows = [(f"v{scale}", 6.0 * scale, 50.0 * scale, speed, B * speed**0.37) for (scale, B), speed in laws]
     columns = ["vine", "diameter_mm", "thickness_um", "x_ss_m_s", "force_N"]
     table = pd.DataFrame([*rows, ("other", 30.0, 50.0, 1.0, 1.0)], columns=columns)
     paper = {"x_ss_paper_m_s": 1.1 * table["x_ss_m_s"], "force_paper_N": 0.99 * table["force_N"]}
@@ -179,12 +169,8 @@ def test_printed_lines_have_the_printed_slope():
 
 
 def test_published_errors_stand_beside_ours():
-    rows = [
-        (figure, float(kPa), name, 0.01 * (k + 1), 0.1 * (k + 1))
-        for figure, pressures_kPa in (("Fig. 4", (7, 14, 28)), ("Fig. 5", (14, 28, 41)))
-        for kPa in pressures_kPa
-        for k, name in enumerate(NAMES)
-    ]
+    at = [("Fig. 4", kPa) for kPa in (7.0, 14.0, 28.0)] + [("Fig. 5", kPa) for kPa in (14.0, 28.0, 41.0)]
+    rows = [(*one, name, 0.01 * (k + 1), 0.1 * (k + 1)) for one, (k, name) in product(at, enumerate(NAMES))]
     columns = ["figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s"]
     paper = pd.DataFrame({"row": ["position_rms_7kPa", "final_speed_rms_41kPa"], "ours": [0.32, 0.07]})
     fig = paper_figures.draw_paper_rms(paper, pd.DataFrame(rows, columns=columns))
@@ -199,11 +185,9 @@ def test_published_errors_stand_beside_ours():
 
 def test_final_speeds_stand_beside_eq2_where_payloads_differ():
     row = {"vine": "v", "final_at_mm": 120.0, "n_final": 4, "final_lead_velocity_sigma_m_s": 0.02}
-    speeds = pd.DataFrame(
-        row | {"pressure_kPa": kPa, "payload_g": g, "final_lead_velocity_m_s": kPa / 20 - g / 100}
-        for kPa in (14.0, 28.0)
-        for g in (0.0, 20.0, 35.6)
-    )
+    at = product((14.0, 28.0), (0.0, 20.0, 35.6))
+    speeds = pd.DataFrame([row | {"pressure_kPa": kPa, "payload_g": g} for kPa, g in at])
+    speeds = speeds.assign(final_lead_velocity_m_s=speeds["pressure_kPa"] / 20 - speeds["payload_g"] / 100)
     fig = paper_figures.draw_paper_speeds(speeds, speeds.assign(final_lead_velocity_m_s=1.0))
     (ax,) = fig.axes
     assert [len(container.lines[0].get_xdata()) for container in ax.containers] == [3, 3]

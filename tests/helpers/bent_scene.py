@@ -4,8 +4,6 @@ The curve is a polyline sampled every 1/20 px from its own formula (lines and ar
 those arcs; every pixel knows its nearest place. `bent_scene` draws frames in memory.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

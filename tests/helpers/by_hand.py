@@ -5,18 +5,14 @@ test does not name.
 Nothing here but `simulated` uses the package's own physics.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from vinetrack.core.records import Trial
-from vinetrack.dynamics.kernel import Trace
+from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model, base_model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate
 
@@ -24,8 +20,6 @@ G = 9.81
 ATM = 101_325.0
 RT_AIR = 287.0 * 293.0
 N = 0.37
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -76,22 +70,13 @@ def whole_catalogue(sizes: Mapping[str, float]) -> Model:
     return model.with_values({**nothing, **sizes})
 
 
-def simulated(
-    vine: Vine, sizes: Mapping[str, float], times: Floats, trace: Trace | None = None, **others: object
-) -> Trajectory:
+def simulated(vine: Vine, sizes: Mapping[str, float], times, trace=None, **others: object) -> Trajectory:
     """The compiled model's answer."""
     model = whole_catalogue({"eversion_damping.B": vine.B, "eversion_damping.n": N, **sizes})
     return simulate(model, vine.trial(**others), times, trace=trace)
 
 
-def followed(
-    acceleration: Callable[..., float],
-    stop: float,
-    *,
-    chamber: tuple[float, Callable[..., float]] | None = None,
-    until: float = 20.0,
-    max_step: float = np.inf,
-) -> Callable[[Floats], Floats]:
+def followed(acceleration, stop: float, *, chamber=None, until=20.0, max_step=np.inf) -> Callable[[Floats], Floats]:
     """Tail travel against time by SciPy, from rest to x = `stop`.
 
     `acceleration(t, x, v)`, or `acceleration(t, x, v, P)` with `chamber` = its first pressure and Ṗ(t, x, v, P). Its
@@ -107,7 +92,7 @@ def followed(
     def there(_t: float, s: Floats) -> float:
         return s[0] - stop
 
-    there.terminal = True  # type: ignore[attr-defined]
+    there.terminal = True
     start = [0.0, 0.0] if chamber is None else [0.0, 0.0, chamber[0]]
     how = {"rtol": 1e-10, "atol": [1e-13, 1e-12, 1e-6][: len(start)], "dense_output": True, "max_step": max_step}
     done = solve_ivp(slope, (0.0, until), start, "LSODA", events=there, **how)
@@ -116,19 +101,11 @@ def followed(
     def travel(times: Floats) -> Floats:
         return np.asarray(done.sol(times)[0])
 
-    travel.end, travel.state = float(done.t[-1]), done.sol  # type: ignore[attr-defined]
+    travel.end, travel.state = float(done.t[-1]), done.sol
     return travel
 
 
-def assert_same_motion(
-    vine: Vine,
-    sizes: Mapping[str, float],
-    acceleration: Callable[..., float],
-    *,
-    share: float = 0.9,
-    chamber: tuple[float, Callable[..., float]] | None = None,
-    **others: object,
-) -> None:
+def assert_same_motion(vine: Vine, sizes, acceleration, *, share=0.9, chamber=None, **others: object) -> None:
     """Lead positions agree to 10⁻⁵ of the distance, up to `share` of the length; and the effect does something."""
     travel = followed(acceleration, 2 * share * vine.L, chamber=chamber)
     times = np.linspace(0.0, travel.end, 61)  # type: ignore[attr-defined]

@@ -1,7 +1,5 @@
 """Files as high-speed cameras write them, byte by byte from the vendors' descriptions, without the package."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 
@@ -60,13 +58,10 @@ def write_cine(path: Path, frames: np.ndarray, times_s=None, exposures_s=None, a
 
 
 CIH = """#Camera Information Header
-Date : 2024/5/2
 Camera Type : FASTCAM SA-Z type 2100K-M-32GB
 Record Rate(fps) : {rate}
 Shutter Speed(s) : {shutter}
-Trigger Mode : Start
 Total Frame : {total}
-Original Total Frame : {total}
 Start Frame : 0
 Save Step : {step}
 Image Width : {width}

@@ -3,8 +3,6 @@
 What the page complains of and everything it asks the network for is kept, for a test to look at.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json
@@ -16,7 +14,7 @@ import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Self
 
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
@@ -43,7 +41,7 @@ class Chrome:
         self.requests: list[str] = []
         self._loop = asyncio.new_event_loop()
         self._count = 0
-        self._answers: dict[int, dict[str, Any]] = {}
+        self._answers: dict = {}
         profile = folder / "profile"
         # The browser leaves folders where programs keep what passes; a socket in them wants a short path.
         self._scratch = tempfile.TemporaryDirectory(prefix="browser", ignore_cleanup_errors=True)
@@ -64,11 +62,11 @@ class Chrome:
         self.size(width, height)
 
     @staticmethod
-    def _pages(port: str) -> list[dict[str, Any]]:
+    def _pages(port: str) -> list[dict]:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
             return [page for page in json.load(answer) if page["type"] == "page"]
 
-    def __enter__(self) -> Chrome:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -77,12 +75,12 @@ class Chrome:
         self._loop.close()
         self._scratch.cleanup()
 
-    def send(self, method: str, **params: Any) -> dict[str, Any]:
+    def send(self, method: str, **params) -> dict:
         """One command and its answer."""
         self._count += 1
         return self._loop.run_until_complete(self._exchange(self._count, method, params))
 
-    async def _exchange(self, number: int, method: str, params: dict[str, Any]) -> dict[str, Any]:
+    async def _exchange(self, number: int, method: str, params: dict) -> dict:
         await self._socket.write_message(json.dumps({"id": number, "method": method, "params": params}))
         while number not in self._answers:
             text = await asyncio.wait_for(self._socket.read_message(), 60)
@@ -92,7 +90,7 @@ class Chrome:
         assert "error" not in answer, f"{method}: {answer['error']}"
         return answer["result"]
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _take(self, message: dict) -> None:
         if "id" in message:
             self._answers[message["id"]] = message
             return
@@ -115,13 +113,13 @@ class Chrome:
         self.send("Page.navigate", url=address)
         self.wait("document.readyState === 'complete'", "the page to load")
 
-    def run(self, script: str) -> Any:
+    def run(self, script: str):
         """Value of a JavaScript expression; a promise is waited for."""
         answer = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, f"{script[:200]}: {answer['exceptionDetails']}"
         return answer["result"].get("value")
 
-    def wait(self, script: str, what: str, seconds: float = 60) -> Any:
+    def wait(self, script: str, what: str, seconds: float = 60):
         """Until an expression is true; its value."""
         return until(lambda: self.run(script), what, seconds)
 
@@ -143,7 +141,7 @@ class Chrome:
         path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
 
 
-def end(process: subprocess.Popen[Any]) -> None:
+def end(process: subprocess.Popen) -> None:
     """End a process that was started here, by force after 20 s."""
     process.terminate()
     try:
@@ -157,7 +155,7 @@ async def _connect(address: str) -> WebSocketClientConnection:
     return await websocket_connect(address, max_message_size=100_000_000)
 
 
-def until(asked: Callable[[], Any], what: str, seconds: float = 60) -> Any:
+def until(asked: Callable, what: str, seconds: float = 60):
     """Ask until the answer is true; an error that names what was waited for, if it never is."""
     end = time.monotonic() + seconds
     while not (answer := asked()):

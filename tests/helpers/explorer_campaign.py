@@ -4,8 +4,6 @@ The truth is that of the demonstration: two vines, n 0.37, B 1.83 and 6.44, rese
 missing from the model in use. Seed 20 everywhere; nothing here scores a method.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,9 +1,8 @@
 """Campaigns from the virtual laboratory for the tests of where a model fails and what drifts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
 from vinetrack.core.records import Track, Trial
@@ -37,15 +36,10 @@ PRESSURES = {1: (16.0, 22.0, 30.0), 2: (30.0, 40.0, 50.0, 60.0), 4: (24.0, 30.0,
 
 def sheet(scales: Sequence[int] = (2, 4), replicates: int = 3, payloads_g: Sequence[float] = (0.0,)) -> list[Trial]:
     """Isometric vines at a few pressures each, with these payloads, on a chamber of 3.7 L."""
-    trials = [
-        replace(trial, chamber_m3=3.7e-3)
-        for scale in scales
-        for payload_g in payloads_g
-        for trial in campaign(
-            isometric_vine(scale), PRESSURES[scale], replicates, payload_g, prefix=f"R{scale}_{payload_g:g}g_"
-        )
-    ]
-    return list(with_names(trials))
+    trials: list[Trial] = []
+    for scale, g in product(scales, payloads_g):
+        trials += campaign(isometric_vine(scale), PRESSURES[scale], replicates, g, prefix=f"R{scale}_{g:g}g_")
+    return list(with_names([replace(trial, chamber_m3=3.7e-3) for trial in trials]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,27 +70,18 @@ def effect_file(folder: Path) -> Path:
 
     One file for all of them is compiled once.
     """
-    choices = "\n".join(
-        f"    if kind == {k}.0:\n        return a * ({force}) + 0.0 * s.time" for k, force in enumerate(FORCES.values())
-    )
+    shapes = enumerate(FORCES.values())
+    choices = "\n".join(f"    if kind == {k}.0:\n        return a * ({force}) + 0.0 * s.time" for k, force in shapes)
     text = f'''"""Forces that no catalogue has.
-
-Its size is a.
 
     tail force a · shape
 """
-
 import numpy as np
-
 from vinetrack.effects import Parameter
-
-KIND = "physical"
 PARAMETERS = (
     Parameter("a", "a", "N", 0.0, bounds=(-100.0, 100.0), meaning="size"),
     Parameter("kind", "kind", "1", 0.0, bounds=(0.0, 100.0), meaning="which"),
 )
-
-
 def tail_force(s, rig, a, kind):
 {choices}
     return 0.0 * s.time

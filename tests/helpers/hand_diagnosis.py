@@ -1,9 +1,6 @@
 """Diagnoses written by hand, in the shape of `diagnosis.json`: one of every verdict, and one that was refused."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import pandas as pd
 
@@ -17,7 +14,7 @@ def number(parameter: str, symbol: str, value: float, sigma: float | None, unit:
     return {"parameter": parameter, "vine": vine, "symbol": symbol, "unit": unit, **found}
 
 
-def candidate(effect: str, delta_chi2: float | None, **changes: Any) -> dict[str, Any]:
+def candidate(effect: str, delta_chi2: float | None, **changes) -> dict:
     """A row of a ranking; physical, refitted, plausible and not in the answer unless said otherwise."""
     row = {"effect": effect, "kind": "physical", "status": "refitted", "plausible": True, "in_answer_set": False}
     gain = {"delta_chi2": delta_chi2, "sigma": None if delta_chi2 is None else math.sqrt(delta_chi2)}
@@ -28,7 +25,7 @@ def candidate(effect: str, delta_chi2: float | None, **changes: Any) -> dict[str
 IMPLAUSIBLE = {"code": "implausible_size", "symbol": "1/τ", "value": 9.0, "unit": "1/s", "low": 0.0, "high": 3.0}
 
 
-def ranking(*answers: str, kind: str = "physical") -> list[dict[str, Any]]:
+def ranking(*answers: str, kind: str = "physical") -> list[dict]:
     blank = {"code": "column_blank", "column": "payload_g"}
     return [
         *(candidate(name, 400.0 - i, in_answer_set=True, kind=kind) for i, name in enumerate(answers)),
@@ -38,7 +35,7 @@ def ranking(*answers: str, kind: str = "physical") -> list[dict[str, Any]]:
     ]
 
 
-def one_round(verdict: str, *answers: str, model: list[str] | None = None, kind: str = "physical") -> dict[str, Any]:
+def one_round(verdict: str, *answers: str, model: list[str] | None = None, kind: str = "physical") -> dict:
     effects = [*answers, "leak", "time_base"]
     n = len(effects)
     matrix = [[1.0 if i == j else 0.97 if {i, j} == {0, 1} else 0.2 for j in range(n)] for i in range(n)]
@@ -50,7 +47,7 @@ def one_round(verdict: str, *answers: str, model: list[str] | None = None, kind:
 ANSWERS = {"missing": ["reservoir_depletion"], "ambiguous": ["air_drag", "inlet_loss"], "artefact": ["length_scale"]}
 
 
-def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
+def diagnosis(verdict: str = "missing", **changes) -> dict:
     """A whole diagnosis; `missing` has reservoir depletion added and nothing left."""
     named = ANSWERS.get(verdict, [])
     rounds = [one_round(verdict, *named, kind="measurement" if verdict == "artefact" else "physical")]
@@ -61,47 +58,33 @@ def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
         parameters.append(number("reservoir_depletion.gamma", "γ", 1.17, 0.004))
     if "final_verdict" in changes:
         rounds[-1]["verdict"] = changes["final_verdict"]
-    content = {
-        "verdict": verdict,
-        "effects": added,
-        "answer_set": named,
-        "explanation": rounds[0]["explanation"],
-        "final_verdict": rounds[-1]["verdict"],
-        "rounds": rounds,
-        "parameters": parameters,
-        "cosines": rounds[0]["cosines"],
-        "where": ["The model fails most at 24 kPa."],
-        "drift": [{"parameter": "eversion_damping.B", "sentence": "B rises by 39 ± 3 % from 60 kPa to 24 kPa."}],
-        "next_experiment": next_experiment() if verdict == "ambiguous" else None,
-        "missing_force": missing_force() if verdict == "unexplained" else None,
-        "notes": [],
-        "refused": None,
-    }
+    content = {"verdict": verdict, "effects": added, "answer_set": named, "rounds": rounds, "parameters": parameters}
+    content |= {name: rounds[0][name] for name in ("explanation", "cosines")} | {"notes": [], "refused": None}
+    drift = {"parameter": "eversion_damping.B", "sentence": "B rises by 39 ± 3 % from 60 kPa to 24 kPa."}
+    content |= {"final_verdict": rounds[-1]["verdict"], "where": ["The model fails most at 24 kPa."], "drift": [drift]}
+    content["next_experiment"] = next_experiment() if verdict == "ambiguous" else None
+    content["missing_force"] = missing_force() if verdict == "unexplained" else None
     return content | changes
 
 
-def refused(reason: str = "fewer than two trials move") -> dict[str, Any]:
-    empty: dict[str, Any] = {"effects": [], "answer_set": [], "rounds": [], "parameters": [], "model": BASE}
+def refused(reason: str = "fewer than two trials move") -> dict:
+    empty: dict = {"effects": [], "answer_set": [], "rounds": [], "parameters": [], "model": BASE}
     said = {"refused": reason, "explanation": f"No diagnosis could be made: {reason}"}
     return empty | said | {"verdict": None, "final_verdict": None}
 
 
-def missing_force() -> dict[str, Any]:
+def missing_force() -> dict:
     law = {"law": "constant", "words": "the same everywhere", "explained": 0.93, "amplitude_N": 0.4, "sigma_N": 0.02}
     return {"sentence": "It looks like a constant.", "laws": [law], "depends_on": {"growth": 0.95}}
 
 
-def next_experiment() -> dict[str, Any]:
+def next_experiment() -> dict:
     trial = {"replicates": 4, "pressure_kPa": 30.0, "payload_g": 0.0, "diameter_mm": 24.0, "thickness_um": 100.0}
     trial |= {"length_mm": 200.0, "chamber_l": 2.0, "inlet_mm": None, "growth_angle_deg": 0.0, "new_vine": True}
     pair = "air_drag | inlet_loss"
-    return {
-        "text": "Make four trials on a tube of half the wall.",
-        "trials": [trial],
-        "separation_sigma": {pair: 21.0},
-        "simulated_sigma": {pair: {"mean": 20.0, "sd": 1.4}},
-        "calibration": "film a ruler and a strobe",
-    }
+    found = {"text": "Make four trials on a tube of half the wall.", "trials": [trial]}
+    found |= {"separation_sigma": {pair: 21.0}, "simulated_sigma": {pair: {"mean": 20.0, "sd": 1.4}}}
+    return found | {"calibration": "film a ruler and a strobe"}
 
 
 def ladder(*added: str) -> pd.DataFrame:
@@ -115,12 +98,7 @@ def ladder(*added: str) -> pd.DataFrame:
 
 def moved() -> pd.DataFrame:
     n = {"model": "m", "vine": "", "unit": "1", "symbol": "n", "parameter": "eversion_damping.n", "added": ""}
+    n |= {"value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52}
     after = n | {"added": "reservoir_depletion", "value": 0.37, "sigma": 0.004, "low_95": 0.36, "high_95": 0.38}
-    gamma = after | {"parameter": "reservoir_depletion.gamma", "symbol": "γ"}
-    return pd.DataFrame(
-        [
-            n | {"value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52},
-            after,
-            gamma | {"value": 1.17, "low_95": 1.16, "high_95": 1.18},
-        ]
-    )
+    gamma = {"parameter": "reservoir_depletion.gamma", "symbol": "γ", "value": 1.17, "low_95": 1.16, "high_95": 1.18}
+    return pd.DataFrame([n, after, after | gamma])

@@ -1,7 +1,5 @@
 """A trial sheet of two vines written by hand, for tests to break."""
 
-from __future__ import annotations
-
 import csv
 import io
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small campaigns with a truth that the diagnosis does not see."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,9 +1,6 @@
 """Vines grown by scipy, for tests: Eq. (2) of the physics written out once more, nothing of the package's own model."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -11,6 +8,7 @@ import numpy as np
 from by_hand import followed
 
 from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import Vine
 from vinetrack.tracks.position_noise import ar1_noise
@@ -27,14 +25,7 @@ def vine_trial(name: str, pressure_kPa: float, diameter_mm: float = 24.0, **more
     return replace(vine.trial(name, pressure_kPa, capture_fps=FPS), **more)  # type: ignore[arg-type]
 
 
-def grown_position(
-    trial: Trial,
-    time_s: np.ndarray,
-    B: float,
-    n: float = N_TRUE,
-    pressure_gain: float = 1.0,
-    pressure_along: Callable[[float], float] | None = None,
-) -> np.ndarray:
+def grown_position(trial: Trial, time_s, B: float, n=N_TRUE, pressure_gain=1.0, pressure_along=None) -> np.ndarray:
     """Lead position at times since release, NaN beyond 96 % of the length; x and ẋ are those of the tail.
 
     `pressure_along` gives the gauge pressure by lead position, in place of the set one.
@@ -56,14 +47,13 @@ def as_track(time_s: np.ndarray, position_m: np.ndarray, pressure_Pa: np.ndarray
     return plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
 
 
-def ar1(count: int, rho: float, draw: np.random.Generator) -> np.ndarray:
-    """Stationary noise of standard deviation 1."""
-    return ar1_noise(count, 1.0, rho, draw)
+def fallen_m(time_s: np.ndarray, trial: Trial, drag: float) -> np.ndarray:
+    """Of a ball in air, y = (v²/g) ln cosh(g t/v) with the terminal speed v = √(2 m g / (ρ A C_D))."""
+    terminal_m_s = math.sqrt(2 * trial.payload_kg * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * drag))
+    return terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * np.maximum(time_s, 0.0) / terminal_m_s))
 
 
-def filmed(
-    trial: Trial, draw: np.random.Generator, *, damping: float = 1.0, pressure: float = 1.0, rho: float = 0.0
-) -> tuple[Track, float, float]:
+def filmed(trial: Trial, draw, *, damping=1.0, pressure=1.0, rho=0.0) -> tuple[Track, float, float]:
     """A track of a trial whose B and P are off by these factors, its release, s, and its origin, m."""
     release_s = (20 - draw.uniform()) / FPS
     origin_m = float(draw.uniform(-0.05, 0.05))
@@ -71,27 +61,16 @@ def filmed(
     B = B_TRUE[round(trial.diameter_m * 1e3, 3)] * damping
     position = grown_position(trial, time_s - release_s, B, N_TRUE, pressure)
     seen = np.isfinite(position)
-    noise = NOISE_M * ar1(int(seen.sum()), rho, draw)
+    noise = NOISE_M * ar1_noise(int(seen.sum()), 1.0, rho, draw)
     return as_track(time_s[seen], origin_m + position[seen] + noise), release_s, origin_m
 
 
-def small_campaign(
-    seed: int, damping: float = 0.03, pressure: float = 0.01, rho: float = 0.0, replicates: int = 2
-) -> tuple[list[tuple[Trial, Track]], list[dict[str, float]]]:
-    """Two vines, four pressures; sheet and tracks, and the truth of every trial."""
-    pairs, truth = _small_campaign(seed, damping, pressure, rho, replicates)
-    return list(pairs), list(truth)
-
-
 @lru_cache(maxsize=32)
-def _small_campaign(seed: int, damping: float, pressure: float, rho: float, replicates: int) -> tuple[list, list]:
+def small_campaign(seed: int, damping=0.03, pressure=0.01, rho=0.0, replicates=2) -> tuple[tuple, tuple]:
+    """Two vines, four pressures; sheet and tracks, and the truth of every trial."""
     draw = np.random.default_rng(seed)
-    trials = [
-        vine_trial(f"D{D:g}_{P:g}_{k}".replace(".", "p"), P, D)
-        for D, pressures in ((24.0, (12, 16, 22, 30)), (18.0, (16, 22, 30, 42)))
-        for P in pressures
-        for k in range(replicates)
-    ]
+    settings = [(24.0, P) for P in (12, 16, 22, 30)] + [(18.0, P) for P in (16, 22, 30, 42)]
+    trials = [vine_trial(f"D{D:g}_{P:g}_{k}", P, D) for D, P in settings for k in range(replicates)]
     pairs, truth = [], []
     for trial in with_names(trials):
         B_off = math.exp(damping * draw.standard_normal())
@@ -99,4 +78,4 @@ def _small_campaign(seed: int, damping: float, pressure: float, rho: float, repl
         track, release_s, origin_m = filmed(trial, draw, damping=B_off, pressure=P_off, rho=rho)
         pairs.append((trial, track))
         truth.append({"damping": B_off, "pressure": P_off, "release_s": release_s, "origin_m": origin_m})
-    return pairs, truth
+    return tuple(pairs), tuple(truth)

@@ -3,8 +3,6 @@
 `python tests/helpers/notebook.py docs/python.ipynb` runs one and writes its outputs into it.
 """
 
-from __future__ import annotations
-
 import ast
 import base64
 import contextlib
@@ -12,7 +10,6 @@ import io
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -20,15 +17,15 @@ DPI = 55
 """Of pictures in a stored notebook. Chosen: about 30 kB each."""
 
 
-def run(path: Path) -> list[list[dict[str, Any]]]:
+def run(path: Path) -> list[list[dict]]:
     """Run the code cells of a notebook in one namespace; what each printed and showed, as `nbformat` 4 has it."""
-    names: dict[str, Any] = {"__name__": "__main__"}
+    names: dict = {"__name__": "__main__"}
     notebook = json.loads(path.read_text(encoding="utf-8"))
     assert notebook["nbformat"] == 4
     return [_run_cell("".join(cell["source"]), names) for cell in notebook["cells"] if cell["cell_type"] == "code"]
 
 
-def _run_cell(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
+def _run_cell(source: str, names: dict) -> list[dict]:
     tree = ast.parse(source)
     last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
     printed, value = io.StringIO(), None
@@ -36,11 +33,11 @@ def _run_cell(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
         exec(compile(tree, "cell", "exec"), names)
         if last is not None:
             value = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
-    outputs: list[dict[str, Any]] = []
+    outputs: list[dict] = []
     if text := printed.getvalue().splitlines(keepends=True):
         outputs.append({"output_type": "stream", "name": "stdout", "text": text})
     if value is not None:
-        data: dict[str, Any] = {"text/plain": repr(value).splitlines(keepends=True)}
+        data: dict = {"text/plain": repr(value).splitlines(keepends=True)}
         if isinstance(value, Figure):
             file = io.BytesIO()
             value.savefig(file, format="png", dpi=DPI, facecolor="white")

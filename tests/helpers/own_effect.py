@@ -1,8 +1,6 @@
 """The effect of docs/own_effect.md. Every test with an effect of a user's own beside the whole catalogue uses this one:
 each further one would be compiled with all the others."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures in memory as a recording that was read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ A truth of another hand than the laboratory's: no import of `vinetrack`, another
 `plain_scene` draws frames in memory, `write_video` and `write_images` put them in files.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -81,9 +79,7 @@ def moving(plan: Plan, n_frames: int) -> np.ndarray:
     return (later > plan.start_px) & (travel(plan, np.arange(n_frames, dtype=float)) < plan.end_px)
 
 
-def developed(
-    plan: Plan, picture: np.ndarray, frame: int, phase: np.ndarray, rng: np.random.Generator, light: float = 1.0
-) -> np.ndarray:
+def developed(plan: Plan, picture: np.ndarray, frame: int, phase, rng, light=1.0) -> np.ndarray:
     """A picture as the camera keeps it: blurred, shaken, in this light, with grain."""
     picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
     if plan.shake:
@@ -176,25 +172,3 @@ def write_images(folder: Path, frames: np.ndarray, suffix: str = ".png", step: i
     for i, picture in enumerate(frames):
         cv2.imwrite(str(folder / f"frame_{1 + i * step:04d}{suffix}"), picture)
     return folder
-
-
-HARDER: dict[str, dict] = {
-    "plain": {},
-    "door": {"door": True},
-    "flicker": {"flicker": 0.05},
-    "shake": {"shake": 1.2},
-    "wobble": {"wobble": 3.0},
-    "dark": {"film": 20.0},
-    "low_contrast": {"film": 95.0, "wall_sd": 4.0, "tail_sd": 3.0},
-    "half_exposure": {"speed": 40.0, "exposure": 0.5, "rise_frames": 4.0},
-    "payload": {"payload": True, "door": True},
-    "slow": {"speed": 3.0, "rise_frames": 30.0},
-    "reversal": {"gradient": 110.0, "film": 130.0},
-    "oblique": {"angle_deg": 12.0, "from_px": (30.0, 45.0), "end_px": 700.0},
-    "leftward": {"angle_deg": 180.0, "from_px": (920.0, 120.0)},
-    "no_rest": {"rest_frames": 0, "start_px": 80.0},
-    "flat_tip": {"tip_depth": 0.0},
-    "round_tip": {"tip_depth": 28.0},
-    "strong_tail": {"tail_sd": 30.0},
-}
-"""Changes to the plan that make recordings harder, by name."""

@@ -1,17 +1,16 @@
 """A command that serves a page, in a separate process; user actions on the explorer's page in a browser."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Self
 
 from chrome import Chrome, end, until
 
@@ -24,20 +23,14 @@ class Served:
     """`vinetrack explore RESULTS --no-browser`, or another command, up to Ctrl-C. Use it as a context."""
 
     def __init__(self, folder: Path, *arguments: str, command: str = "explore") -> None:
-        self.lines: list[str] = []
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, command, str(folder), "--no-browser", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self._log = tempfile.NamedTemporaryFile()  # noqa: SIM115
+        started = [sys.executable, "-c", PROGRAM, command, str(folder), "--no-browser", *arguments]
+        self.process = subprocess.Popen(started, stdout=self._log, stderr=subprocess.STDOUT)
 
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.append(line.rstrip("\n"))
+    @property
+    def lines(self) -> list[str]:
+        """What it has printed."""
+        return Path(self._log.name).read_text().splitlines()
 
     @property
     def address(self) -> str:
@@ -52,19 +45,15 @@ class Served:
     def interrupt(self) -> int:
         """Ctrl-C; the exit status."""
         self.process.send_signal(signal.SIGINT)
-        status = self.process.wait(30)
-        self._reader.join(10)
-        return status
+        return self.process.wait(30)
 
-    def __enter__(self) -> Served:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
             end(self.process)
-        self._reader.join(10)
-        if self.process.stdout is not None:
-            self.process.stdout.close()
+        self._log.close()
 
 
 @contextmanager
@@ -95,7 +84,7 @@ class Visitor:
         """JavaScript expression of a widget or figure."""
         return f"Bokeh.documents[0].get_model_by_name({name!r})"
 
-    def value(self, name: str, what: str) -> Any:
+    def value(self, name: str, what: str):
         """A property of a widget."""
         return self.chrome.run(f"{self.model(name)}.{what}")
 

@@ -4,26 +4,20 @@ m(x) ẍ = ½(P − P_y)A + m g − ½B ẋⁿ with m = λL + m_pay − (λ/2)x,
 integrators or effects take part.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from by_hand import followed
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from vinetrack.core.records import Track, plain_track
+from vinetrack.core.records import Floats, Track, plain_track
 
 G = 9.81
 N_EXPONENT = 0.37
 B_PRINTED = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}
 CAPTURE_FPS = 1069.0
-make_track = plain_track
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -90,15 +84,7 @@ def ar1(n: int, sd: float, rho: float, rng: np.random.Generator) -> Floats:
     return lfilter([1.0], [1.0, -rho], innovations)[60:]
 
 
-def record(
-    vine: Vine,
-    rng: np.random.Generator,
-    *,
-    noise_m: float,
-    rho: float = 0.0,
-    rest_frames: int = 40,
-    end_frames: int = 0,
-) -> Recording:
+def record(vine: Vine, rng, *, noise_m: float, rho=0.0, rest_frames=40, end_frames=0) -> Recording:
     """Sample a vine: still frames before release, `end_frames` flat ones once it is grown, arbitrary zeros."""
     solution, duration_s = motion(vine)
     release_s = (rest_frames + rng.uniform()) / CAPTURE_FPS
@@ -110,5 +96,5 @@ def record(
     lead_speed = np.where((time_s <= release_s) | (time_s > release_s + duration_s), 0.0, lead_speed)
     offset_s, origin_m = rng.uniform(-3, 3), rng.uniform(-0.1, 0.1)
     noisy = lead + origin_m + ar1(n, noise_m, rho, rng)
-    track = make_track(time_s + offset_s, noisy)
+    track = plain_track(time_s + offset_s, noisy)
     return Recording(track, lead + origin_m, lead_speed, release_s + offset_s, release_s + duration_s + offset_s)

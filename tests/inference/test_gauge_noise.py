@@ -7,25 +7,17 @@ import numpy as np
 import pytest
 from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
-from lsoda_vine import N_TRUE, ar1, as_track, small_campaign
+from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
+from vinetrack.inference import gauge_noise as gauge
 from vinetrack.inference import solving
 from vinetrack.inference.fit import predict_prepared
-from vinetrack.inference.gauge_noise import (
-    DenoisedTrace,
-    Growth,
-    denoised_traces,
-    gauge_clocks,
-    gauge_readings,
-    noise_correlation,
-    noise_of_traces,
-    white_noise_sd,
-)
 from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.robust_covariance import recorded_pressures, systematics_of
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
+from vinetrack.tracks.position_noise import ar1_noise
 
 TIMES_S = np.arange(0.0, 0.6, 1e-3)
 FRAMES = np.arange(TIMES_S.size)
@@ -34,7 +26,7 @@ LET_DOWN = np.interp(TIMES_S, [0.1, 0.12, 0.2, 0.5], [16e3, 3e3, 3e3, 16e3])
 
 def without_noise(pressure_Pa: np.ndarray) -> np.ndarray:
     still = as_track(1e-3 * np.arange(pressure_Pa.size), np.zeros(pressure_Pa.size), pressure_Pa)
-    return denoised_traces([still])[0].pressure_Pa
+    return gauge.denoised_traces([still])[0].pressure_Pa
 
 
 @pytest.mark.parametrize("sigma_Pa", [30.0, 100.0, 300.0])
@@ -43,7 +35,7 @@ def test_most_of_the_noise_is_removed(sigma_Pa):
     lefts = []
     for seed in range(10):
         noisy = LET_DOWN + sigma_Pa * np.random.default_rng(seed).standard_normal(TIMES_S.size)
-        assert white_noise_sd(noisy) == pytest.approx(sigma_Pa, rel=0.15)
+        assert gauge.white_noise_sd(noisy) == pytest.approx(sigma_Pa, rel=0.15)
         lefts.append(without_noise(noisy) - LET_DOWN)
     assert np.sqrt(np.mean(np.square(lefts))) < 0.5 * sigma_Pa
     assert np.max(np.abs(lefts)) < 5 * sigma_Pa
@@ -53,7 +45,7 @@ def test_exact_pressures_are_unchanged_and_equal_readings_handled():
     for exact_Pa in (LET_DOWN, 16e3 * -np.expm1(-TIMES_S / 0.2), np.full(5, 3.0)):
         np.testing.assert_array_equal(without_noise(exact_Pa), exact_Pa)
     told_Pa = 20e3 + 100.0 * (np.arange(60) == 30)  # readings that are nearly all equal
-    assert noise_correlation([told_Pa] * 4) == 0.0
+    assert gauge.noise_correlation([told_Pa] * 4) == 0.0
     assert np.isfinite(without_noise(told_Pa)).all()
 
 
@@ -78,11 +70,11 @@ def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset):
         readings_Pa = np.interp(read_at, FRAMES, at_gauge_Pa)
         readings_Pa += 50.0 * np.random.default_rng(100 + seed).standard_normal(read_at.size)
         traces.append(np.interp(FRAMES, read_at, readings_Pa))
-        growths.append(Growth(growth_m, 1e-3))
-    read = gauge_readings(traces)
-    noises = noise_of_traces(read, 0.0)
-    alone = [gauge_clocks(*([each] for each in one))[0] for one in zip(read, growths, noises, strict=True)]
-    off = np.array([clock.offset - offset for clock in gauge_clocks(read, growths, noises)])
+        growths.append(gauge.Growth(growth_m, 1e-3))
+    read = gauge.gauge_readings(traces)
+    noises = gauge.noise_of_traces(read, 0.0)
+    alone = [gauge.gauge_clocks(*([each] for each in one))[0] for one in zip(read, growths, noises, strict=True)]
+    off = np.array([clock.offset - offset for clock in gauge.gauge_clocks(read, growths, noises)])
     off_alone = np.array([clock.offset - offset for clock in alone])
     assert off[5] == pytest.approx(20.0, abs=5.0)
     others = np.arange(12) != 5
@@ -98,7 +90,7 @@ def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent):
     """Twenty traces with 5 Pa of noise: their mean is off by no more than a fifth of a pascal."""
     pressure_Pa = 115e3 * (1 + 0.2 * GROWTH_M / exponent) ** -exponent - 101_325.0
     draws = [np.random.default_rng(300 + seed).standard_normal(TIMES_S.size) for seed in range(20)]
-    quiet = denoised_traces([as_track(TIMES_S, GROWTH_M, pressure_Pa + 5.0 * draw) for draw in draws])
+    quiet = gauge.denoised_traces([as_track(TIMES_S, GROWTH_M, pressure_Pa + 5.0 * draw) for draw in draws])
     off = np.array([trace.pressure_Pa - pressure_Pa for trace in quiet])
     assert np.max(np.abs(np.mean(off, axis=0))) < 1.0
 
@@ -114,7 +106,7 @@ def test_a_corner_between_two_readings_is_where_the_growth_begins():
         readings_Pa += 10.0 * np.random.default_rng(200 + seed).standard_normal(read_at.size)
         tracks.append(as_track(TIMES_S, growth_m, np.interp(FRAMES, read_at, readings_Pa)))
         true_Pa.append(pressure_Pa)
-    off_Pa = np.array([trace.pressure_Pa for trace in denoised_traces(tracks)]) - true_Pa
+    off_Pa = np.array([trace.pressure_Pa for trace in gauge.denoised_traces(tracks)]) - true_Pa
     assert np.max(cut_Pa) > 50.0
     assert np.max(np.abs(off_Pa)) < 0.5 * np.max(cut_Pa)
 
@@ -122,7 +114,7 @@ def test_a_corner_between_two_readings_is_where_the_growth_begins():
 @pytest.mark.slow
 def test_stated_errors_cover_the_actual_errors():
     made = [emptied(seed) for seed in range(40)]
-    quiet = denoised_traces([as_track(TIMES_S, growth_m, noisy_Pa) for _, noisy_Pa, growth_m in made])
+    quiet = gauge.denoised_traces([as_track(TIMES_S, growth_m, noisy_Pa) for _, noisy_Pa, growth_m in made])
     sizes = []
     for trace, (pressure_Pa, _, _) in zip(quiet, made, strict=True):
         assert trace.mean_error_Pa == pytest.approx(50.0 / np.sqrt(TIMES_S.size), rel=0.25)
@@ -141,14 +133,14 @@ def test_readings_of_an_interpolated_trace_are_recovered(per_reading):
     read_at = np.arange(0.3, 400.0, per_reading)
     readings_Pa = 20e3 + 100.0 * draw.standard_normal(read_at.size)
     frames = np.arange(int(read_at[0] + 0.2 * per_reading) + 1, int(read_at[-1] - 0.2 * per_reading))
-    (told,) = gauge_readings([np.interp(frames, read_at, readings_Pa)])
+    (told,) = gauge.gauge_readings([np.interp(frames, read_at, readings_Pa)])
     # Those before and after the trace as well, where enough of the lines that lead to them shows.
     places = told.places + frames[0]
     which = np.searchsorted(read_at, places - 0.5 * per_reading)
     assert which.size >= read_at.size - 2
     np.testing.assert_allclose(places, read_at[which], atol=1e-4)
     np.testing.assert_allclose(told.values_Pa, readings_Pa[which], rtol=1e-7)
-    (held,) = gauge_readings([readings_Pa[np.searchsorted(read_at, frames, side="right") - 1]])
+    (held,) = gauge.gauge_readings([readings_Pa[np.searchsorted(read_at, frames, side="right") - 1]])
     assert np.isin(held.values_Pa, readings_Pa).all()
     assert np.max(np.abs(held.places + frames[0] - read_at[: held.places.size])) <= 1.0
 
@@ -161,8 +153,8 @@ def test_readings_are_recovered_from_samples_rounded_after_interpolation(per_rea
     readings_Pa = 20e3 + 100.0 * draw.standard_normal((8, read_at.size))
     frames = np.arange(int(read_at[0]) + 1, int(read_at[-1]))
     traces = [digit_Pa * np.round(np.interp(frames, read_at, each) / digit_Pa) for each in readings_Pa]
-    told = gauge_readings(traces)
-    assert np.mean([noise.sigma_Pa for noise in noise_of_traces(told, 0.0)]) == pytest.approx(100.0, rel=0.15)
+    told = gauge.gauge_readings(traces)
+    assert np.mean([noise.sigma_Pa for noise in gauge.noise_of_traces(told, 0.0)]) == pytest.approx(100.0, rel=0.15)
     for trace, each in zip(traces, told, strict=True):
         assert each.places.size < 1.1 * trace.size / per_reading + 2
         off_Pa = np.interp(np.arange(trace.size), each.places, each.values_Pa) - trace
@@ -176,17 +168,17 @@ def test_readings_in_coarse_steps_are_recovered_although_many_are_equal(per_read
     read_at = np.arange(0.3, 600.0, per_reading)
     readings_Pa = 100.0 * np.round((20e3 + 60.0 * draw.standard_normal(read_at.size)) / 100.0)
     frames = np.arange(int(read_at[1]) + 1, int(read_at[-1]))
-    (held,) = gauge_readings([readings_Pa[np.searchsorted(read_at, frames, side="right") - 1]])
-    (joined,) = gauge_readings([np.interp(frames, read_at, readings_Pa)])
+    (held,) = gauge.gauge_readings([readings_Pa[np.searchsorted(read_at, frames, side="right") - 1]])
+    (joined,) = gauge.gauge_readings([np.interp(frames, read_at, readings_Pa)])
     places = held.places + frames[0]
     which = np.argmin(np.abs(places[:, None] - read_at), axis=1)
     assert np.max(np.abs(places - read_at[which])) < 1.0
     np.testing.assert_array_equal(held.values_Pa, readings_Pa[which])
     rounded_Pa = np.hypot(60.0, 100.0 / np.sqrt(12))
-    assert noise_of_traces([held], 0.0)[0].sigma_Pa == pytest.approx(rounded_Pa, rel=0.2)
+    assert gauge.noise_of_traces([held], 0.0)[0].sigma_Pa == pytest.approx(rounded_Pa, rel=0.2)
     # Lines that stand still for several readings are one: the noise is that of readings that differ.
     assert joined.places.size > 0.6 * read_at.size
-    assert rounded_Pa < noise_of_traces([joined], 0.0)[0].sigma_Pa < 1.6 * rounded_Pa
+    assert rounded_Pa < gauge.noise_of_traces([joined], 0.0)[0].sigma_Pa < 1.6 * rounded_Pa
 
 
 def test_a_fall_in_steps_coarser_than_its_noise_is_smooth_to_a_fraction_of_a_step():
@@ -198,7 +190,7 @@ def test_a_fall_in_steps_coarser_than_its_noise_is_smooth_to_a_fraction_of_a_ste
         told_Pa = 50.0 * np.round((pressure_Pa + 5.0 * draw.standard_normal(400)) / 50.0)
         tracks.append(as_track(TIMES_S[:400], growth_m, told_Pa))
     off, stated = [], []
-    for quiet, pressure_Pa in zip(denoised_traces(tracks), true_Pa, strict=True):
+    for quiet, pressure_Pa in zip(gauge.denoised_traces(tracks), true_Pa, strict=True):
         off.append(quiet.pressure_Pa - pressure_Pa)
         stated.append(np.hypot(np.linalg.norm(quiet.errors_Pa, axis=1), quiet.mean_error_Pa))
     assert np.max(np.abs(np.diff(off))) < 10.0  # no step is left
@@ -213,7 +205,7 @@ def test_noise_of_about_a_digit_is_not_taken_for_readings(digit_Pa):
     for sigma_Pa in (0.0, 0.3 * digit_Pa, digit_Pa, 100.0 * digit_Pa):
         noisy = falls + sigma_Pa * draw.standard_normal((8, falls.size))
         traces = list(digit_Pa * np.round(noisy / digit_Pa))
-        for told, trace in zip(gauge_readings(traces), traces, strict=True):
+        for told, trace in zip(gauge.gauge_readings(traces), traces, strict=True):
             assert told.all_noise or told.values_Pa.size == trace.size
 
 
@@ -221,10 +213,10 @@ def test_noise_behind_a_filter_is_detected_as_correlated():
     draw = np.random.default_rng(5)
     for rho in (0.0, 0.5, 0.85):
         falls = 20e3 * (1 + TIMES_S[:300] / 0.4) ** -0.3
-        traces = [falls + 100.0 * ar1(300, rho, draw) for _ in range(24)]
-        told = noise_correlation(traces)
+        traces = [falls + ar1_noise(300, 100.0, rho, draw) for _ in range(24)]
+        told = gauge.noise_correlation(traces)
         assert told == pytest.approx(rho, abs=0.05)
-        sigmas = [noise.sigma_Pa for noise in noise_of_traces(gauge_readings(traces), told)]
+        sigmas = [noise.sigma_Pa for noise in gauge.noise_of_traces(gauge.gauge_readings(traces), told)]
         assert np.mean(sigmas) == pytest.approx(100.0 * np.sqrt(1 - rho**2), rel=0.1)
 
 
@@ -237,7 +229,7 @@ def test_steady_pressures_stay_nearly_constant(per_reading):
         read_at = np.arange(-1.0, frames.size + per_reading, per_reading)
         readings_Pa = 8e3 + 100.0 * draw.standard_normal(read_at.size)
         tracks.append(as_track(frames / 500, frames**2 * 1e-6, np.interp(frames, read_at, readings_Pa)))
-    quiet = denoised_traces(tracks)
+    quiet = gauge.denoised_traces(tracks)
     off = [trace.pressure_Pa - 8e3 for trace in quiet]
     # A slope that is not quite unlikely has its share, a tenth of the 200 Pa that it would be.
     assert sum(float(np.ptp(each)) > 20.0 for each in off) <= 1
@@ -249,13 +241,13 @@ def test_a_pressure_is_extrapolated_linearly_but_not_below_ambient():
     times_s = np.linspace(0.0, 0.2, 201)
     falls = np.where(times_s < 0.1, 30e3, 30e3 - 50e3 * (times_s - 0.1))
     errors = np.column_stack([np.full(201, 20.0), 100 * times_s])
-    longer = DenoisedTrace(times_s, falls, 5.0, errors).extended()
+    longer = gauge.DenoisedTrace(times_s, falls, 5.0, errors).extended()
     assert longer.time_s[:-1] == pytest.approx(times_s)
     assert longer.time_s[-1] == pytest.approx(0.24)
     assert longer.pressure_Pa[-1] == pytest.approx(25e3 - 50e3 * 0.04)
     assert longer.errors_Pa[-1] == pytest.approx([20.0, 24.0])
     assert longer.mean_error_Pa == 5.0
-    let_out = DenoisedTrace(times_s, np.maximum(20e3 - 1e5 * times_s, 0.0), 0.0, np.zeros((201, 0))).extended()
+    let_out = gauge.DenoisedTrace(times_s, np.maximum(20e3 - 1e5 * times_s, 0.0), 0.0, np.zeros((201, 0))).extended()
     assert let_out.pressure_Pa[-1] == 0.0
 
 

@@ -23,9 +23,7 @@ def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
     return np.asarray(sigma**2 * toeplitz(rho ** np.arange(count)))
 
 
-def given(
-    n_trials: int, count: int, keys: int, spread: float = 1e-5, *, rho: float = RHO, sigma: float = SIGMA, **more
-) -> tuple[marginal.MixedProblem, marginal.FitState]:
+def given(n_trials: int, count: int, keys: int, spread=1e-5, *, rho=RHO, sigma=SIGMA, **more):
     """A problem whose releases and origins are free, only B deviates and nothing has bounds or priors; its state."""
     own = {"has_deviation": np.tile([False, True], (n_trials, 1)), "gauge_error": np.zeros(n_trials)}
     own |= {"index": np.tile(np.arange(keys), (n_trials, 1)), "release_origin_mean": np.zeros((n_trials, 2))}
@@ -53,8 +51,10 @@ def crossed(columns: list[np.ndarray]) -> np.ndarray:
 
 
 def test_cross_products_agree_with_the_dense_inverse_covariance():
+    """Of columns divided by their noise."""
     columns, first = np.random.default_rng(0).standard_normal((30, 4)), np.isin(np.arange(30), [0, 17])
-    white = at_correlation(products(columns, first)[None], RHO)[0]
+    noise = np.linspace(0.5, 2.0, 30)
+    white = at_correlation(products(columns * noise[:, None], first, noise)[None], RHO)[0]
     dense = block_diag(covariance(17, RHO, 1.0), covariance(13, RHO, 1.0))
     assert white / (1 - RHO**2) == pytest.approx(columns.T @ np.linalg.solve(dense, columns))
 

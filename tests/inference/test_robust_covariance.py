@@ -6,24 +6,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, N_TRUE, as_track, filmed, small_campaign, vine_trial
+from lsoda_vine import B_TRUE, N_TRUE, as_track, fallen_m, filmed, small_campaign, vine_trial
 from scipy.stats import t as student
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.drift import against_the_sheet
 from vinetrack.inference import fit_result, optimiser, position_errors
+from vinetrack.inference import robust_covariance as sandwich
 from vinetrack.inference.optimiser import solve
-from vinetrack.inference.robust_covariance import (
-    PRESSURE_ERROR_PA,
-    Systematics,
-    _few_trial_variances,
-    coarsest_groups,
-    group_scatter,
-    robust_covariance,
-    widened_covariance,
-)
 
 Pairs = list[tuple[Trial, Track]]
 FALL = vt.make_model(["gravity", "air_drag"])
@@ -34,7 +25,8 @@ def misread(seed: int) -> Pairs:
     """Trials that hardly scatter, and a gauge read wrong by 30 Pa or so, anew for every condition."""
     pairs, _ = small_campaign(seed, damping=5e-4, pressure=5e-4, replicates=5)
     draw = np.random.default_rng(seed)
-    wrong = {one: PRESSURE_ERROR_PA * draw.standard_normal() for one in sorted({t.condition for t, _ in pairs})}
+    conditions = sorted({trial.condition for trial, _ in pairs})
+    wrong = {one: sandwich.PRESSURE_ERROR_PA * draw.standard_normal() for one in conditions}
     return [(replace(trial, pressure_Pa=trial.pressure_Pa + wrong[trial.condition]), track) for trial, track in pairs]
 
 
@@ -79,12 +71,12 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch):
     What trials err by together, which here is more, is left aside.
     """
     found = vt.fit(vt.base_model(), unlike(20620), profile=False)
-    plain, robust = (np.diag(matrix) for matrix in robust_covariance(found.predictor, found.solution))
+    plain, robust = (np.diag(matrix) for matrix in sandwich.robust_covariance(found.predictor, found.solution))
     assert np.max(robust / plain) > 1.5
     known = position_errors.precision(found.solution)
-    nothing = Systematics.none([trial.time_s.size for trial in found.predictor.data])
+    nothing = sandwich.Systematics.none([trial.time_s.size for trial in found.predictor.data])
     monkeypatch.setattr("vinetrack.inference.robust_covariance.systematics_of", lambda *_, **__: nothing)
-    stated = np.diag(widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
+    stated = np.diag(sandwich.widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
     assert np.all(stated / np.diag(known.covariance) >= 0.99 * robust / plain)
 
 
@@ -98,19 +90,18 @@ def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials):
     for _ in range(3000):
         values = 0.2 * draw.standard_normal(trials)
         scores = 25.0 * (values - values.mean())[:, None]
-        variance, degrees = _few_trial_variances(information, scores, solution, plain)
+        variance, degrees = sandwich._few_trial_variances(information, scores, solution, plain)
         assert degrees[0] == pytest.approx(trials - 1)
         found.append(variance[0])
     assert np.mean(found) == pytest.approx(plain[0, 0], rel=0.08)
 
 
 def dropped(name: str, seed: int, drag: float, noise_m: float = 2e-3) -> tuple[Trial, Track]:
-    """A ball of 100 mm and 20 g that falls in air, y = (v²/g) ln cosh(g t/v), filmed with 2 mm of noise or so."""
+    """A ball of 100 mm and 20 g that falls in air, filmed with 2 mm of noise or so."""
     trial = Trial(name=name, diameter_m=0.1, pressure_Pa=0.0, yield_pressure_Pa=0.0, payload_kg=20e-3, travel_ratio=1.0)
-    terminal_m_s = float(np.sqrt(2 * 20e-3 * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * drag)))
     time_s = np.arange(100) / 120
-    fallen_m = terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * time_s / terminal_m_s))
-    return trial, as_track(time_s, fallen_m + np.random.default_rng(seed).normal(0, noise_m, time_s.size))
+    noise = np.random.default_rng(seed).normal(0, noise_m, time_s.size)
+    return trial, as_track(time_s, fallen_m(time_s, trial, drag) + noise)
 
 
 def scattering(seed: int, campaign: int, count: int) -> Pairs:
@@ -136,27 +127,18 @@ def test_drops_that_disagree_have_equal_weights_and_those_that_agree_are_weighte
     assert both.sigma == pytest.approx(first.sigma, rel=0.15)
 
 
-@pytest.mark.slow
-def test_intervals_from_few_drops_contain_the_true_drag():
-    held = []
-    for campaign in range(40):
-        drag = vt.fit(FALL, scattering(20300, campaign, 3 + campaign % 4), profile=False)["C_D"]
-        held.append(drag.low < 0.5 < drag.high)
-    assert sum(held) >= 34  # of 40 at 95 %, fewer once in 600
-
-
 @pytest.mark.parametrize(("specimens", "days", "groups"), [(8, 12, 8), (3, 12, 12), (0, 0, 24), (2, 3, 24)])
 def test_the_coarsest_sufficient_groups_are_used(specimens, days, groups):
     told = [(f"s{i % specimens}" if specimens else "", f"{i % days}" if days else "") for i in range(24)]
     trials = [Trial(name=f"t{i}", vine="v", specimen=one, day=day) for i, (one, day) in enumerate(told)]
-    assert len(set(coarsest_groups(trials))) == groups
+    assert len(set(sandwich.coarsest_groups(trials))) == groups
 
 
 def test_errors_shared_by_a_group_enter_the_covariance():
     draw, groups, seen = np.random.default_rng(7), [f"s{i % 12:02}" for i in range(48)], []
     for _ in range(400):
         single = np.tile(draw.standard_normal((12, 1)), (4, 1)) + 0.1 * draw.standard_normal((48, 1))
-        seen.append(group_scatter(single - single.mean(axis=0), groups, 1)[0, 0])
+        seen.append(sandwich.group_scatter(single - single.mean(axis=0), groups, 1)[0, 0])
     # 12 groups of 4 with a shared error of variance 1 and single ones of 0.01: 12 · 16 + 48 · 0.01.
     assert abs(np.mean(seen) / 192.5 - 1) < 0.05
 
@@ -166,10 +148,10 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
     found = vt.fit(vt.base_model(), bent(pairs, bends_m), profile=False)
-    alone = np.diag(robust_covariance(found.predictor, found.solution)[1])
+    alone = np.diag(sandwich.robust_covariance(found.predictor, found.solution)[1])
     told = enumerate(found.predictor.data)
     found.predictor.data = [replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in told]
-    by_day = np.diag(robust_covariance(found.predictor, found.solution)[1])
+    by_day = np.diag(sandwich.robust_covariance(found.predictor, found.solution)[1])
     assert np.all(by_day >= alone)
     assert np.max(by_day / alone) > 1.2
 

@@ -1,14 +1,11 @@
 """A results folder in memory: the same quantity has one value in files, report, command line, explorer and Python; the
 story of the README and the notebook of the documentation run on it."""
 
-from __future__ import annotations
-
 import html
 import json
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 import notebook
 import numpy as np
@@ -101,7 +98,7 @@ def test_a_frame_without_a_column_or_with_a_wrong_setting_is_refused_and_a_press
 
 @pytest.mark.slow
 def test_every_cell_of_the_notebook_runs_and_shows_what_is_stored():
-    def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
+    def kinds(outputs: list[dict]) -> list[list[str]]:
         return [sorted(one.get("data", one)) for one in outputs]
 
     page = ROOT / "docs" / "python.ipynb"

@@ -1,12 +1,9 @@
 """F = B·x_ssⁿ: the fit, the fit under a model of the pressure, and how its numbers and others change with size."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -227,13 +224,9 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model():
 
     With the set pressure nothing is steady and our rules refuse; the published rule goes on, and is wrong.
     """
-    vines = {1: (15.1, 22.8, 30.5, 38.3, 46, 53.7), 2: (12.7, 18.5, 24.3, 30.1, 35.9, 41.7)}
-    trials = [
-        replace(trial, chamber_m3=2.5e-4)
-        for scale, pressures_kPa in vines.items()
-        for trial in of_vine(isometric_vine(scale), pressures_kPa, 3, prefix=f"R{scale}_")
-    ]
-    trials = list(with_names(trials))
+    trials = of_vine(isometric_vine(1), (15.1, 22.8, 30.5, 38.3, 46, 53.7), 3, prefix="R1_")
+    trials += of_vine(isometric_vine(2), (12.7, 18.5, 24.3, 30.1, 35.9, 41.7), 3, prefix="R2_")
+    trials = list(with_names([replace(trial, chamber_m3=2.5e-4) for trial in trials]))
     nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=41)
     pairs = [(one.stated, one.track) for one in grow(trials, nature)]
     settings = RunSettings.model_validate({"damping": {"resamples": 300}})
@@ -241,7 +234,7 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model():
     found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs, profile=False)
     before, after = (redo_damping(model, motions, settings) for model in (vt.base_model(), found.model))
 
-    def worst_B(law: Mapping[str, Any]) -> float:
+    def worst_B(law: Mapping) -> float:
         return max(abs(vine["B"] / PAPER_B[round(vine["diameter_mm"] / 6)] - 1) for vine in law["vines"].values())
 
     assert before["both_axes"]["refused"]

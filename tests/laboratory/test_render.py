@@ -1,7 +1,5 @@
 """The pictures show what the truth says, measured by area, centroid and correlation, never by a tracker."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Both pages in a real browser: fill in, drag, track, refit, save; by keyboard, narrow, dark."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np
@@ -123,11 +121,7 @@ class Person:
         self.chrome.wait(f"document.querySelector('{element}')?.textContent.includes({words!r})", words, seconds)
 
     def box(self, element: str) -> list[float]:
-        return list(
-            self.chrome.run(
-                f"(() => {{ const r = {element}.getBoundingClientRect(); return [r.x, r.y, r.width, r.height]; }})()"
-            )
-        )
+        return self.chrome.run(f"(r => [r.x, r.y, r.width, r.height])({element}.getBoundingClientRect())")
 
     def at(self, x_px: float, y_px: float) -> tuple[float, float]:
         """Place in the window of a pixel of the picture, 480 × 160 px."""

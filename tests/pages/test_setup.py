@@ -1,12 +1,9 @@
 """The set-up page without a browser: names, drafts, pasted blocks, and answers of its server."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,18 +11,7 @@ from served import served_here
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import list_recordings, parse_yaml, read_table
-from vinetrack.pages.draft_files import (
-    SHARED_ROW,
-    columns_from_names,
-    first_settings,
-    list_pictures,
-    list_tables,
-    open_draft,
-    place_block,
-    read_block,
-    shared_values,
-    with_shared,
-)
+from vinetrack.pages import draft_files as draft
 from vinetrack.pages.setup_server import SetupServer, draft_from_json, draft_problems, page_state, write_templates
 from vinetrack.video.curved_axis import axis_through
 
@@ -38,8 +24,8 @@ def test_a_folder_offers_recordings_pictures_and_pressure_traces_in_the_order_of
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
     assert list_recordings(tmp_path) == ["burst", "monday/a.avi", "run 2.MOV", "run 10.mp4"]
-    assert list_pictures(tmp_path) == ["board.png", "calibration/board.mp4"]
-    assert list_tables(tmp_path) == ["p 2.csv", "p 10.csv", "traces/a.csv"]
+    assert draft.list_pictures(tmp_path) == ["board.png", "calibration/board.mp4"]
+    assert draft.list_tables(tmp_path) == ["p 2.csv", "p 10.csv", "traces/a.csv"]
 
 
 NAMES = {
@@ -62,9 +48,9 @@ NAMES = {
 
 
 def test_a_name_says_cells_and_a_unit_that_all_share_is_kept_while_mixed_ones_are_converted():
-    assert {name: columns_from_names([name]) for name in NAMES} == {name: [cells] for name, cells in NAMES.items()}
-    assert columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
-    assert columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
+    assert [draft.columns_from_names([name]) for name in NAMES] == [[cells] for cells in NAMES.values()]
+    assert draft.columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
+    assert draft.columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
 
 
 SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
@@ -78,7 +64,7 @@ def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_
     lines: list[str] = []
     write_templates(tmp_path, lines.append)
     assert [(row["diameter_mm"], row["pressure_kPa"]) for row in read_table(sheet).rows] == [("", ""), ("12", "30")]
-    assert settings.read_text() == first_settings()
+    assert settings.read_text() == draft.first_settings()
     assert any("capture_fps" in line and "calibration" in line for line in lines if line.startswith("To fill in"))
 
     sheet.write_text(SHEET)
@@ -91,20 +77,20 @@ def test_a_folder_of_recordings_gets_both_files_and_a_sheet_that_is_there_keeps_
     assert settings.read_text() == SETTINGS
     sheet.write_text("trial,video\nold,a.mp4,stray\n")  # cells without a column would be lost
     with pytest.raises(ExperimentError):
-        open_draft(tmp_path)
+        draft.open_draft(tmp_path)
 
 
 def test_shared_values_are_set_in_place_and_in_the_unit_chosen():
-    after = with_shared(SETTINGS, {"yield_pressure_psi": "0.5", "thickness_um": "100", "capture_fps": "1069"})
+    after = draft.with_shared(SETTINGS, {"yield_pressure_psi": "0.5", "thickness_um": "100", "capture_fps": "1069"})
     assert after.startswith("# of the lab\nyield_pressure_psi: 0.5 # measured twice\n")
-    assert shared_values(after) == {"thickness_um": 100, "yield_pressure_psi": 0.5, "capture_fps": 1069}
+    assert draft.shared_values(after) == {"thickness_um": 100, "yield_pressure_psi": 0.5, "capture_fps": 1069}
     # A new file has a blank `yield_pressure_kPa:`; that of an older version of the page has both.
-    after = with_shared(first_settings(), {"yield_pressure_psi": "0.42", "capture_fps": "1000"})
+    after = draft.with_shared(draft.first_settings(), {"yield_pressure_psi": "0.42", "capture_fps": "1000"})
     assert parse_yaml(after, "").content["yield_pressure_psi"] == 0.42
     assert "yield_pressure_kPa" not in parse_yaml(after, "").content
-    both = with_shared("yield_pressure_psi: 0.4\nyield_pressure_kPa:\n", {"yield_pressure_psi": "0.42"})
+    both = draft.with_shared("yield_pressure_psi: 0.4\nyield_pressure_kPa:\n", {"yield_pressure_psi": "0.42"})
     assert parse_yaml(both, "").content == {"yield_pressure_psi": 0.42}
-    assert parse_yaml(with_shared(after, {"yield_pressure_kPa": "3"}), "").content["yield_pressure_kPa"] == 3
+    assert parse_yaml(draft.with_shared(after, {"yield_pressure_kPa": "3"}), "").content["yield_pressure_kPa"] == 3
 
 
 COLUMNS = ["capture_fps", "diameter_mm", "pressure_kPa", "payload_g"]
@@ -118,13 +104,13 @@ EXPECTED = {(0, "pressure_kPa"): "24.1317", (0, "payload_g"): "0", (1, "pressure
 
 
 def changed(text: str, at_row: int | str = 0, at_column: str = "trial", decimal: str = ".") -> dict[tuple, str]:
-    placed, _ = place_block(text, COLUMNS, ROWS, at_row, at_column, decimal)
+    placed, _ = draft.place_block(text, COLUMNS, ROWS, at_row, at_column, decimal)
     assert len({cell[:2] for cell in placed}) == len(placed)
     return {(row, column): text for row, column, text in placed}
 
 
 def notes(text: str, at_column: str = "trial") -> int:
-    return len(place_block(text, COLUMNS, ROWS, 1, at_column)[1])
+    return len(draft.place_block(text, COLUMNS, ROWS, 1, at_column)[1])
 
 
 @pytest.mark.parametrize("mark", ["\t", ";", ",", "  "])
@@ -143,8 +129,8 @@ def test_without_a_header_names_decide_on_the_row_and_numbers_alone_go_where_the
     assert changed("late\t36\t5\nd15_24kPa_1\t24\t0\n", 0, "pressure_kPa") == expected
     expected = {(1, "pressure_kPa"): "24", (1, "payload_g"): "0", (2, "pressure_kPa"): "30", (2, "payload_g"): "20"}
     assert changed("24\t0\n30\t20", 1, "pressure_kPa") == expected
-    expected = {(SHARED_ROW, "pressure_kPa"): "1000", (0, "pressure_kPa"): "24"}
-    assert changed("1000\n24\n", SHARED_ROW, "pressure_kPa") == expected
+    expected = {(draft.SHARED_ROW, "pressure_kPa"): "1000", (0, "pressure_kPa"): "24"}
+    assert changed("1000\n24\n", draft.SHARED_ROW, "pressure_kPa") == expected
     assert changed("pressure\n24", 1, "diameter_mm") == {(1, "pressure_kPa"): "24"}
 
 
@@ -157,17 +143,18 @@ def test_what_matches_nothing_is_named_and_changes_nothing():
     assert notes("24\t0\t5", "pressure_kPa") == 1
     # A name of two recordings is of neither.
     rows = [{"trial": "a", "video": "x/1.mp4"}, {"trial": "b", "video": "y/1.mp4"}]
-    assert place_block("1.mp4\t24\nx/1.mp4\t30", COLUMNS, rows, 0, "pressure_kPa")[0] == [(0, "pressure_kPa", "30")]
+    block = "1.mp4\t24\nx/1.mp4\t30"
+    assert draft.place_block(block, COLUMNS, rows, 0, "pressure_kPa")[0] == [(0, "pressure_kPa", "30")]
 
 
 def test_decimal_commas_are_read_and_written_as_the_sheet_has_them():
-    assert read_block("24,5\n30,5") == [["24,5"], ["30,5"]]
+    assert draft.read_block("24,5\n30,5") == [["24,5"], ["30,5"]]
     assert changed("24,5\n30,5", 0, "pressure_kPa") == {(0, "pressure_kPa"): "24.5", (1, "pressure_kPa"): "30.5"}
     assert changed("late;36,5", 0, "pressure_kPa", ",") == {(2, "pressure_kPa"): "36,5"}
-    assert read_block("late,36") == [["late", "36"]]
+    assert draft.read_block("late,36") == [["late", "36"]]
 
 
-def sent(folder: Path, **more: Any) -> dict[str, Any]:
+def sent(folder: Path, **more) -> dict:
     """The content that an unchanged page sends."""
     state = page_state(folder)
     return {key: state[key] for key in ("sheet", "shared", "calibration", "axis", "stamp")} | more
@@ -176,7 +163,7 @@ def sent(folder: Path, **more: Any) -> dict[str, Any]:
 FILLED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
 
 
-def problems(folder: Path, **more: Any) -> list[dict[str, Any]]:
+def problems(folder: Path, **more) -> list[dict]:
     return draft_problems(folder, draft_from_json(folder, sent(folder, **more)))["problems"]
 
 
@@ -220,9 +207,7 @@ def server(clips):
         yield made
 
 
-def ask(
-    server: SetupServer, path: str, body: Any = None, headers: dict[str, str] = OURS, secret: str | None = None
-) -> tuple[int, bytes, str]:
+def ask(server: SetupServer, path: str, body=None, headers=OURS, secret=None) -> tuple[int, bytes, str]:
     with contextlib.closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)) as connection:
         method, data = ("GET", None) if body is None else ("POST", json.dumps(body))
         connection.request(method, (server.secret if secret is None else secret) + path, data, headers)

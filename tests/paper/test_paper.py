@@ -1,9 +1,8 @@
 """The paper's numbers: its own arithmetic, its figures found in an experiment, and what departures would cause."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -17,8 +16,6 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.summary import CONDITION_COLUMNS
 from vinetrack.paper import motions
 from vinetrack.paper import rows as lines
-
-# What follows from the paper's own numbers, each worked out by hand.
 
 
 def test_what_the_chamber_the_injector_and_the_sizes_say():
@@ -105,12 +102,10 @@ def test_without_weight_and_noise_the_published_rule_finds_what_was_put_in_and_l
 
     Of a chamber the larger vines lose most, and most where they are slow: set pressure overstates the force there.
     """
-    trials = [
-        replace(motions.paper_trial(6.0 * s, 50.0 * s, 70.0 * s, 14 + 1.5 * k), condition=f"R{s}_{k}")
-        for s in (1, 2, 3, 4)
-        for k in range(8)
-    ]
-    trials = [replace(trial, growth_angle_rad=math.pi / 2) for trial in trials]
+    trials = []
+    for s, k in product((1, 2, 3, 4), range(8)):
+        one = motions.paper_trial(6.0 * s, 50.0 * s, 70.0 * s, 14 + 1.5 * k)
+        trials.append(replace(one, condition=f"R{s}_{k}", growth_angle_rad=math.pi / 2))
     n, found = motions.rule_on_noise_free(None, trials)
     assert n == pytest.approx(0.37, abs=0.002)
     assert found == pytest.approx({1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}, rel=0.01)
@@ -197,11 +192,8 @@ DAMPING = {"log_log": law(0.371), "both_axes": law(0.372), "paper": law(0.38, 0.
 SPEEDS = {"pressure_kPa": 24.0, "sizes": [6.0, 12.0, 18.0, 24.0], "n_steady": [4, 4, 3, 4], "monotonic": False}
 SPEEDS |= {"power": LINE | {"slope": 0.6}, "line": LINE | {"R2": 0.7}}
 SPEEDS |= {"over_diameter": {"power": LINE | {"slope": -0.4}}}
-TREND = {
-    "thickness_um": {"power": -1.5, "power_95": [-2, -1], "p": 0.002},
-    "diameter_mm": {"power": 0.2, "power_95": [-1, 1.4], "p": 0.7},
-    "n": 8,
-}
+TREND = {"thickness_um": {"power": -1.5, "power_95": [-2, -1], "p": 0.002}, "n": 8}
+TREND["diameter_mm"] = {"power": 0.2, "power_95": [-1, 1.4], "p": 0.7}
 TRENDS = dict.fromkeys(("efficiency", "efficiency_payload", "efficiency_with_weight"), TREND)
 SCALING = {
     "isometric": [{"vines": ["v1", "v2", "v3", "v4"], "power": LINE, "line": LINE}],
@@ -215,14 +207,11 @@ FIT = FitSummary(names=("yield_pressure",), numbers=(P_Y_FOUND,))
 
 def found(**changes: object) -> lines.ExperimentResults:
     positions = pd.DataFrame([("c", 7.0, 4, 0.0031, 0.0042)], columns=list(motions.POSITION_COLUMNS))
-    speeds = pd.DataFrame(
-        [("a", "v", 14.0, 10.0, 4, 120.0, 1.1, 0.1, 1.0), ("b", "v", 14.0, 20.0, 4, 120.0, 1.3, 0.1, 1.6)],
-        columns=list(motions.SPEED_COLUMNS),
-    )
+    speeds = [("a", "v", 14.0, 10.0, 4, 120.0, 1.1, 0.1, 1.0), ("b", "v", 14.0, 20.0, 4, 120.0, 1.3, 0.1, 1.6)]
+    speeds = pd.DataFrame(speeds, columns=list(motions.SPEED_COLUMNS))
     sizes = dict(zip((one.name for one in motions.DEPARTURES), (0.057, 0.069, 0.095, 0.110, 0.114), strict=True))
-    departures = pd.DataFrame(
-        [("Fig. 4", 7.0, name, size, nan, nan) for name, size in sizes.items()], columns=list(motions.DEPARTURE_COLUMNS)
-    )
+    departures = [("Fig. 4", 7.0, name, size, nan, nan) for name, size in sizes.items()]
+    departures = pd.DataFrame(departures, columns=list(motions.DEPARTURE_COLUMNS))
     fast = {"diameter_mm": 25.0, "thickness_um": 100.0, "pressure_kPa": 62.0, "payload_g": 0.0}
     fast |= {"final_at_mm": 380.0, "final_lead_velocity_m_s": 46.0, "n_final": 1}
     conditions = pd.DataFrame([fast]).reindex(columns=list(CONDITION_COLUMNS))

@@ -1,7 +1,5 @@
 """What a results folder holds, read back: fit, diagnosis and its tables, pictures, contradictions of the sheet."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -17,13 +15,7 @@ from vinetrack.core import published
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis, Round
-from vinetrack.figures.diagnosis_figures import (
-    DiagnosisTables,
-    cosine_cells,
-    predicted_trials,
-    read_diagnosis_tables,
-    worst_condition,
-)
+from vinetrack.figures import diagnosis_figures as tables
 from vinetrack.figures.registry import diagnosis_figures, draw, with_final_model
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
@@ -37,27 +29,16 @@ from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 
 
-# The fit and the diagnosis of a results folder, read back as they were written.
 def test_a_fit_comes_back_as_it_was_written_and_one_that_is_none_of_ours_is_one_sentence(tmp_path):
     free = math.nan
     damping = Number("eversion_damping.B", "v", "B", "N·(s/m)ⁿ", 6.4, 0.1, 6.2, 6.6, free, "linear")
     onset = Number("yield_pressure.P_y", "", "P_y", "Pa", 3000.0, free, free, free, free, "none", 0.0)
     fit = FitSummary(
-        names=("gravity", "eversion_damping"),
-        numbers=(damping, onset),
-        covariance=np.array([[0.01, 0.0], [0.0, free]]),
-        spreads={"B": BetweenTrialSpread(0.03, True)},
-        noise_m=1e-4,
-        noise_correlation=0.4,
-        chi2_per_dof=1.2,
-        log_likelihood=-12.5,
-        converged=True,
-        messages=("a",),
-        warnings=("b",),
-        left_out={"c": "never moves"},
-        trials={"t": TrialEstimates(*(0.1 * i for i in range(8)))},
-        between=np.array([[0.04, 0.0], [0.0, 0.0]]),
-    )
+        names=("gravity", "eversion_damping"), numbers=(damping, onset), covariance=np.array([[0.01, 0], [0, free]]),
+        spreads={"B": BetweenTrialSpread(0.03, True)}, noise_m=1e-4, noise_correlation=0.4, chi2_per_dof=1.2,
+        log_likelihood=-12.5, converged=True, messages=("a",), warnings=("b",), left_out={"c": "never moves"},
+        trials={"t": TrialEstimates(*(0.1 * i for i in range(8)))}, between=np.array([[0.04, 0.0], [0.0, 0.0]]),
+    )  # fmt: skip
     results = Results(tmp_path)
     write_json(results.fit, fit.to_json())
     back = read_fit(results)
@@ -129,7 +110,7 @@ def folder(path: Path, content: dict | None, after: bool = True, compared: bool 
 
 def test_predictions_count_from_release_and_origin(tmp_path):
     for compared in (True, False):
-        trials = predicted_trials(folder(tmp_path / str(compared), diagnosis(), compared=compared), conditions())
+        trials = tables.predicted_trials(folder(tmp_path / str(compared), diagnosis(), compared=compared), conditions())
         one = trials[trials["trial"] == "a"]
         # Without the comparison the release is the first frame that moves: a frame or two late.
         assert one["time_s"].iloc[0] == pytest.approx(-0.02, abs=1e-9 if compared else 2.5e-3)
@@ -138,11 +119,11 @@ def test_predictions_count_from_release_and_origin(tmp_path):
 
 def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(tmp_path):
     results = folder(tmp_path / "r", diagnosis())
-    found = read_diagnosis_tables(results, conditions())
+    found = tables.read_diagnosis_tables(results, conditions())
     assert found is not None
     assert found.worst == "12 mm, 24 kPa"
     assert set(found.before_after["trial"]) == {"a", "b"}
-    assert worst_condition(found.before_after.iloc[:0]) == ""
+    assert tables.worst_condition(found.before_after.iloc[:0]) == ""
     slow = found.where[found.where["condition"] == "slow"]
     middle = (slow["growth_from"] + slow["growth_to"]) / 2
     assert slow["misfit_before_m"].to_numpy() == pytest.approx(0.02 * middle.to_numpy(), abs=3e-4)
@@ -153,7 +134,7 @@ def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(
     row = {"vine": "v", "condition": "slow", "from_m": 0.1, "to_m": 0.2, "lead_position_m": 0.15}
     row |= {"mean_residual_m": 0.011, "sigma_m": 0.001, "z": 11.0, "n_trials": 2}
     pd.DataFrame([row, row | {"condition": ""}]).to_csv(results.diagnosed("along_position.csv"), index=False)
-    found = read_diagnosis_tables(results, conditions())
+    found = tables.read_diagnosis_tables(results, conditions())
     assert found is not None
     (slow,) = found.where[found.where["condition"] == "slow"].to_dict("records")
     assert (slow["growth_from"], slow["growth_to"]) == (0.5, 1.0)
@@ -164,7 +145,7 @@ def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):
     for verdict in VERDICTS:
         results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
-        found = read_diagnosis_tables(results, conditions())
+        found = tables.read_diagnosis_tables(results, conditions())
         assert found is not None
         drawn = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
         assert set(drawn) == {"ladder", "before_after", "where", "candidates", "cosines"}
@@ -172,27 +153,27 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_t
             assert render(figure, ["svg"])["svg"]
             assert len(getattr(found, diagnosis_figures()[name].data)) > 0
     for name, content in (("none", None), ("refused", refused())):
-        assert read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
-    assert not any(draw(name, DiagnosisTables()) for name in diagnosis_figures())
+        assert tables.read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
+    assert not any(draw(name, tables.DiagnosisTables()) for name in diagnosis_figures())
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
     results = folder(tmp_path / "r", diagnosis())
     trajectories = {name: pd.read_csv(results.trajectories(name)) for name in ("slow", "fast")}
-    joined = with_final_model(trajectories, read_diagnosis_tables(results, conditions()))
+    joined = with_final_model(trajectories, tables.read_diagnosis_tables(results, conditions()))
     difference = joined["slow"]["model_after_m"] - joined["slow"]["lead_position_m"]
     assert float(np.abs(difference).max()) < 1e-12
     assert "model_after_m" not in with_final_model(trajectories, None)["slow"]
     shorter = {"slow": trajectories["slow"].iloc[1:]}
-    assert "model_after_m" not in with_final_model(shorter, read_diagnosis_tables(results, conditions()))["slow"]
+    assert "model_after_m" not in with_final_model(shorter, tables.read_diagnosis_tables(results, conditions()))["slow"]
 
 
 def test_ties_stand_in_the_order_of_the_ranking():
     cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
-    cells = cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
+    cells = tables.cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
     leak, time_base = ["leak", "air_drag", 0.3], ["time_base", "air_drag", 0.2]
     assert cells.to_numpy().tolist() == [leak, time_base, ["time_base", "leak", 0.1]]
-    assert cosine_cells(Round.from_json({"verdict": ""})).empty
+    assert tables.cosine_cells(Round.from_json({"verdict": ""})).empty
 
 
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.

@@ -1,7 +1,5 @@
 """What the Snakefile is told, `vinetrack run`, and whose lock is whose."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -14,22 +12,7 @@ from test_pipeline import write_campaign
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.stages import STAGES
-from vinetrack.pipeline.workflow import (
-    RunError,
-    RunPaths,
-    WorkflowPlan,
-    begin_run,
-    check_before_run,
-    check_folder,
-    command_for_results,
-    make_plan,
-    path_problems,
-    run_chain,
-    run_lines,
-    run_paths,
-)
 
-# What the Snakefile is told before anything runs.
 ROOT = Path(__file__).parents[2]
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
 
@@ -46,15 +29,15 @@ def filmed(folder: Path) -> None:
     (folder / "trials.csv").write_text(SHEET.replace("track", "video,capture_fps") + "a,a.mp4,1000,12,100,300,20,3,\n")
 
 
-def planned(folder: Path, **config: object) -> WorkflowPlan:
-    return make_plan({"experiment": str(folder), **config}, folder.parent)
+def planned(folder: Path, **config: object) -> workflow.WorkflowPlan:
+    return workflow.make_plan({"experiment": str(folder), **config}, folder.parent)
 
 
 def test_results_are_named_after_the_last_part_of_the_path(tmp_path, monkeypatch):
     folder = experiment(tmp_path / "2024")
     monkeypatch.chdir(tmp_path)
     for given in (2024, str(folder), f"{folder}/", f"{folder}/."):
-        assert make_plan({"experiment": given}, tmp_path).results == Path("results/2024")
+        assert workflow.make_plan({"experiment": given}, tmp_path).results == Path("results/2024")
 
 
 def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_there_are(tmp_path):
@@ -79,12 +62,12 @@ def test_trials_left_out_get_no_files_and_failed_ones_do_and_inputs_are_those_th
 def test_shipped_experiments_are_found_from_anywhere(tmp_path, monkeypatch):
     experiment(tmp_path / "house" / "data" / "demo")
     monkeypatch.chdir(tmp_path)
-    plan = make_plan({"experiment": "data/demo"}, tmp_path / "house")
+    plan = workflow.make_plan({"experiment": "data/demo"}, tmp_path / "house")
     assert plan.ground_truth
     assert (plan.ground_truth.name, plan.results) == ("demo.yaml", Path("results/demo"))
     assert plan.files("<measurements>") == [str(tmp_path / "house" / "data" / "demo" / "a.csv")]
     for name in ("demo", "paper"):
-        plan = make_plan({"experiment": f"data/{name}", "results": str(tmp_path)}, ROOT)
+        plan = workflow.make_plan({"experiment": f"data/{name}", "results": str(tmp_path)}, ROOT)
         assert plan.ground_truth == ROOT / "vinetrack" / "laboratory" / f"{name}.yaml"
         assert plan.published is (name == "paper")
         folders = {Path(path).parent.name for path in plan.files("<measurements>")}
@@ -102,8 +85,8 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
     for name in ("a{b}", "<b>x"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "trials.csv").write_text("trial\n")
-        assert "Snakemake cannot handle" in check_folder(tmp_path / name).problems[0].message
-    assert path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
+        assert "Snakemake cannot handle" in workflow.check_folder(tmp_path / name).problems[0].message
+    assert workflow.path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
 
 
 def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path):
@@ -131,26 +114,27 @@ def test_what_a_stage_reads_an_earlier_one_writes_or_the_user_brings(tmp_path):
 def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path, monkeypatch):
     folder = experiment(tmp_path / "week" / "my vines")
     monkeypatch.chdir(tmp_path)
-    assert run_paths(folder, None) == RunPaths(folder, tmp_path / make_plan({"experiment": folder}, tmp_path).results)
-    assert run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "my vines"
+    results = tmp_path / workflow.make_plan({"experiment": folder}, tmp_path).results
+    assert workflow.run_paths(folder, None) == workflow.RunPaths(folder, results)
+    assert workflow.run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "my vines"
     given, command = folder.relative_to(tmp_path), "vinetrack run 'week/my vines'"
     for base, options in ((None, ""), (Path("out"), " --results out")):
-        results = run_paths(given, base).results
+        results = workflow.run_paths(given, base).results
         for there in (results, Path(os.path.relpath(results))):
-            assert command_for_results(given, there) == command + options
-    elsewhere = command_for_results(given, Path("results/other"))
+            assert workflow.command_for_results(given, there) == command + options
+    elsewhere = workflow.command_for_results(given, Path("results/other"))
     assert elsewhere == "snakemake --config 'experiment=week/my vines' results=results/other"
 
 
 def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keeps_its_own(tmp_path):
     first, second = (experiment(tmp_path / week / "vines") for week in ("monday", "friday"))
-    begin_run(tmp_path / "out" / "vines", first).release()
+    workflow.begin_run(tmp_path / "out" / "vines", first).release()
     with pytest.raises(ExperimentError) as refused:
-        run_paths(second, tmp_path / "out")
+        workflow.run_paths(second, tmp_path / "out")
     assert all(str(folder) in str(refused.value) for folder in (first, second))
     with pytest.raises(ExperimentError):
         planned(second, results=str(tmp_path / "out" / "vines"))
-    assert run_paths(first, tmp_path / "out").experiment == first
+    assert workflow.run_paths(first, tmp_path / "out").experiment == first
     moved = first.rename(tmp_path / "else") / "."
     assert planned(moved, results=str(tmp_path / "out" / "vines")).trials == ("a",)
 
@@ -159,12 +143,13 @@ def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keep
 def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path):
     experiment(tmp_path / "vines: ü & 'q'")
     folder = experiment(tmp_path / "vines: ü & 'q' #2 $(x);")
-    paths = RunPaths(folder, tmp_path / "out" / folder.name)
+    paths = workflow.RunPaths(folder, tmp_path / "out" / folder.name)
+    wrong = workflow.RunPaths(experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3,\n"), tmp_path)
     with pytest.raises(ExperimentError, match="pressure_kPa"):
-        check_before_run(RunPaths(experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3,\n"), tmp_path), print)
+        workflow.check_before_run(wrong, print)
     (folder / "trials.csv").write_text("nothing\n")
-    with pytest.raises(RunError, match="trial"):
-        run_chain(paths, 1, print)
+    with pytest.raises(workflow.RunError, match="trial"):
+        workflow.run_chain(paths, 1, print)
     assert (paths.results / "logs" / "run.log").is_file()
 
 
@@ -186,7 +171,7 @@ def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path):
     assert lines[-1].startswith(f"{verdict}: ")
     assert f"Report: {results / 'report.html'}" in lines
     assert {stage.done for stage in STAGES.values() if stage.done in lines} >= {"trials analysed", "report written"}
-    assert run_lines(results)[-1] == lines[-1]
+    assert workflow.run_lines(results)[-1] == lines[-1]
     assert sorted(path.name for path in elsewhere.iterdir()) == ["out"]
 
 
@@ -204,16 +189,17 @@ time.sleep(60)
 def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", BEGIN]
-    paths = RunPaths(tmp_path / "vines", tmp_path / "results" / "vines")
+    paths = workflow.RunPaths(tmp_path / "vines", tmp_path / "results" / "vines")
     with subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "begun\n"
-        for start in (lambda: begin_run(paths.results, paths.experiment), lambda: run_chain(paths, 1, print)):
-            with pytest.raises(ExperimentError, match=f"process {other.pid}"):
-                start()
+        with pytest.raises(ExperimentError, match=f"process {other.pid}"):
+            workflow.begin_run(paths.results, paths.experiment)
+        with pytest.raises(ExperimentError, match=f"process {other.pid}"):
+            workflow.run_chain(paths, 1, print)
         other.kill()
     assert not (paths.results / "logs").exists()
-    begin_run(paths.results, paths.experiment).release()
+    workflow.begin_run(paths.results, paths.experiment).release()
 
 
 def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(tmp_path):
@@ -224,6 +210,6 @@ def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(
             (folder / name).touch()
             if "1e" not in name:
                 os.utime(folder / name, (1e9, 1e9))
-    begin_run(tmp_path / "results" / "vines", tmp_path / "vines").release()
+    workflow.begin_run(tmp_path / "results" / "vines", tmp_path / "vines").release()
     for folder in folders:
         assert sorted(path.name for path in folder.iterdir()) == [f".tmp-{'1e' * 16}.csv", ".tmp-mine"]

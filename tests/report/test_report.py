@@ -1,7 +1,5 @@
 """The report, from tables written by hand: one file, every part where it belongs, no external requests."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math
@@ -29,7 +27,6 @@ from vinetrack.paper.rows import SIMULATED, as_table
 from vinetrack.report import build
 from vinetrack.video.write import write_clip
 
-# The report, from tables written by hand: its first screen, a single file, and no external requests.
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
 
@@ -105,22 +102,12 @@ def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped():
     content["drift"][0]["sentence"] = content["next_experiment"]["text"] = EVIL
     content["next_experiment"]["calibration"] = content["rounds"][0]["explanation"] = EVIL
     content["rounds"][0]["ranking"][0] |= {"reason": EVIL, "effect": EVIL}
-    pages = (
-        page(trials=trials(EVIL, reason=EVIL), windows=windows(EVIL).assign(rule=EVIL, reason=EVIL)),
-        page(damping=unfitted),
-        page(
-            name=EVIL,
-            damping=fit,
-            provenance=PROVENANCE | written,
-            figures=[build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL)],
-            clips={"a": "overlays/a.mp4"},
-            clip=build.Clip("a", b"film", EVIL, b"frame"),
-            **result(messages=[EVIL], warnings=[EVIL]),
-            sections=[build.ReportSection("paper", EVIL, [EVIL], [table], [])],
-        ),
-        shown(content),
-    )
-    for html in pages:
+    figure, section = build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL), ("paper", EVIL, [EVIL], [table], [])
+    given = {"name": EVIL, "damping": fit, "provenance": PROVENANCE | written, "figures": [figure]}
+    given |= {"clips": {"a": "overlays/a.mp4"}, "clip": build.Clip("a", b"film", EVIL, b"frame")}
+    given |= result(messages=[EVIL], warnings=[EVIL]) | {"sections": [build.ReportSection(*section)]}
+    rows = {"trials": trials(EVIL, reason=EVIL), "windows": windows(EVIL).assign(rule=EVIL, reason=EVIL)}
+    for html in (page(**rows), page(damping=unfitted), page(**given), shown(content)):
         assert EVIL not in html
         assert not [tag for tag, _ in Tags(html).tags if tag == "script"]
         assert "&lt;script&gt;" in html
@@ -270,18 +257,10 @@ def test_the_page_says_what_the_trials_could_have_seen():
 
 
 # The section on the model in use, from tables written by hand.
-FIT = {
-    "model": ["gravity", "eversion_damping"],
-    "refused": None,
-    "numbers": [
-        number("eversion_damping.B", "B", 6.44, 0.12, "N·(s/m)ⁿ", "v"),
-        number("yield_pressure.P_y", "P_y", 3000.0, None, "Pa"),
-    ],
-    "spreads": {"B": {"value": 0.03, "estimated": True}, "pressure": {"value": 0.01, "estimated": False}},
-    "messages": ["a message"],
-    "warnings": ["a warning"],
-    "left_out": {"b": "its leading edge never moves"},
-}
+NUMBERS = [("eversion_damping.B", "B", 6.44, 0.12, "N·(s/m)ⁿ", "v"), ("yield_pressure.P_y", "P_y", 3000.0, None, "Pa")]
+FIT = {"model": ["gravity", "eversion_damping"], "refused": None, "numbers": [number(*one) for one in NUMBERS]}
+FIT["spreads"] = {"B": {"value": 0.03, "estimated": True}, "pressure": {"value": 0.01, "estimated": False}}
+FIT |= {"messages": ["a message"], "warnings": ["a warning"], "left_out": {"b": "its leading edge never moves"}}
 
 
 def result(**changes: object) -> dict[str, object]:

@@ -9,8 +9,6 @@ every file but the logs is compared; all that was started is stopped, and that f
 collected by pytest, since it needs root and two packages of the system.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import pwd

@@ -1,7 +1,5 @@
 """Scales and corners in rendered targets against the geometry they were rendered with; seeds from 2000 on."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A growth axis that bends: geometry, the strip along it, its scale, and how it is found."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,24 +1,45 @@
-"""Reading recordings, those of high-speed cameras too: every value and every frame, rate and exposure."""
+"""Recordings read, those of high-speed cameras too, and written: every value, rate, exposure, and the event alone."""
 
-from __future__ import annotations
-
+import math
 import struct
+import subprocess
+import sys
 import threading
 import zlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import av
 import av.logging
 import cv2
 import numpy as np
 import pytest
 from camera_files import write_cine, write_mraw, write_side_file
-from plain_scene import write_images, write_video
+from plain_scene import Plan, plain_scene, write_images, write_video
 
-from vinetrack.core.records import Trial
+from vinetrack.core.records import Track, Trial, with_flag
+from vinetrack.laboratory.filming import Filming, film
+from vinetrack.laboratory.render import Truth
+from vinetrack.laboratory.scene import Camera
+from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video import frames as module
-from vinetrack.video.frames import PHANTOM_TABLE, RecordingError, inspect_recording, read_frames
+from vinetrack.video import small_pictures
+from vinetrack.video.axis import Axis
+from vinetrack.video.edge import outline
+from vinetrack.video.frames import (
+    PHANTOM_TABLE,
+    Frames,
+    RecordingError,
+    inspect_recording,
+    read_frames,
+    slots_from_times,
+    torn_frames,
+)
 from vinetrack.video.images import capture_exposure, capture_rate
-from vinetrack.video.strip import camera_unit
+from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
+from vinetrack.video.strip import Strip, camera_unit
+from vinetrack.video.track import track_frames, track_recording
+from vinetrack.video.write import write_clip
 
 RNG = np.random.default_rng(5)
 FRAMES = (np.add.outer(np.arange(24) * 3, np.add.outer(np.arange(48), np.arange(64))) % 200 + 20).astype(np.uint8)
@@ -247,3 +268,314 @@ def test_a_sheet_that_contradicts_the_recording_is_refused(tmp_path):
         capture_rate(replace(trial, capture_fps=1000.0), recording)
     with pytest.raises(RecordingError):
         capture_exposure(replace(trial, exposure_s=400e-6), recording)
+
+
+BEFORE, AFTER = 300, 180
+"""Frames of rest beyond those of the scene."""
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    """A scene, and its frames with rest before and after it, each frame of rest with grain of its own."""
+    scene = plain_scene(
+        Plan(seed=20942, width=384, height=96, from_px=(24.0, 48.0), end_px=320.0, radius=14.0, speed=9.0)
+    )
+    first, last = np.repeat(scene.frames[:1], BEFORE, 0), np.repeat(scene.frames[-1:], AFTER, 0)
+    frames, rng = np.concatenate([first, scene.frames, last]), np.random.default_rng(20943)
+    for rest in (slice(None, BEFORE), slice(-AFTER, None)):
+        grain = np.rint(rng.normal(0, 2.0, frames[rest].shape))
+        frames[rest] = np.clip(frames[rest] + grain, 0, 255).astype(np.uint8)
+    return scene, frames
+
+
+def tracked(path: Path, **stated: object) -> Track:
+    return track_recording(replace(Trial(name="t", video=path, capture_fps=1000.0, exposure_s=2e-4), **stated)).track
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key_frames", ["30", "5000", "1"])
+def test_of_a_long_film_the_event_is_decoded_and_no_more(filmed, tmp_path, monkeypatch, key_frames):
+    """With a key frame every 30, with one, and with key frames alone; tracked as the whole film is."""
+    scene, long_frames = filmed
+    film = write_video(tmp_path / "long.mp4", long_frames, options={"crf": "14", "g": key_frames})
+    whole, whole_track = read_frames(film), tracked(film)
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    frames, part = read_event(inspect_recording(film)), tracked(film)
+    moving = np.flatnonzero(scene.moving) + BEFORE
+    assert frames.first <= moving[0] - 40
+    assert frames.first + len(frames) > moving[-1] + 40
+    assert len(frames) < len(moving) + 2 * (MARGIN_FRAMES + 60)
+    assert frames.n_recorded == len(long_frames)
+    same = slice(frames.first, frames.first + len(frames))
+    assert np.array_equal(frames.luma, whole.luma[same])
+    assert np.array_equal(frames.slot, whole.slot[same])
+    assert len(part.time_s) == len(whole_track.time_s)
+    assert part.time_s == pytest.approx(whole_track.time_s)
+    known = np.isfinite(part.edge_px[moving]) & np.isfinite(whole_track.edge_px[moving])
+    assert known.mean() > 0.95
+    assert np.std((part.edge_px - whole_track.edge_px)[moving][known]) < 0.05
+    assert set(part.flag[: BEFORE - 150]) == {"before_release"}
+    assert set(part.flag[-100:]) == {"after_end"}
+    assert np.std(part.edge_px[moving][known] - scene.edge_px[moving - BEFORE][known]) < 0.3
+    # Frames that the sheet names are those that are decoded.
+    wanted = (BEFORE - 20, BEFORE + len(scene.frames) - 1)
+    frames = read_event(inspect_recording(film), wanted)
+    assert (frames.first, frames.first + len(frames) - 1) == wanted
+    made = tracked(film, frames_used=wanted)
+    assert np.isfinite(made.edge_px).sum() > 0.9 * scene.moving.sum()
+    assert not np.isfinite(made.edge_px[: wanted[0]]).any()
+
+
+@pytest.mark.slow
+def test_of_a_long_cine_the_event_is_read_and_no_more(filmed, tmp_path, monkeypatch):
+    scene, long_frames = filmed
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
+    missing = np.delete(np.arange(len(long_frames) + 1), BEFORE + 30) / 1000 + 0.2
+    deep = long_frames.astype(np.uint16) * 16
+    path = write_cine(tmp_path / "long.cine", deep, rate=1000, exposure_ns=200_000, times_s=missing)
+    frames = read_event(inspect_recording(path))
+    same = slice(frames.first, frames.first + len(frames))
+    assert len(frames) < len(scene.frames) + 2 * (MARGIN_FRAMES + 20)
+    assert np.array_equal(frames.luma, deep[same])
+    assert np.array_equal(frames.slot, np.rint((missing - 0.2) * 1000)[same])
+    made = tracked(path, capture_fps=np.nan, exposure_s=np.nan)
+    assert len(made.time_s) == len(long_frames)
+    assert made.time_s[-1] == pytest.approx(len(long_frames) / 1000 + 1e-4)
+
+
+def test_the_event_lies_between_the_pictures_that_differ_from_either_end():
+    rng = np.random.default_rng(8)
+    pictures = [rng.normal(80, 1.5, (48, 64)).clip(0, 255).astype(np.uint8) for _ in range(60)]
+    for i in range(20, 60):
+        pictures[i][20:30, : min(60, 4 * (i - 19))] = 170
+    numbers = np.arange(60) * 50
+    # From picture 19, the last at rest, to 34, the first at the end, and a margin of MARGIN_PART of that.
+    assert event_range(pictures, numbers, 3000) == (19 * 50 - 112, 34 * 50 + 112)
+    assert event_range(pictures[:20], numbers[:20], 1000) is None
+
+
+def clip_pictures(n: int, height: int = 64, width: int = 96) -> list[np.ndarray]:
+    made = []
+    for i in range(n):
+        picture = np.full((height, width, 3), 60, np.uint8)
+        picture[:, 8 * i : 8 * i + 8] = (240, 228, 66)
+        made.append(picture)
+    return made
+
+
+def test_pictures_come_back_in_order_and_in_colour(tmp_path):
+    path = tmp_path / "overlays" / "a.mp4"
+    assert write_clip(path, iter(clip_pictures(10)), 12.5) == 10
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert float(stream.average_rate) == 12.5
+        back = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(back) == 10
+    for i, picture in enumerate(back):
+        middle = picture[20:40, 8 * i + 2 : 8 * i + 6].astype(float).mean(axis=(0, 1))
+        assert middle == pytest.approx([240, 228, 66], abs=14)
+
+
+def broken_off():  # type: ignore[no-untyped-def]
+    yield clip_pictures(1)[0]
+    raise RuntimeError("the recording ends here")
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [([], ValueError), ([np.zeros((63, 96, 3), np.uint8)], ValueError), (broken_off(), RuntimeError)],
+    ids=["nothing", "odd", "broken_off"],
+)
+def test_a_failed_write_leaves_the_old_clip_and_no_other_file(tmp_path: Path, given, error) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"the old one")
+    with pytest.raises(error):
+        write_clip(path, given, 10)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+    assert path.read_bytes() == b"the old one"
+
+
+@pytest.mark.slow
+def test_the_same_pictures_are_the_same_bytes_whatever_the_memory_held(tmp_path):
+    draw = np.random.default_rng(20701)
+    noisy = [np.clip(p + draw.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in clip_pictures(30, 198, 480)]
+    written = []
+    for k in range(6):
+        held = [draw.bytes(int(draw.integers(1, 2_000_000))) for _ in range(20)]
+        del held
+        write_clip(tmp_path / f"{k}.mp4", iter(noisy), 9.0)
+        written.append((tmp_path / f"{k}.mp4").read_bytes())
+    assert len(set(written)) == 1
+
+
+CAPTURE_FPS = 1069.0
+KEY_FRAMES = (0, 30, 60)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A sound recording of the laboratory: H.264, a key frame in 30."""
+
+    trial: Trial
+    truth: Truth
+    frames: Frames
+
+    def damaged_at(self, folder: Path, *frames: int) -> Path:
+        """A copy with ten bytes of each of these frames' packets changed."""
+        rng = np.random.default_rng(2030)
+        data = np.fromfile(self.trial.video, np.uint8)
+        with av.open(str(self.trial.video)) as container:
+            places = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+        for frame in frames:
+            start, size = places[frame]
+            # Past the header of the slice, where a fault is met while macroblocks are decoded.
+            data[start + 40 + rng.choice(size - 40, 10, replace=False)] ^= 0x5A
+        path = folder / "damaged.mp4"
+        data.tofile(path)
+        return path
+
+    def errors_m(self, track) -> np.ndarray:
+        """Error of every usable point, m, but for the arbitrary origin."""
+        use = track.usable & np.isfinite(track.lead_position_m)
+        error = track.lead_position_m[use] - self.truth.lead_position_m[use]
+        return error - np.median(error)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clip")
+    stated = Trial(
+        name="p36", video=folder / "a.mp4", diameter_m=0.012, thickness_m=100e-6, length_m=0.14, pressure_Pa=36e3,
+        yield_pressure_Pa=3e3, growth_angle_rad=math.pi / 2, m_per_px=2.4e-4, capture_fps=CAPTURE_FPS,
+        exposure_s=93.5e-6, vine="v",
+    )  # fmt: skip
+    nature = GroundTruth(
+        values={"eversion_damping.n": 0.37, "eversion_damping.B": {"v": 1.83}},
+        damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
+    )  # fmt: skip
+    grown = grow([stated], nature)[0]
+    truth = film(grown, Filming(camera=Camera(m_per_px=2.4e-4)), grown.stated.video, seed=41)
+    return Clip(grown.stated, truth, read_frames(grown.stated.video))
+
+
+def test_frames_after_a_damaged_one_are_damaged_up_to_the_next_key_frame(clip, tmp_path):
+    frames = read_frames(clip.damaged_at(tmp_path, 40))
+    wrong = np.abs(frames.luma.astype(float) - clip.frames.luma).max(axis=(1, 2)) > 8
+    assert wrong[40:60].all()  # what the decoder shows of them is wrong indeed
+    assert frames.damaged.tolist() == [40 <= i < KEY_FRAMES[2] for i in range(len(frames))]
+
+
+def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip, tmp_path):
+    path = clip.damaged_at(tmp_path, *KEY_FRAMES)
+    with pytest.raises(RecordingError):
+        track_recording(replace(clip.trial, video=path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", [50, 62])
+def test_only_the_sound_frames_before_the_damage_are_tracked(clip, tmp_path, frame):
+    """Beyond it, from the key frame 60 on, the tracker would have to leap, and errs by centimetres when it does."""
+    track = track_recording(replace(clip.trial, video=clip.damaged_at(tmp_path, frame))).track
+    assert np.isfinite(track.edge_px[20:frame]).all()
+    assert with_flag(track.flag, "rejected")[frame : 60 if frame < 60 else None].all()
+    assert not np.isfinite(track.edge_px[frame:]).any()
+    assert np.abs(clip.errors_m(track)).max() < 0.5e-3
+
+
+@pytest.mark.parametrize("unused", ["frames_used", "damaged tail"])
+def test_frames_that_are_not_used_keep_their_distance_in_time_after_a_dropped_one(clip, unused):
+    kept = np.delete(np.arange(len(clip.frames)), 35)
+    frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=np.arange(70), damaged=np.arange(70) >= 50)
+    trial = clip.trial
+    if unused == "frames_used":
+        frames, trial = replace(frames, damaged=np.zeros(70, dtype=bool)), replace(trial, frames_used=(0, 49))
+    track = track_frames(frames, trial, CAPTURE_FPS).track
+    assert np.rint((track.time_s - track.time_s[0]) * CAPTURE_FPS).tolist() == kept.tolist()
+
+
+def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fails(clip, tmp_path):
+    path = write_video(tmp_path / "a.mkv", clip.frames.luma[:12], "ffv1", "gray", options={"g": "1"})
+    data = bytearray(path.read_bytes())
+    data[int(0.55 * len(data))] ^= 0xFF
+    path.write_bytes(bytes(data))
+    frames = read_frames(path)
+    wrong = np.any(frames.luma != clip.frames.luma[:12], axis=(1, 2))
+    assert wrong.sum() == 1
+    assert frames.damaged.tolist() == wrong.tolist()
+
+
+def test_a_frame_unlike_those_around_it_along_a_row_of_blocks_is_torn(clip):
+    luma = clip.frames.luma.astype(np.int16)
+    assert not torn_frames(luma.astype(np.uint8)).any()
+    for torn in ({0: (3, 30)}, {35: (8, 30)}, {70: (15, 30)}, {30: (8, 30), 31: (8, 50)}):
+        wrong = luma.copy()
+        for frame, (row, by) in torn.items():
+            wrong[frame, 16 * row : 16 * row + 16, 300:] += by
+        assert np.flatnonzero(torn_frames(np.clip(wrong, 0, 255).astype(np.uint8))).tolist() == list(torn)
+
+
+def test_moving_patches_and_flicker_are_not_torn_frames(clip):
+    lit = clip.frames.luma.astype(float) * np.where(np.arange(len(clip.frames.luma)) % 2, 1.0, 0.96)[:, None, None]
+    assert not torn_frames(np.rint(lit).astype(np.uint8)).any()
+    crossed = clip.frames.luma.copy()
+    for i in range(20, 40):  # a dark door 100 px wide that swings along the tube by 30 px a frame
+        crossed[i, :, 30 * (i - 20) : 30 * (i - 20) + 100] = 20
+    assert not torn_frames(crossed).any()
+
+
+def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many():
+    times = np.delete(np.arange(60.0), np.arange(20, 30))
+    assert np.array_equal(slots_from_times(times)[0], np.arange(50))
+    assert np.array_equal(slots_from_times(times, known_missing=10)[0], times)
+    in_milliseconds = np.round(np.delete(np.arange(71.0), np.arange(30, 51)) / 60, 3)
+    assert slots_from_times(in_milliseconds, known_missing=21)[0][[29, 30]].tolist() == [29, 51]
+
+
+def test_frames_beyond_lost_ones_are_not_used(clip):
+    kept = np.delete(np.arange(len(clip.frames)), np.arange(48, 58))
+    frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=kept, damaged=np.zeros(len(kept), dtype=bool))
+    track = track_frames(frames, clip.trial, CAPTURE_FPS).track
+    assert not track.usable[48:].any()
+    error = track.lead_position_m[:48] - clip.truth.lead_position_m[:48]
+    assert np.max(np.abs(error - np.median(error))) < 1e-3
+
+
+def test_a_tube_of_two_widths_has_one_of_them():
+    n, rows, columns = 60, 81, 240
+    values = np.random.default_rng(6).normal(60, 2, (n, rows, columns))
+    inside = np.abs(np.arange(rows) - rows // 2)[:, None] <= np.where(np.arange(columns) < 120, 8, 30)
+    for i in range(n):
+        values[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & inside)
+    luma, axis = np.clip(values, 0, 255).astype(np.uint8), Axis((0, 40), (columns - 1, 40), 40)
+    sides = outline(Strip(luma, np.ones(n), np.zeros(n), np.zeros((n, 2)), 2.0, axis, False))
+    assert np.isfinite([sides.shift_px, sides.slope, sides.width_px]).all()
+
+
+GIVEN_UP = """
+import sys
+from pathlib import Path
+import numpy as np
+from vinetrack.video import frames
+
+for _ in range(60):
+    seen = iter([np.zeros((320, 960), np.uint8)] * 2)
+    frames.luma_plane = lambda frame: next(seen)
+    try:
+        frames.decode_container(Path(sys.argv[1]), (320, 960))
+    except (StopIteration, RuntimeError):
+        pass
+"""
+"""A decoder left after two frames, sixty times over."""
+
+
+@pytest.mark.slow
+def test_a_damaged_recording_that_is_given_up_lets_go_of_its_decoder(tmp_path):
+    draw = np.random.default_rng(0)
+    noise = draw.integers(0, 255, (60, 320, 960), dtype=np.uint8)
+    path = write_video(tmp_path / "noise.mp4", noise, options={"g": "30", "bf": "0"})
+    content = bytearray(path.read_bytes())
+    for place in draw.integers(3000, len(content) - 20_000, 3000):
+        content[place] ^= int(draw.integers(1, 255))
+    path.write_bytes(content)
+    subprocess.run([sys.executable, "-c", GIVEN_UP, str(path)], check=True, timeout=120)

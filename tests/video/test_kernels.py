@@ -1,7 +1,5 @@
 """Compiled loops against plain ones, NumPy and OpenCV, on any number of threads."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Checks of recordings, scales and sizes before any work."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
