@@ -101,14 +101,12 @@ def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str
     if len(drawn) == 1:
         _draw_shares(axes[1, 1], drawn[0])
     else:
-        ax = axes[1, 1]  # the condition of each colour, instead of the bars
-        ax.set_axis_off()
-        for k, (colour, title) in enumerate(zip(st.VINE_COLOURS, titles, strict=False)):
-            y = 0.97 - 0.155 * k
-            ax.plot([0.0, 0.07], [y - 0.025] * 2, color=colour, lw=3, transform=ax.transAxes, clip_on=False)
-            ax.text(0.1, y, textwrap.fill(title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
+        named = zip(st.VINE_COLOURS, titles, strict=False)  # the condition of each colour, instead of the bars
+        keys = [st.line_key(textwrap.fill(title, 50), color=colour, lw=3) for colour, title in named]
         if (n_more := len(titles) - len(st.VINE_COLOURS)) > 0:
-            ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=st.MUTED)
+            keys.append(st.line_key(f"and {n_more} more, not drawn", ls="none"))
+        axes[1, 1].set_axis_off()
+        axes[1, 1].legend(handles=keys, loc="upper left", fontsize=9.2, labelspacing=1.0, borderaxespad=0.0)
     title = titles[0] if len(drawn) == 1 else f"{len(titles)} conditions"
     fig.text(0.075, 0.955, title, fontweight="bold", fontsize=st.fitting_size(title, 0.9 * 72 * width_in, 12))
     words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
