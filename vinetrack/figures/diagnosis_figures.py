@@ -5,7 +5,6 @@ The model before the added effects is vermillion and dashed, the model after blu
 
 from __future__ import annotations
 
-import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -74,13 +73,10 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         frame = (("axes fraction", "data"), "offset points")
         words = f"replicate scatter: {number(floor)} mm"
         ax.annotate(words, (0.015, floor), (0, -4), *frame, color=st.MUTED, va="top", fontsize=9)
-    handles = []
     for key, (name, colour, marker, line) in _ERRORS.items():
-        style: dict[str, Any] = {"marker": marker, "color": colour, "ls": line}
-        ax.plot(np.arange(len(ladder)), errors_mm[key], ms=7, zorder=3, **style)
         if np.isfinite(errors_mm[key]).any():
-            handles.append(st.line_key(name, ms=6, **style))
-    _write_values(ax, errors_mm)
+            values = " → ".join(number(value) if np.isfinite(value) else "–" for value in errors_mm[key])
+            ax.plot(errors_mm[key], marker=marker, color=colour, ls=line, ms=7, zorder=3, label=f"{name}: {values} mm")
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
     for added, part in list(zip(ladder["added"], partial, strict=True))[1:]:
@@ -89,28 +85,8 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     ax.set_xticks(range(len(ladder)), labels)
     ax.grid(axis="x", visible=False)
     st.plain_log_ticks(ax, "y")
-    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.02, 1.0)}
-    ax.legend(handles=handles, fontsize=9, labelspacing=0.25, labelcolor=st.INK, **place)
+    st.legend_above(ax, fontsize=9, labelspacing=0.25)
     return fig
-
-
-def _write_values(ax: Axes, errors_mm: dict[str, np.ndarray]) -> None:
-    """Write the values next to the points, clear of the lines and of each other."""
-    low, high = (math.log10(value) for value in ax.get_ylim())
-    spacing = 0.075 * (high - low)
-    n_steps = len(next(iter(errors_mm.values())))
-    for step in range(n_steps):
-        shown = sorted((float(values[step]), _ERRORS[key][1]) for key, values in errors_mm.items() if values[step] > 0)
-        side, sideways = ("right", -9) if step == 0 and n_steps > 1 else ("left", 9)
-        lifted = 0.6 * spacing if 0 < step < n_steps - 1 else 0.0  # lines arrive from above left and leave to the right
-        levels = [math.log10(value) + lifted for value, _ in shown]
-        for i in range(1, len(levels)):
-            levels[i] = max(levels[i], levels[i - 1] + spacing)
-        excess = max(levels[-1] - (high - spacing / 2), 0.0) if levels else 0.0
-        for (value, colour), level in zip(shown, levels, strict=True):
-            style: dict[str, Any] = {"color": colour, "fontsize": 9, "fontweight": "bold", "ha": side, "va": "center"}
-            at = (step, 10 ** (level - excess))
-            ax.annotate(number(value), at, (sideways, 0), textcoords="offset points", **style)
 
 
 @figure("before_after", "verdict", "The worst condition", data="before_after", if_refuted=DASHED_REFUTED)
@@ -587,35 +563,21 @@ def assemble_tables(
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
-    """Return measured and predicted positions of all trials, relative to release and origin."""
+    """Return measured and predicted positions of all trials, from release and origin as in `comparison`."""
     import pandas as pd
 
+    paths = {name: results.trajectories(name) for name in dict.fromkeys(conditions["condition"]) if name}
+    compared = {name: read_result(path) for name, path in paths.items() if path.exists()}
     parts = []
-    compared: dict[str, pd.DataFrame] = {}
     for trial, condition in zip(conditions["trial"], conditions["condition"], strict=True):
         path = results.predictions(trial)
-        table = read_result(path) if path.exists() else None
-        if table is None or not len(table):
+        if condition not in compared or not path.exists():
             continue
-        if condition not in compared:
-            exists = bool(condition) and results.trajectories(condition).exists()
-            compared[condition] = read_result(results.trajectories(condition)) if exists else pd.DataFrame()
-        release_s, origin_m = _start(trial, table, compared[condition])
-        positions = {name: table[name] - origin_m for name in CURVE_COLUMNS[3:]}
-        time_s = table["time_s"] - release_s
-        parts.append(pd.DataFrame({"trial": trial, "condition": condition, "time_s": time_s, **positions}))
+        table, course = read_result(path), compared[condition][compared[condition]["trial"] == trial]
+        after_m = table["model_after_m"] - (table["lead_position_m"] - course["lead_position_m"].to_numpy())
+        models = {"model_before_m": course["model_position_m"], "model_after_m": after_m.to_numpy()}
+        parts.append(course.assign(condition=condition, **models)[list(CURVE_COLUMNS)])
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
-
-
-def _start(trial: str, table: pd.DataFrame, compared: pd.DataFrame) -> tuple[float, float]:
-    """Return release and origin of a trial: those of the comparison, which starts at the same point, else estimates."""
-    of_trial = compared[compared["trial"] == trial] if len(compared) else compared
-    time_s, position_m = float(table["time_s"].iloc[0]), float(table["lead_position_m"].iloc[0])
-    if len(of_trial) == len(table):
-        return time_s - float(of_trial["time_s"].iloc[0]), position_m - float(of_trial["lead_position_m"].iloc[0])
-    origin_m = float(np.nanmin(table["lead_position_m"]))
-    growth_m = table["lead_position_m"].to_numpy(dtype=float) - origin_m
-    return float(table["time_s"].iloc[int(np.argmax(growth_m > 0.01 * np.nanmax(growth_m)))]), origin_m
 
 
 def worst_condition(trials: pd.DataFrame) -> str:
@@ -628,41 +590,23 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in sections of its growth, for the figure `where`: the sections of the
-    diagnosis with the misfit of the initial model there and its error, or else equal ones, with means over the trials.
+    """Return the mean misfit of every condition in the sections of its growth that the diagnosis looked at, for the
+    figure `where`: of the initial model with its error as found there, of the final one as mean over the trials.
     """
     import pandas as pd
 
-    from vinetrack.diagnosis.result import MAX_STRETCHES
-
     rows: list[dict[str, Any]] = []
-    for condition, label in labels.items():
-        members = trials[trials["condition"] == condition]
-        members = members[members["time_s"] >= 0]
-        if not len(members):
-            continue
-        found = located[located["condition"] == condition] if len(located) and condition else located[:0]
-        if len(found):
-            along, whole_m = "model_before_m", located.loc[located["vine"] == found["vine"].iloc[0], "to_m"].max()
-            sections = found[["from_m", "to_m", "mean_residual_m", "sigma_m"]].to_numpy(dtype=float)
-        else:
-            along, whole_m = "lead_position_m", members["lead_position_m"].max()
-            ends = np.linspace(0.0, whole_m, MAX_STRETCHES + 1)
-            sections = np.array([(*section, np.nan, np.nan) for section in itertools.pairwise(ends)])
-        n_trials, models = members["trial"].nunique(), ["model_before_m", "model_after_m"]
-        misfits = members[models].rsub(members["lead_position_m"], axis=0)
-        for low, high, mean, sigma in sections if whole_m > 0 else ():
-            to_end = math.isnan(mean) and not high < whole_m
-            inside = (members[along] >= low) & (members[along] < (math.inf if to_end else high))
-            of_trials = misfits[inside].groupby(members["trial"]).mean()
-            if math.isnan(mean):
-                if of_trials["model_before_m"].isna().all():
-                    continue
-                mean = of_trials["model_before_m"].mean()
-                sigma = of_trials["model_before_m"].std() / math.sqrt(n_trials)
-            misfit = {"misfit_before_m": mean, "misfit_after_m": of_trials["model_after_m"].mean(), "scatter_m": sigma}
+    for condition, label in labels.items() if len(located) else ():
+        members = trials[(trials["condition"] == condition) & (trials["time_s"] >= 0)]
+        after_m, n_trials = members["lead_position_m"] - members["model_after_m"], members["trial"].nunique()
+        for row in st.rows(located[located["condition"] == condition]) if n_trials else ():
+            whole_m = located.loc[located["vine"] == row.vine, "to_m"].max()
+            inside = (members["model_before_m"] >= row.from_m) & (members["model_before_m"] < row.to_m)
+            misfit_after_m = after_m[inside].groupby(members["trial"]).mean().mean()
+            misfit = {"misfit_before_m": row.mean_residual_m, "misfit_after_m": misfit_after_m}
+            place = {"growth_from": row.from_m / whole_m, "growth_to": row.to_m / whole_m}
             name = {"condition": condition, "condition_label": label, "n_trials": n_trials}
-            rows.append(name | {"growth_from": low / whole_m, "growth_to": high / whole_m} | misfit)
+            rows.append(name | place | misfit | {"scatter_m": row.sigma_m})
     return pd.DataFrame(rows)
 
 
