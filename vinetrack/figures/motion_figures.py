@@ -154,17 +154,12 @@ def draw_trial_motion(
     text_in, strip_in = line_in * len(notes) + 0.1, 0.24 * max(len(windows), 1)
     height_in = 1.75 + 2.1 + strip_in + text_in + 1.2
     fig = st.new_figure(7.2, height_in, layout=None)
-
-    def row_of_axes(bottom_in: float, tall_in: float, **keywords: Any) -> Axes:
-        return fig.add_axes((0.125, bottom_in / height_in, 0.765, tall_in / height_in), **keywords)
-
-    bottom_in = text_in + 0.58
-    strip = row_of_axes(bottom_in, strip_in)
-    speed = row_of_axes(bottom_in + strip_in + 0.1, 2.1, sharex=strip)
-    lead = row_of_axes(bottom_in + strip_in + 0.1 + 2.1 + 0.14, 1.75, sharex=strip)
-    for ax in (lead, speed, strip):
+    lead, speed, strip = fig.subplots(3, 1, sharex=True, height_ratios=(1.75, 2.1, strip_in))
+    tall_in = 1.75 + 2.1 + strip_in  # and twice 0.12 in between the panels
+    bottom, top = (text_in + 0.58) / height_in, (text_in + 0.82 + tall_in) / height_in
+    fig.subplots_adjust(left=0.125, right=0.89, bottom=bottom, top=top, hspace=0.36 / tall_in)
+    for ax in (lead, speed):
         ax.yaxis.set_label_coords(-0.095, 0.5)
-    strip.xaxis.set_label_coords(0.5, -0.29 / strip_in)
     _draw_position(lead, track, kinematics, unusable, by_hand)
     lead.set_title(title, pad=8, fontsize=st.fitting_size(title, 0.8 * 72 * 7.2, 11))
     _draw_speed(speed, kinematics, windows, travel_ratio)
