@@ -519,15 +519,7 @@ def expose(
 #
 # All positions are in plane pixels (see `camera`), all times in seconds from the start of the first exposure.
 
-Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]  # Lead position in metres against time in seconds
-
-
-def _interpolated(time_s: Floats, lead_position_m: Floats) -> Callable[[Floats], Floats]:
-    """A sampled motion as a function: monotone cubics (PCHIP), constant outside."""
-    from scipy.interpolate import PchipInterpolator
-
-    cubic = PchipInterpolator(time_s, lead_position_m)
-    return lambda at_s: np.asarray(cubic(np.clip(at_s, time_s[0], time_s[-1])))
+Motion = Callable[[Floats], Floats]  # Lead position in metres against time in seconds
 
 
 class SceneMotion:
@@ -537,7 +529,7 @@ class SceneMotion:
         self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float, seed: int
     ) -> None:
         self.scene, self.capture_fps, self.exposure_s = scene, capture_fps, exposure_s
-        self._position_m = motion if callable(motion) else _interpolated(*motion)
+        self._position_m = motion
         grid_s = np.arange(0, (n_frames + 1) * 10) / (10 * capture_fps)
         lead_m = np.asarray(self._position_m(grid_s), dtype=float)
         moving = np.flatnonzero(lead_m > lead_m[0] + 1e-5)
@@ -874,16 +866,9 @@ class FrameRenderer:
         rng = np.random.default_rng([self.seed, 0])
         self._canvas = backdrop_canvas(self.scene, rng, (y1 - y0 + 1, x1 - x0 + 1), (x0, y0))
         self._canvas_x, self._canvas_y = maps.plane_x - np.float32(x0), maps.plane_y - np.float32(y0)
-        target, psf_px = self.scene.target, self.scene.psf_px
-        if target is not None and self.scene.shake_px:
-            across, down = np.meshgrid(np.arange(x0, x1 + 1), np.arange(y0, y1 + 1))
-            offset_px = np.stack([across, down], axis=-1) - np.array(self.scene.camera.centre_px)
-            self._canvas = lay_target(self._canvas, target, offset_px * self.scene.camera.m_per_px, psf_px)
         #: radiance of the static scene, shape (height, width)
         self.still = np.empty(maps.plane_x.shape, dtype=np.float32)
         sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self.still)
-        if target is not None and not self.scene.shake_px:
-            self.still = lay_target(self.still, target, plane_seen(self.scene.camera), psf_px)
 
     def _prepare_sensor(self) -> None:
         """Prepare the gain of every pixel (vignetting, fixed pattern), and normal deviates."""

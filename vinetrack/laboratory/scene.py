@@ -229,7 +229,6 @@ class Scene:
     camera: Camera = field(default_factory=Camera)
     subject: Tube | Ball = field(default_factory=Tube)
     door: Door | None = field(default_factory=Door)
-    target: Target | None = None
     backdrop: Backdrop = field(default_factory=Backdrop)
     light: Light = field(default_factory=Light)
     sensor: Sensor = field(default_factory=Sensor)
