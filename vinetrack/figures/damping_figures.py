@@ -67,19 +67,10 @@ def _draw_points(ax: Axes, points: pd.DataFrame, style: st.VineStyle, used: bool
     """Points with bars of one standard error; the lower one ends above zero, which logarithmic axes cannot show."""
     x, y = st.column(points, "x_ss_m_s"), st.column(points, "force_N")
     x_sigma, y_sigma = (np.nan_to_num(st.column(points, name)) for name in ("x_ss_sigma_m_s", "force_sigma_N"))
-    bars: dict[str, Any] = {
-        "xerr": [np.minimum(x_sigma, 0.9 * x), x_sigma],
-        "yerr": [np.minimum(y_sigma, 0.9 * y), y_sigma],
-    }
-    marker: dict[str, Any] = {
-        "fmt": style.marker,
-        "mfc": style.colour if used else st.PAPER,
-        "mec": style.colour,
-        "ms": 5,
-    }
-    ax.errorbar(
-        x, y, color=style.colour, mew=1.1, elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3, **bars, **marker
-    )
+    errors: dict[str, Any] = {"xerr": [np.minimum(x_sigma, 0.9 * x), x_sigma]}
+    errors["yerr"] = [np.minimum(y_sigma, 0.9 * y), y_sigma]
+    look: dict[str, Any] = {"fmt": style.marker, "color": style.colour, "mfc": style.colour if used else st.PAPER}
+    ax.errorbar(x, y, **errors, **look, ms=5, mew=1.1, elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3)
 
 
 def _draw_law(ax: Axes, fit: dict[str, Any], vine: str, B: float, x_ss_m_s: np.ndarray, colour: str, line: Any) -> None:

@@ -523,42 +523,32 @@ def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> Diagnos
     diagnosis = read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return None
-    names = ("along_position.csv", "drift_groups.csv", "missing_force.csv", "learned_force.csv")
-    paths = map(results.diagnosed, names)
-    tables = [read_result(path) if path.exists() else empty_table(()) for path in paths]
-    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), *tables)
+    tables = {path.name: read_result(path) for path in results.diagnosed("moved.csv").parent.glob("*.csv")}
+    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), tables)
 
 
 def assemble_tables(
-    diagnosis: Diagnosis,
-    conditions: pd.DataFrame,
-    trials: pd.DataFrame,
-    located: pd.DataFrame,
-    drifting: pd.DataFrame,
-    force: pd.DataFrame,
-    learned: pd.DataFrame,
+    diagnosis: Diagnosis, conditions: pd.DataFrame, trials: pd.DataFrame, tables: Mapping[str, pd.DataFrame]
 ) -> DiagnosisTables:
-    """Assemble the data of the figures."""
-    import pandas as pd
-
-    labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
-    worst, rounds = worst_condition(trials), []
+    """Assemble the data of the figures; `tables` are those of the folder `diagnosis` by file name."""
+    labels = {str(row.condition): str(row.condition_label) for row in st.rows(conditions)}
+    worst, rounds, none = worst_condition(trials), [], empty_table(())
     for i, ranked in enumerate(diagnosis.rounds):
         added = [name for name in ranked.model if name not in diagnosis.rounds[0].model]
         heading = f"Which is missing with {listed_names(added)} added?"
         rounds.append((heading if i else "Which effect is missing from the initial model?", ranking_table(ranked)))
     return DiagnosisTables(
-        ladder=pd.DataFrame() if diagnosis.ladder is None else diagnosis.ladder,
+        ladder=none if diagnosis.ladder is None else diagnosis.ladder,
         trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
-        where=_where_table(trials, labels, located),
+        where=_where_table(trials, labels, tables.get("along_position.csv", none)),
         cosines=cosine_cells(diagnosis.rounds[0]),
-        drift=drifting,
-        missing_force=force,
+        drift=tables.get("drift_groups.csv", none),
+        missing_force=tables.get("missing_force.csv", none),
+        learned_force=tables.get("learned_force.csv", none),
         rounds=rounds,
         worst=labels.get(worst, worst),
         added=listed_names(diagnosis.effects),
-        learned_force=learned,
     )
 
 
