@@ -58,25 +58,23 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     fig = st.new_figure(max(5.2, 2.4 + 1.55 * len(ladder)), 3.9)  # names of effects are wrapped at 18 letters
     ax = fig.add_subplot()
     ax.set(yscale="log", ylabel="error of position, rms (mm)", xlim=(-0.5, len(ladder) - 0.5))
-    known = np.concatenate([*errors_mm.values(), floor_mm])
-    known = known[np.isfinite(known) & (known > 0)]
-    if known.size:
-        middle = math.sqrt(known.min() * known.max())
-        ax.set_ylim(min(0.72 * known.min(), middle / 2), max(1.35 * known.max(), middle * 2))
-    else:
-        ax.set_ylim(0.1, 1.0)
-    known_floor_mm = floor_mm[np.isfinite(floor_mm) & (floor_mm > 0)]
-    if known_floor_mm.size:
-        floor = float(known_floor_mm[-1])  # an error in the shaded range says nothing about the model
-        ax.axhspan(ax.get_ylim()[0], floor, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
-        ax.axhline(floor, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
-        frame = (("axes fraction", "data"), "offset points")
-        words = f"replicate scatter: {number(floor)} mm"
-        ax.annotate(words, (0.015, floor), (0, -4), *frame, color=st.MUTED, va="top", fontsize=9)
     for key, (name, colour, marker, line) in _ERRORS.items():
         if np.isfinite(errors_mm[key]).any():
             values = " → ".join(number(value) if np.isfinite(value) else "–" for value in errors_mm[key])
             ax.plot(errors_mm[key], marker=marker, color=colour, ls=line, ms=7, zorder=3, label=f"{name}: {values} mm")
+    known_floor_mm = floor_mm[np.isfinite(floor_mm) & (floor_mm > 0)]
+    if known_floor_mm.size:
+        floor = float(known_floor_mm[-1])
+        ax.axhline(floor, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
+        frame = (("axes fraction", "data"), "offset points")
+        words = f"replicate scatter: {number(floor)} mm"
+        ax.annotate(words, (0.015, floor), (0, -4), *frame, color=st.MUTED, va="top", fontsize=9)
+    ax.margins(y=0.15)
+    st.plain_log_ticks(ax, "y")
+    if known_floor_mm.size:  # an error in the shaded range says nothing about the model
+        low, high = ax.get_ylim()
+        ax.axhspan(low, floor, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
+        ax.set_ylim(low, high)
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
     for added, part in list(zip(ladder["added"], partial, strict=True))[1:]:
@@ -84,7 +82,6 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         labels.append("+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False)))
     ax.set_xticks(range(len(ladder)), labels)
     ax.grid(axis="x", visible=False)
-    st.plain_log_ticks(ax, "y")
     st.legend_above(ax, fontsize=9, labelspacing=0.25)
     return fig
 
@@ -572,11 +569,11 @@ def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame
 
 def worst_condition(trials: pd.DataFrame) -> str:
     """Return the condition with the largest RMS error of the initial model; blank without predictions."""
-    if not len(trials):
-        return ""
-    errors_m = {name: rms_m(part, "model_before_m") for name, part in trials.groupby("condition", sort=False)}
-    finite_m = {name: value for name, value in errors_m.items() if math.isfinite(value)}
-    return str(max(finite_m, key=finite_m.__getitem__)) if finite_m else ""
+    import pandas as pd
+
+    parts = trials.groupby("condition", sort=False)
+    errors_m = pd.Series({str(name): rms_m(part, "model_before_m") for name, part in parts}, dtype=float).dropna()
+    return str(errors_m.idxmax()) if len(errors_m) else ""
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:

@@ -231,9 +231,8 @@ def draw_power(power: Power) -> Figure | None:
     ])  # fmt: skip
     fig = st.new_figure(9.6, 0.31 * n + 1.75)
     ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
-    edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, n_columns + 1)
     shades = LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", st.BLUE, "#003f66"])
-    mesh = ax.pcolormesh(edges, np.arange(n + 1) - 0.5, probabilities, cmap=shades, vmin=0, vmax=1, rasterized=True)
+    mesh = ax.pcolormesh(parts, np.arange(n), probabilities, cmap=shades, vmin=0, vmax=1, rasterized=True)
     ax.set(xscale="log", xlim=(least, most), ylim=(n - 0.5, -0.5), xlabel="size relative to the largest plausible")
     ax.grid(visible=False)
     ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])
