@@ -114,9 +114,8 @@ def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styl
     if len(vines) > 14:
         handles.append(st.line_key(f"and {len(vines) - 14} more vines", ls="none"))
     if n_left := int((~points["used"].astype(bool)).sum()):
-        handles.append(
-            st.line_key(f"not in the fit, N = {n_left}", color=st.MUTED, marker="o", mfc=st.PAPER, ls="none", ms=6)
-        )
+        words = f"not in the fit, N = {n_left}"
+        handles.append(st.line_key(words, color=st.MUTED, marker="o", mfc=st.PAPER, ls="none", ms=6))
     for method, name in METHOD_NAMES.items():
         if (damping.get(method) or {}).get("vines"):
             handles.append(st.line_key(f"{name}\nand its 95 % band", color=st.INK, ls=_METHOD_LINES[method]))
@@ -199,9 +198,8 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
         pairs = [pair for family in families for pair in zip(family["vines"], family["sizes"], strict=True)]
         printed = [(size, published["B"][vine]) for vine, size in pairs if published and vine in published["B"]]
         if published and printed:
-            ax.plot(
-                *zip(*printed, strict=True), "D", mfc="none", mec=st.MUTED, ms=11, mew=1.3, label=published["source"]
-            )
+            places = zip(*printed, strict=True)
+            ax.plot(*places, "D", mfc="none", mec=st.MUTED, ms=11, mew=1.3, label=published["source"])
         sizes = sorted({size for _, size in pairs})
         ax.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
         st.plain_log_ticks(ax)

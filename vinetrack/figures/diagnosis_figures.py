@@ -116,9 +116,8 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
     growth.set_title(worst, fontsize=10)
     handles = [st.line_key(f"measured, N = {len(parts)}", color=st.MUTED, marker=".", ls="none", ms=8)]
     for model, (colour, line, words) in models.items():
-        handles.append(
-            st.line_key(f"{words}: {number(1e3 * rms_m(before_after, model), 2)} mm rms", color=colour, ls=line)
-        )
+        words += f": {number(1e3 * rms_m(before_after, model), 2)} mm rms"
+        handles.append(st.line_key(words, color=colour, ls=line))
     growth.legend(handles=handles, loc="lower right", fontsize=9, borderaxespad=0.2, labelspacing=0.3)
     return fig
 
@@ -442,13 +441,9 @@ def _draw_curve(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variable: str
     st.band(ax, at, force - half, force + half, st.BLUE, label="95 % band")
     ax.plot(at, force, color=st.BLUE, lw=1.8, label="learned force")
     ax.axhline(0, color=st.INK, lw=0.8)
-    places, label = (
-        st.column(along, variable, factor),
-        f"range of the trials, N = {along['condition'].nunique()} conditions",
-    )
-    ax.plot(
-        places, np.full(places.size, 0.02), "|", color=st.MUTED, ms=6, transform=ax.get_xaxis_transform(), label=label
-    )
+    places, across = st.column(along, variable, factor), ax.get_xaxis_transform()
+    label = f"range of the trials, N = {along['condition'].nunique()} conditions"
+    ax.plot(places, np.full(places.size, 0.02), "|", color=st.MUTED, ms=6, transform=across, label=label)
     ax.set(xlabel=words, ylabel="missing force (N)")
     ax.margins(x=0.01)
 

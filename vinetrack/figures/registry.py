@@ -203,16 +203,13 @@ class FigureTables:
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
     """Add pressure and a short label of the condition to `trials.csv`, for the panels of the overview."""
-    by_name: dict[str, Any] = {trial.name: trial for trial in known}
+    by_name = {trial.name: trial for trial in known}
     labels, pressures = [], []
-    for row in trials.itertuples():
-        trial = by_name.get(str(row.trial))
-        if trial is None:
-            labels.append(str(row.condition) or "not readable")
-            pressures.append(float("nan"))
-            continue
-        labels.append(", ".join([f"{1e3 * trial.diameter_m:g} mm", *features(trial)[1:]]))
-        pressures.append(1e-3 * trial.pressure_Pa)
+    for name, condition in zip(trials["trial"], trials["condition"], strict=True):
+        trial = by_name.get(str(name))
+        size = f"{1e3 * trial.diameter_m:g} mm" if trial else str(condition) or "not readable"
+        labels.append(", ".join([size, *(features(trial)[1:] if trial else ())]))
+        pressures.append(1e-3 * trial.pressure_Pa if trial else float("nan"))
     return trials.assign(condition_label=labels, pressure_kPa=pressures)
 
 
