@@ -30,10 +30,10 @@ from rich.progress import track
 import vinetrack as vt
 from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
+from vinetrack.core.units import AIR_DENSITY_KG_M3, BASE_EFFECTS, GRAVITY_M_S2
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, campaign, damping_values, grow, isometric_vine
+from vinetrack.laboratory.tracks import GroundTruth, VirtualTrial, campaign, damping_values, grow, isometric_vine
 
 NOISE_M = 1e-4
 EFFECT = "reservoir_depletion"
@@ -53,7 +53,7 @@ def draw_nature(seed: int) -> tuple[GroundTruth, float, bool]:
     draw = np.random.default_rng([seed, 77])
     gamma = float(draw.uniform(1.05, 1.35))
     nature = GroundTruth(
-        effects=(*BASE, EFFECT),
+        effects=(*BASE_EFFECTS, EFFECT),
         values={**damping_values(sheet()), f"{EFFECT}.gamma": gamma},
         damping_scatter=float(draw.uniform(0, 0.04)),
         pressure_scatter=float(draw.uniform(0, 0.02)),
@@ -92,7 +92,7 @@ def measure_few(seed: int) -> dict[str, object]:
     draw, count = np.random.default_rng([seed, 79]), 2 + seed % 6
     trials = list(with_names([isometric_vine(4).trial(f"{P:g}kPa", P) for P in FEW_PRESSURES_KPA[:count]]))
     nature = GroundTruth(
-        effects=BASE,
+        effects=BASE_EFFECTS,
         values=damping_values(trials),
         damping_scatter=float(draw.uniform(0, 0.04)),
         pressure_scatter=float(draw.uniform(0, 0.02)),

@@ -31,11 +31,12 @@ from rich.progress import track
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.core.terminal import table
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis.further_trials import NextExperiment, next_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
+from vinetrack.laboratory.tracks import GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
 TUBE, DAMPING, EXPONENT, GUESSED_WRONG = Vine(24.0, 200.0, 280.0), 6.44, 0.37, 1.15
@@ -82,7 +83,7 @@ def grown(trials: Sequence[Trial], tie: Tie, seed: int) -> list[tuple[Trial, Tra
         for t in trials
     }
     nature = GroundTruth(
-        effects=(*BASE, tie.effect),
+        effects=(*BASE_EFFECTS, tie.effect),
         values={"eversion_damping.B": damping, "eversion_damping.n": EXPONENT, **tie.size},
         noise_correlation=0.3,
         seed=seed,
@@ -110,7 +111,7 @@ def asked_for(found: NextExperiment, like: Trial) -> list[Trial]:
 
 def fitted(pairs: Sequence[tuple[Trial, Track]], tie: Tie, before: Sequence[Fit] = ()) -> list[Fit]:
     """The true hypothesis and the other, each from nothing and from where it was before."""
-    host = vt.make_model([*BASE, tie.effect, tie.other])
+    host = vt.make_model([*BASE_EFFECTS, tie.effect, tie.other])
     base = vt.fit(vt.base_model(), pairs, profile=False, host=host)
     found = []
     for k, name in enumerate((tie.effect, tie.other)):

@@ -24,13 +24,14 @@ from own_effect import write_effect
 import vinetrack
 import vinetrack as vt
 from vinetrack.core.tables import write_json
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import propose as proposing
 from vinetrack.diagnosis.propose import add, propose
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import own_effects
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_summary import summary_of
-from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow, write_experiment
+from vinetrack.laboratory.tracks import GroundTruth, damping_values, grow, write_experiment
 from vinetrack.pipeline import model_stage
 from vinetrack.pipeline.predict_stage import read_basis, read_si_range
 from vinetrack.pipeline.workflow import command_for_results
@@ -101,7 +102,7 @@ def test_diagnose_writes_the_contract_and_effects_are_added_and_saved(tmp_path, 
     trials = sheet()[6:]  # one vine at three pressures, twice each
     values = {**damping_values(trials), "reservoir_depletion.gamma": 1.2}
     scatter = {"damping_scatter": 0.02, "pressure_scatter": 0.005}
-    nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=values, seed=7200, **scatter)
+    nature = GroundTruth(effects=(*BASE_EFFECTS, "reservoir_depletion"), values=values, seed=7200, **scatter)
     folder, results, alone = (tmp_path / name for name in ("campaign", "results", "alone"))
     write_experiment(grow(trials, nature), folder, "chamber_l: 3.7\n" + FEW_CANDIDATES)
 

@@ -11,13 +11,14 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import campaign_power, linear_power
 from vinetrack.diagnosis import further_trials as advice
 from vinetrack.diagnosis.campaign_power import CampaignDesign, FilmingPlan, make, planned_tests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
+from vinetrack.laboratory.tracks import GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
@@ -206,7 +207,7 @@ def test_information_apart_from_the_most_similar_rival():
 
 
 FITTED = ["air_drag", "inlet_loss", "reservoir_depletion", "tail_friction", "length_scale", "time_base"]
-HOST = vt.make_model([*BASE, *FITTED])  # one compiled model serves all that are fitted here
+HOST = vt.make_model([*BASE_EFFECTS, *FITTED])  # one compiled model serves all that are fitted here
 
 B_KNOWN, N = 6.44, 0.37
 
@@ -216,7 +217,7 @@ def grown(trials, seed: int, off: float = 1.0) -> Pairs:
     damping = {trial.vine: off * damping_prior(trial.diameter_m, trial.thickness_m) for trial in trials}
     known = {t.vine: B_KNOWN for t in trials if (round(t.diameter_m * 1e3), round(t.thickness_m * 1e6)) == (24, 200)}
     values = {"eversion_damping.B": damping | known, "eversion_damping.n": N, "air_drag.C_D": 60.0}
-    nature = GroundTruth(effects=(*BASE, "air_drag"), values=values, noise_correlation=0.3, seed=seed)
+    nature = GroundTruth(effects=(*BASE_EFFECTS, "air_drag"), values=values, noise_correlation=0.3, seed=seed)
     return pairs_of(grow(trials, nature))
 
 
@@ -244,7 +245,7 @@ def shown(fits, pairs: Pairs) -> float:
     base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST)
     likelihood = []
     for fit in fits:
-        (effect,) = set(fit.model.names) - set(BASE)
+        (effect,) = set(fit.model.names) - set(BASE_EFFECTS)
         size = {key: value for key, value in fit.model.values.items() if key.startswith(effect)}
         likelihood.append(max(vt.refit(base, fit.model, start=start).log_likelihood for start in ({}, size)))
     change = 2 * (likelihood[0] - likelihood[1]) - 2 * (fits[0].log_likelihood - fits[1].log_likelihood)

@@ -6,11 +6,11 @@ from itertools import product
 from pathlib import Path
 
 from vinetrack.core.records import Track, Trial
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import Effect, own_effects
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import (
-    BASE,
     GroundTruth,
     VirtualTrial,
     campaign,
@@ -56,7 +56,7 @@ def grown(trials: Sequence[Trial], seed: int, effects=(), values=None, own=(), *
     """The trials grown with the printed B and n and these effects hidden."""
     hidden = own_effects(own)
     known = {**damping_values(trials), **(values or {})}
-    nature = Hiding(effects=(*BASE, *effects, *hidden), values=known, seed=seed, own=hidden, **more)
+    nature = Hiding(effects=(*BASE_EFFECTS, *effects, *hidden), values=known, seed=seed, own=hidden, **more)
     return grow(trials, nature)
 
 

@@ -13,13 +13,14 @@ from odrpack import odr_fit
 from scipy.stats import binom
 
 import vinetrack as vt
-from vinetrack.core.published import DAMPING_B, DIAMETER_MM, THICKNESS_UM
+from vinetrack.core.published import DAMPING_B, DIAMETER_MM, EXPONENT, THICKNESS_UM
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics import damping
 from vinetrack.kinematics.damping import fit_damping, fit_laws, fit_scaling, fit_trends
 from vinetrack.kinematics.summary import CONDITION_COLUMNS, look_at_motions, redo_damping
-from vinetrack.laboratory.tracks import BASE, PAPER_B, PAPER_N, GroundTruth, damping_values, grow, isometric_vine
+from vinetrack.laboratory.tracks import GroundTruth, damping_values, grow, isometric_vine
 from vinetrack.laboratory.tracks import campaign as of_vine
 
 N = 0.37
@@ -227,7 +228,7 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model():
     trials = of_vine(isometric_vine(1), (15.1, 22.8, 30.5, 38.3, 46, 53.7), 3, prefix="R1_")
     trials += of_vine(isometric_vine(2), (12.7, 18.5, 24.3, 30.1, 35.9, 41.7), 3, prefix="R2_")
     trials = list(with_names([replace(trial, chamber_m3=2.5e-4) for trial in trials]))
-    nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=41)
+    nature = GroundTruth(effects=(*BASE_EFFECTS, "reservoir_depletion"), values=damping_values(trials), seed=41)
     pairs = [(one.stated, one.track) for one in grow(trials, nature)]
     settings = RunSettings.model_validate({"damping": {"resamples": 300}})
     motions = look_at_motions(pairs, settings)
@@ -235,13 +236,13 @@ def test_b_and_n_come_home_with_the_pressure_of_the_model():
     before, after = (redo_damping(model, motions, settings) for model in (vt.base_model(), found.model))
 
     def worst_B(law: Mapping) -> float:
-        return max(abs(vine["B"] / PAPER_B[round(vine["diameter_mm"] / 6)] - 1) for vine in law["vines"].values())
+        return max(abs(vine["B"] / DAMPING_B[round(vine["diameter_mm"] / 6)] - 1) for vine in law["vines"].values())
 
     assert before["both_axes"]["refused"]
     assert worst_B(before["paper"]) > 0.1
     assert worst_B(after["both_axes"]) < 0.03
     low, high = after["both_axes"]["n_95"]
-    assert low < PAPER_N < high
+    assert low < EXPONENT < high
 
 
 def families(sizes: dict[str, tuple[float, float, float]]) -> dict:

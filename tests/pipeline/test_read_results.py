@@ -15,8 +15,8 @@ from vinetrack.core import published
 from vinetrack.core.records import Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis, Round
-from vinetrack.figures import diagnosis_figures as tables
-from vinetrack.figures.registry import diagnosis_figures, draw, with_final_model
+from vinetrack.figures import diagnosis_figures as drawn
+from vinetrack.figures.registry import FigureTables, diagnosis_figures, draw, label_conditions
 from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
@@ -87,7 +87,7 @@ def prediction(off_m: float, after: bool) -> pd.DataFrame:
     return table.assign(model_before_m=before_m, model_after_m=table["lead_position_m"] if after else math.nan)
 
 
-def folder(path: Path, content: dict | None, after: bool = True, compared: bool = True) -> Results:
+def folder(path: Path, content: dict | None, after: bool = True) -> Results:
     results = Results(path)
     (path / "diagnosis" / "predictions").mkdir(parents=True)
     (path / "comparison").mkdir()
@@ -103,77 +103,68 @@ def folder(path: Path, content: dict | None, after: bool = True, compared: bool 
             since = {"time_s": table["time_s"] - RELEASE_S, "lead_position_m": table["lead_position_m"] - ORIGIN_M}
             model = {"model_position_m": table["model_before_m"] - ORIGIN_M}
             parts.append(pd.DataFrame({"trial": trial, **since, **model}))
-        if compared:
-            pd.concat(parts).to_csv(results.trajectories(condition), index=False)
+        pd.concat(parts).to_csv(results.trajectories(condition), index=False)
+    rows = [("v", name, low, low + 0.1, 0.011, 0.001) for name in ("slow", "fast", "") for low in (0.0, 0.1)]
+    columns = ["vine", "condition", "from_m", "to_m", "mean_residual_m", "sigma_m"]
+    pd.DataFrame(rows, columns=columns).to_csv(results.diagnosed("along_position.csv"), index=False)
     return results
 
 
 def test_predictions_count_from_release_and_origin(tmp_path):
-    for compared in (True, False):
-        trials = tables.predicted_trials(folder(tmp_path / str(compared), diagnosis(), compared=compared), conditions())
-        one = trials[trials["trial"] == "a"]
-        # Without the comparison the release is the first frame that moves: a frame or two late.
-        assert one["time_s"].iloc[0] == pytest.approx(-0.02, abs=1e-9 if compared else 2.5e-3)
-        assert one["lead_position_m"].iloc[-1] == pytest.approx(0.2)
+    trials = drawn.predicted_trials(folder(tmp_path / "r", diagnosis()), conditions())
+    one = trials[trials["trial"] == "a"]
+    assert one["time_s"].iloc[0] == pytest.approx(-0.02)
+    end = one[["lead_position_m", "model_before_m", "model_after_m"]].iloc[-1]
+    assert end.to_numpy() == pytest.approx([0.2, 0.18, 0.2])
 
 
-def test_the_worst_condition_is_shown_and_misfits_are_averaged_along_the_growth(tmp_path):
-    results = folder(tmp_path / "r", diagnosis())
-    found = tables.read_diagnosis_tables(results, conditions())
+def test_the_worst_condition_is_shown_and_misfits_stand_along_the_growth_with_their_errors(tmp_path):
+    found = drawn.read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
     assert found is not None
     assert found.worst == "12 mm, 24 kPa"
     assert set(found.before_after["trial"]) == {"a", "b"}
-    assert tables.worst_condition(found.before_after.iloc[:0]) == ""
-    slow = found.where[found.where["condition"] == "slow"]
-    middle = (slow["growth_from"] + slow["growth_to"]) / 2
-    assert slow["misfit_before_m"].to_numpy() == pytest.approx(0.02 * middle.to_numpy(), abs=3e-4)
-    assert slow["misfit_after_m"].to_numpy() == pytest.approx(np.zeros(len(slow)), abs=1e-12)
+    assert drawn.worst_condition(found.before_after.iloc[:0]) == ""
     assert set(found.where["condition_label"]) == {"12 mm, 24 kPa", "12 mm, 60 kPa"}
-    assert slow["n_trials"].tolist() == [2] * len(slow)
-    # Misfits that the diagnosis found are taken with their errors.
-    row = {"vine": "v", "condition": "slow", "from_m": 0.1, "to_m": 0.2, "lead_position_m": 0.15}
-    row |= {"mean_residual_m": 0.011, "sigma_m": 0.001, "z": 11.0, "n_trials": 2}
-    pd.DataFrame([row, row | {"condition": ""}]).to_csv(results.diagnosed("along_position.csv"), index=False)
-    found = tables.read_diagnosis_tables(results, conditions())
-    assert found is not None
-    (slow,) = found.where[found.where["condition"] == "slow"].to_dict("records")
-    assert (slow["growth_from"], slow["growth_to"]) == (0.5, 1.0)
-    assert (slow["misfit_before_m"], slow["scatter_m"]) == (0.011, 0.001)
-    assert slow["misfit_after_m"] == pytest.approx(0, abs=1e-12)
+    slow = found.where[found.where["condition"] == "slow"]
+    assert slow[["growth_from", "growth_to"]].to_numpy().tolist() == [[0.0, 0.5], [0.5, 1.0]]
+    assert slow[["misfit_before_m", "scatter_m", "n_trials"]].to_numpy().tolist() == [[0.011, 0.001, 2]] * 2
+    assert slow["misfit_after_m"].to_numpy() == pytest.approx(np.zeros(2), abs=1e-12)
 
 
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_there_is_none(tmp_path):
     for verdict in VERDICTS:
         results = folder(tmp_path / verdict, diagnosis(verdict), after=verdict == "missing")
-        found = tables.read_diagnosis_tables(results, conditions())
+        found = drawn.read_diagnosis_tables(results, conditions())
         assert found is not None
-        drawn = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
-        assert set(drawn) == {"ladder", "before_after", "where", "candidates", "cosines"}
-        for name, figure in drawn.items():
+        pictures = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
+        assert set(pictures) == {"ladder", "before_after", "where", "candidates", "cosines"}
+        for name, figure in pictures.items():
             assert render(figure, ["svg"])["svg"]
             assert len(getattr(found, diagnosis_figures()[name].data)) > 0
     for name, content in (("none", None), ("refused", refused())):
-        assert tables.read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
-    assert not any(draw(name, tables.DiagnosisTables()) for name in diagnosis_figures())
+        assert drawn.read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
+    assert not any(draw(name, pictures.DiagnosisTables()) for name in diagnosis_figures())
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
-    results = folder(tmp_path / "r", diagnosis())
-    trajectories = {name: pd.read_csv(results.trajectories(name)) for name in ("slow", "fast")}
-    joined = with_final_model(trajectories, tables.read_diagnosis_tables(results, conditions()))
-    difference = joined["slow"]["model_after_m"] - joined["slow"]["lead_position_m"]
-    assert float(np.abs(difference).max()) < 1e-12
-    assert "model_after_m" not in with_final_model(trajectories, None)["slow"]
-    shorter = {"slow": trajectories["slow"].iloc[1:]}
-    assert "model_after_m" not in with_final_model(shorter, tables.read_diagnosis_tables(results, conditions()))["slow"]
+    for effects in (["air_drag"], []):
+        results = folder(tmp_path / str(len(effects)), diagnosis(effects=effects))
+        tables = FigureTables(results.folder, ())
+        described = conditions().assign(pressure_kPa=24.0)
+        table = pd.DataFrame({"condition": ["slow", "fast"], "model": "base"})
+        vars(tables).update(trials=described, comparison=label_conditions(table, described))
+        joined = tables.trajectories["slow"]
+        assert ("model_after_m" in joined) == bool(effects)
+        if effects:
+            assert np.allclose(joined["model_after_m"], joined["lead_position_m"], rtol=0, atol=1e-12)
 
 
 def test_ties_stand_in_the_order_of_the_ranking():
     cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
-    cells = tables.cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
+    cells = drawn.cosine_cells(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
     leak, time_base = ["leak", "air_drag", 0.3], ["time_base", "air_drag", 0.2]
     assert cells.to_numpy().tolist() == [leak, time_base, ["time_base", "leak", 0.1]]
-    assert tables.cosine_cells(Round.from_json({"verdict": ""})).empty
+    assert drawn.cosine_cells(Round.from_json({"verdict": ""})).empty
 
 
 # Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.

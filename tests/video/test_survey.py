@@ -178,8 +178,8 @@ def clip(tmp_path_factory):
     tube = replace(scene.subject, diameter_m=0.012, length_m=0.14)
     scene = replace(scene, subject=tube, camera=replace(scene.camera, m_per_px=SCALE_MM / 1e3))
     path = tmp_path_factory.mktemp("clip") / "a.mp4"
-    motion = np.linspace(0, 0.06, 400), np.clip(6.0 * (np.linspace(0, 0.06, 400) - 0.015), 0, 0.14)
-    render_recording(scene, motion, n_frames=60, capture_fps=FPS, out_path=path, seed=20950)
+    grown = lambda time_s: np.clip(6.0 * (time_s - 0.015), 0, 0.14)  # noqa: E731
+    render_recording(scene, grown, n_frames=60, capture_fps=FPS, out_path=path, seed=20950)
     return path
 
 

@@ -67,19 +67,10 @@ def _draw_points(ax: Axes, points: pd.DataFrame, style: st.VineStyle, used: bool
     """Points with bars of one standard error; the lower one ends above zero, which logarithmic axes cannot show."""
     x, y = st.column(points, "x_ss_m_s"), st.column(points, "force_N")
     x_sigma, y_sigma = (np.nan_to_num(st.column(points, name)) for name in ("x_ss_sigma_m_s", "force_sigma_N"))
-    bars: dict[str, Any] = {
-        "xerr": [np.minimum(x_sigma, 0.9 * x), x_sigma],
-        "yerr": [np.minimum(y_sigma, 0.9 * y), y_sigma],
-    }
-    marker: dict[str, Any] = {
-        "fmt": style.marker,
-        "mfc": style.colour if used else st.PAPER,
-        "mec": style.colour,
-        "ms": 5,
-    }
-    ax.errorbar(
-        x, y, color=style.colour, mew=1.1, elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3, **bars, **marker
-    )
+    errors: dict[str, Any] = {"xerr": [np.minimum(x_sigma, 0.9 * x), x_sigma]}
+    errors["yerr"] = [np.minimum(y_sigma, 0.9 * y), y_sigma]
+    look: dict[str, Any] = {"fmt": style.marker, "color": style.colour, "mfc": style.colour if used else st.PAPER}
+    ax.errorbar(x, y, **errors, **look, ms=5, mew=1.1, elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3)
 
 
 def _draw_law(ax: Axes, fit: dict[str, Any], vine: str, B: float, x_ss_m_s: np.ndarray, colour: str, line: Any) -> None:
@@ -123,9 +114,8 @@ def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styl
     if len(vines) > 14:
         handles.append(st.line_key(f"and {len(vines) - 14} more vines", ls="none"))
     if n_left := int((~points["used"].astype(bool)).sum()):
-        handles.append(
-            st.line_key(f"not in the fit, N = {n_left}", color=st.MUTED, marker="o", mfc=st.PAPER, ls="none", ms=6)
-        )
+        words = f"not in the fit, N = {n_left}"
+        handles.append(st.line_key(words, color=st.MUTED, marker="o", mfc=st.PAPER, ls="none", ms=6))
     for method, name in METHOD_NAMES.items():
         if (damping.get(method) or {}).get("vines"):
             handles.append(st.line_key(f"{name}\nand its 95 % band", color=st.INK, ls=_METHOD_LINES[method]))
@@ -208,9 +198,8 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
         pairs = [pair for family in families for pair in zip(family["vines"], family["sizes"], strict=True)]
         printed = [(size, published["B"][vine]) for vine, size in pairs if published and vine in published["B"]]
         if published and printed:
-            ax.plot(
-                *zip(*printed, strict=True), "D", mfc="none", mec=st.MUTED, ms=11, mew=1.3, label=published["source"]
-            )
+            places = zip(*printed, strict=True)
+            ax.plot(*places, "D", mfc="none", mec=st.MUTED, ms=11, mew=1.3, label=published["source"])
         sizes = sorted({size for _, size in pairs})
         ax.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
         st.plain_log_ticks(ax)

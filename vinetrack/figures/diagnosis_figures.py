@@ -5,7 +5,6 @@ The model before the added effects is vermillion and dashed, the model after blu
 
 from __future__ import annotations
 
-import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -59,28 +58,23 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     fig = st.new_figure(max(5.2, 2.4 + 1.55 * len(ladder)), 3.9)  # names of effects are wrapped at 18 letters
     ax = fig.add_subplot()
     ax.set(yscale="log", ylabel="error of position, rms (mm)", xlim=(-0.5, len(ladder) - 0.5))
-    known = np.concatenate([*errors_mm.values(), floor_mm])
-    known = known[np.isfinite(known) & (known > 0)]
-    if known.size:
-        middle = math.sqrt(known.min() * known.max())
-        ax.set_ylim(min(0.72 * known.min(), middle / 2), max(1.35 * known.max(), middle * 2))
-    else:
-        ax.set_ylim(0.1, 1.0)
+    for key, (name, colour, marker, line) in _ERRORS.items():
+        if np.isfinite(errors_mm[key]).any():
+            values = " → ".join(number(value) if np.isfinite(value) else "–" for value in errors_mm[key])
+            ax.plot(errors_mm[key], marker=marker, color=colour, ls=line, ms=7, zorder=3, label=f"{name}: {values} mm")
     known_floor_mm = floor_mm[np.isfinite(floor_mm) & (floor_mm > 0)]
     if known_floor_mm.size:
-        floor = float(known_floor_mm[-1])  # an error in the shaded range says nothing about the model
-        ax.axhspan(ax.get_ylim()[0], floor, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
+        floor = float(known_floor_mm[-1])
         ax.axhline(floor, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
         frame = (("axes fraction", "data"), "offset points")
         words = f"replicate scatter: {number(floor)} mm"
         ax.annotate(words, (0.015, floor), (0, -4), *frame, color=st.MUTED, va="top", fontsize=9)
-    handles = []
-    for key, (name, colour, marker, line) in _ERRORS.items():
-        style: dict[str, Any] = {"marker": marker, "color": colour, "ls": line}
-        ax.plot(np.arange(len(ladder)), errors_mm[key], ms=7, zorder=3, **style)
-        if np.isfinite(errors_mm[key]).any():
-            handles.append(st.line_key(name, ms=6, **style))
-    _write_values(ax, errors_mm)
+    ax.margins(y=0.15)
+    st.plain_log_ticks(ax, "y")
+    if known_floor_mm.size:  # an error in the shaded range says nothing about the model
+        low, high = ax.get_ylim()
+        ax.axhspan(low, floor, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
+        ax.set_ylim(low, high)
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
     for added, part in list(zip(ladder["added"], partial, strict=True))[1:]:
@@ -88,29 +82,8 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         labels.append("+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False)))
     ax.set_xticks(range(len(ladder)), labels)
     ax.grid(axis="x", visible=False)
-    st.plain_log_ticks(ax, "y")
-    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.02, 1.0)}
-    ax.legend(handles=handles, fontsize=9, labelspacing=0.25, labelcolor=st.INK, **place)
+    st.legend_above(ax, fontsize=9, labelspacing=0.25)
     return fig
-
-
-def _write_values(ax: Axes, errors_mm: dict[str, np.ndarray]) -> None:
-    """Write the values next to the points, clear of the lines and of each other."""
-    low, high = (math.log10(value) for value in ax.get_ylim())
-    spacing = 0.075 * (high - low)
-    n_steps = len(next(iter(errors_mm.values())))
-    for step in range(n_steps):
-        shown = sorted((float(values[step]), _ERRORS[key][1]) for key, values in errors_mm.items() if values[step] > 0)
-        side, sideways = ("right", -9) if step == 0 and n_steps > 1 else ("left", 9)
-        lifted = 0.6 * spacing if 0 < step < n_steps - 1 else 0.0  # lines arrive from above left and leave to the right
-        levels = [math.log10(value) + lifted for value, _ in shown]
-        for i in range(1, len(levels)):
-            levels[i] = max(levels[i], levels[i - 1] + spacing)
-        excess = max(levels[-1] - (high - spacing / 2), 0.0) if levels else 0.0
-        for (value, colour), level in zip(shown, levels, strict=True):
-            style: dict[str, Any] = {"color": colour, "fontsize": 9, "fontweight": "bold", "ha": side, "va": "center"}
-            at = (step, 10 ** (level - excess))
-            ax.annotate(number(value), at, (sideways, 0), textcoords="offset points", **style)
 
 
 @figure("before_after", "verdict", "The worst condition", data="before_after", if_refuted=DASHED_REFUTED)
@@ -143,9 +116,8 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
     growth.set_title(worst, fontsize=10)
     handles = [st.line_key(f"measured, N = {len(parts)}", color=st.MUTED, marker=".", ls="none", ms=8)]
     for model, (colour, line, words) in models.items():
-        handles.append(
-            st.line_key(f"{words}: {number(1e3 * rms_m(before_after, model), 2)} mm rms", color=colour, ls=line)
-        )
+        words += f": {number(1e3 * rms_m(before_after, model), 2)} mm rms"
+        handles.append(st.line_key(words, color=colour, ls=line))
     growth.legend(handles=handles, loc="lower right", fontsize=9, borderaxespad=0.2, labelspacing=0.3)
     return fig
 
@@ -469,13 +441,9 @@ def _draw_curve(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variable: str
     st.band(ax, at, force - half, force + half, st.BLUE, label="95 % band")
     ax.plot(at, force, color=st.BLUE, lw=1.8, label="learned force")
     ax.axhline(0, color=st.INK, lw=0.8)
-    places, label = (
-        st.column(along, variable, factor),
-        f"range of the trials, N = {along['condition'].nunique()} conditions",
-    )
-    ax.plot(
-        places, np.full(places.size, 0.02), "|", color=st.MUTED, ms=6, transform=ax.get_xaxis_transform(), label=label
-    )
+    places, across = st.column(along, variable, factor), ax.get_xaxis_transform()
+    label = f"range of the trials, N = {along['condition'].nunique()} conditions"
+    ax.plot(places, np.full(places.size, 0.02), "|", color=st.MUTED, ms=6, transform=across, label=label)
     ax.set(xlabel=words, ylabel="missing force (N)")
     ax.margins(x=0.01)
 
@@ -547,122 +515,80 @@ def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> Diagnos
     diagnosis = read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return None
-    names = ("along_position.csv", "drift_groups.csv", "missing_force.csv", "learned_force.csv")
-    paths = map(results.diagnosed, names)
-    tables = [read_result(path) if path.exists() else empty_table(()) for path in paths]
-    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), *tables)
+    tables = {path.name: read_result(path) for path in results.diagnosed("moved.csv").parent.glob("*.csv")}
+    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), tables)
 
 
 def assemble_tables(
-    diagnosis: Diagnosis,
-    conditions: pd.DataFrame,
-    trials: pd.DataFrame,
-    located: pd.DataFrame,
-    drifting: pd.DataFrame,
-    force: pd.DataFrame,
-    learned: pd.DataFrame,
+    diagnosis: Diagnosis, conditions: pd.DataFrame, trials: pd.DataFrame, tables: Mapping[str, pd.DataFrame]
 ) -> DiagnosisTables:
-    """Assemble the data of the figures."""
-    import pandas as pd
-
-    labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
-    worst, rounds = worst_condition(trials), []
+    """Assemble the data of the figures; `tables` are those of the folder `diagnosis` by file name."""
+    labels = {str(row.condition): str(row.condition_label) for row in st.rows(conditions)}
+    worst, rounds, none = worst_condition(trials), [], empty_table(())
     for i, ranked in enumerate(diagnosis.rounds):
         added = [name for name in ranked.model if name not in diagnosis.rounds[0].model]
         heading = f"Which is missing with {listed_names(added)} added?"
         rounds.append((heading if i else "Which effect is missing from the initial model?", ranking_table(ranked)))
     return DiagnosisTables(
-        ladder=pd.DataFrame() if diagnosis.ladder is None else diagnosis.ladder,
+        ladder=none if diagnosis.ladder is None else diagnosis.ladder,
         trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
-        where=_where_table(trials, labels, located),
+        where=_where_table(trials, labels, tables.get("along_position.csv", none)),
         cosines=cosine_cells(diagnosis.rounds[0]),
-        drift=drifting,
-        missing_force=force,
+        drift=tables.get("drift_groups.csv", none),
+        missing_force=tables.get("missing_force.csv", none),
+        learned_force=tables.get("learned_force.csv", none),
         rounds=rounds,
         worst=labels.get(worst, worst),
         added=listed_names(diagnosis.effects),
-        learned_force=learned,
     )
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
-    """Return measured and predicted positions of all trials, relative to release and origin."""
+    """Return measured and predicted positions of all trials, from release and origin as in `comparison`."""
     import pandas as pd
 
+    paths = {name: results.trajectories(name) for name in dict.fromkeys(conditions["condition"]) if name}
+    compared = {name: read_result(path) for name, path in paths.items() if path.exists()}
     parts = []
-    compared: dict[str, pd.DataFrame] = {}
     for trial, condition in zip(conditions["trial"], conditions["condition"], strict=True):
         path = results.predictions(trial)
-        table = read_result(path) if path.exists() else None
-        if table is None or not len(table):
+        if condition not in compared or not path.exists():
             continue
-        if condition not in compared:
-            exists = bool(condition) and results.trajectories(condition).exists()
-            compared[condition] = read_result(results.trajectories(condition)) if exists else pd.DataFrame()
-        release_s, origin_m = _start(trial, table, compared[condition])
-        positions = {name: table[name] - origin_m for name in CURVE_COLUMNS[3:]}
-        time_s = table["time_s"] - release_s
-        parts.append(pd.DataFrame({"trial": trial, "condition": condition, "time_s": time_s, **positions}))
+        table, course = read_result(path), compared[condition][compared[condition]["trial"] == trial]
+        after_m = table["model_after_m"] - (table["lead_position_m"] - course["lead_position_m"].to_numpy())
+        models = {"model_before_m": course["model_position_m"], "model_after_m": after_m.to_numpy()}
+        parts.append(course.assign(condition=condition, **models)[list(CURVE_COLUMNS)])
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
-
-
-def _start(trial: str, table: pd.DataFrame, compared: pd.DataFrame) -> tuple[float, float]:
-    """Return release and origin of a trial: those of the comparison, which starts at the same point, else estimates."""
-    of_trial = compared[compared["trial"] == trial] if len(compared) else compared
-    time_s, position_m = float(table["time_s"].iloc[0]), float(table["lead_position_m"].iloc[0])
-    if len(of_trial) == len(table):
-        return time_s - float(of_trial["time_s"].iloc[0]), position_m - float(of_trial["lead_position_m"].iloc[0])
-    origin_m = float(np.nanmin(table["lead_position_m"]))
-    growth_m = table["lead_position_m"].to_numpy(dtype=float) - origin_m
-    return float(table["time_s"].iloc[int(np.argmax(growth_m > 0.01 * np.nanmax(growth_m)))]), origin_m
 
 
 def worst_condition(trials: pd.DataFrame) -> str:
     """Return the condition with the largest RMS error of the initial model; blank without predictions."""
-    if not len(trials):
-        return ""
-    errors_m = {name: rms_m(part, "model_before_m") for name, part in trials.groupby("condition", sort=False)}
-    finite_m = {name: value for name, value in errors_m.items() if math.isfinite(value)}
-    return str(max(finite_m, key=finite_m.__getitem__)) if finite_m else ""
+    import pandas as pd
+
+    parts = trials.groupby("condition", sort=False)
+    errors_m = pd.Series({str(name): rms_m(part, "model_before_m") for name, part in parts}, dtype=float).dropna()
+    return str(errors_m.idxmax()) if len(errors_m) else ""
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in sections of its growth, for the figure `where`: the sections of the
-    diagnosis with the misfit of the initial model there and its error, or else equal ones, with means over the trials.
+    """Return the mean misfit of every condition in the sections of its growth that the diagnosis looked at, for the
+    figure `where`: of the initial model with its error as found there, of the final one as mean over the trials.
     """
     import pandas as pd
 
-    from vinetrack.diagnosis.result import MAX_STRETCHES
-
     rows: list[dict[str, Any]] = []
-    for condition, label in labels.items():
-        members = trials[trials["condition"] == condition]
-        members = members[members["time_s"] >= 0]
-        if not len(members):
-            continue
-        found = located[located["condition"] == condition] if len(located) and condition else located[:0]
-        if len(found):
-            along, whole_m = "model_before_m", located.loc[located["vine"] == found["vine"].iloc[0], "to_m"].max()
-            sections = found[["from_m", "to_m", "mean_residual_m", "sigma_m"]].to_numpy(dtype=float)
-        else:
-            along, whole_m = "lead_position_m", members["lead_position_m"].max()
-            ends = np.linspace(0.0, whole_m, MAX_STRETCHES + 1)
-            sections = np.array([(*section, np.nan, np.nan) for section in itertools.pairwise(ends)])
-        n_trials, models = members["trial"].nunique(), ["model_before_m", "model_after_m"]
-        misfits = members[models].rsub(members["lead_position_m"], axis=0)
-        for low, high, mean, sigma in sections if whole_m > 0 else ():
-            to_end = math.isnan(mean) and not high < whole_m
-            inside = (members[along] >= low) & (members[along] < (math.inf if to_end else high))
-            of_trials = misfits[inside].groupby(members["trial"]).mean()
-            if math.isnan(mean):
-                if of_trials["model_before_m"].isna().all():
-                    continue
-                mean = of_trials["model_before_m"].mean()
-                sigma = of_trials["model_before_m"].std() / math.sqrt(n_trials)
-            misfit = {"misfit_before_m": mean, "misfit_after_m": of_trials["model_after_m"].mean(), "scatter_m": sigma}
+    for condition, label in labels.items() if len(located) else ():
+        members = trials[(trials["condition"] == condition) & (trials["time_s"] >= 0)]
+        after_m, n_trials = members["lead_position_m"] - members["model_after_m"], members["trial"].nunique()
+        for row in st.rows(located[located["condition"] == condition]) if n_trials else ():
+            whole_m = located.loc[located["vine"] == row.vine, "to_m"].max()
+            inside = (members["model_before_m"] >= row.from_m) & (members["model_before_m"] < row.to_m)
+            misfit_after_m = after_m[inside].groupby(members["trial"]).mean().mean()
+            misfit = {"misfit_before_m": row.mean_residual_m, "misfit_after_m": misfit_after_m}
+            place = {"growth_from": row.from_m / whole_m, "growth_to": row.to_m / whole_m}
             name = {"condition": condition, "condition_label": label, "n_trials": n_trials}
-            rows.append(name | {"growth_from": low / whole_m, "growth_to": high / whole_m} | misfit)
+            rows.append(name | place | misfit | {"scatter_m": row.sigma_m})
     return pd.DataFrame(rows)
 
 

@@ -154,17 +154,12 @@ def draw_trial_motion(
     text_in, strip_in = line_in * len(notes) + 0.1, 0.24 * max(len(windows), 1)
     height_in = 1.75 + 2.1 + strip_in + text_in + 1.2
     fig = st.new_figure(7.2, height_in, layout=None)
-
-    def row_of_axes(bottom_in: float, tall_in: float, **keywords: Any) -> Axes:
-        return fig.add_axes((0.125, bottom_in / height_in, 0.765, tall_in / height_in), **keywords)
-
-    bottom_in = text_in + 0.58
-    strip = row_of_axes(bottom_in, strip_in)
-    speed = row_of_axes(bottom_in + strip_in + 0.1, 2.1, sharex=strip)
-    lead = row_of_axes(bottom_in + strip_in + 0.1 + 2.1 + 0.14, 1.75, sharex=strip)
-    for ax in (lead, speed, strip):
+    lead, speed, strip = fig.subplots(3, 1, sharex=True, height_ratios=(1.75, 2.1, strip_in))
+    tall_in = 1.75 + 2.1 + strip_in  # and twice 0.12 in between the panels
+    bottom, top = (text_in + 0.58) / height_in, (text_in + 0.82 + tall_in) / height_in
+    fig.subplots_adjust(left=0.125, right=0.89, bottom=bottom, top=top, hspace=0.36 / tall_in)
+    for ax in (lead, speed):
         ax.yaxis.set_label_coords(-0.095, 0.5)
-    strip.xaxis.set_label_coords(0.5, -0.29 / strip_in)
     _draw_position(lead, track, kinematics, unusable, by_hand)
     lead.set_title(title, pad=8, fontsize=st.fitting_size(title, 0.8 * 72 * 7.2, 11))
     _draw_speed(speed, kinematics, windows, travel_ratio)
@@ -184,9 +179,8 @@ def _share_ticks(below: Axes, above: Sequence[Axes]) -> None:
         ax.xaxis.set_visible(False)
         across = ax.get_xaxis_transform()
         ax.vlines(ticks, 0, 1, color=st.GRID, lw=0.7, zorder=0.5, transform=across)
-        ax.plot(
-            ticks, [0] * len(ticks), ls="none", marker=3, ms=3.5, mew=0.8, color=st.INK, transform=across, clip_on=False
-        )
+        outside: dict[str, Any] = {"transform": across, "clip_on": False}
+        ax.plot(ticks, [0] * len(ticks), ls="none", marker=3, ms=3.5, mew=0.8, color=st.INK, **outside)
 
 
 def _draw_position(
@@ -211,10 +205,8 @@ def _draw_speed(ax: Axes, kinematics: pd.DataFrame, windows: pd.DataFrame, trave
     for row in st.rows(windows):
         if np.isfinite(row.x_ss_m_s):
             level = row.x_ss_m_s / travel_ratio
-            style = "-" if row.accepted else (0, (1.5, 1.2))
-            ax.plot(
-                [row.from_s, row.to_s], [level, level], color=st.RULE_COLOURS[row.rule], ls=style, lw=3.2, alpha=0.9
-            )
+            style: dict[str, Any] = {"color": st.RULE_COLOURS[row.rule], "ls": "-" if row.accepted else (0, (1.5, 1.2))}
+            ax.plot([row.from_s, row.to_s], [level, level], lw=3.2, alpha=0.9, **style)
     ax.set_ylim(*_speed_limits(speed_m_s, two_sigma_m_s))
     ax.set_ylabel("leading edge (m/s)")
     if travel_ratio != 1:
@@ -233,11 +225,9 @@ def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[flo
         return 0.0, 1.0
     low, high = min(float(finite.min()), 0.0), max(float(finite.max()), 0.0)
     span = (high - low) or 1.0
-    known = np.isfinite(half_band_m_s)
-    band_low = float(np.nanmin(np.where(known, speed_m_s - half_band_m_s, low)))
-    band_high = float(np.nanmax(np.where(known, speed_m_s + half_band_m_s, high)))
-    low = max(min(low, band_low), low - 0.5 * span)
-    high = min(max(high, band_high), high + 0.5 * span)
+    band_low = float(np.nanmin(speed_m_s - half_band_m_s, initial=low))
+    band_high = float(np.nanmax(speed_m_s + half_band_m_s, initial=high))
+    low, high = max(band_low, low - 0.5 * span), min(band_high, high + 0.5 * span)
     return low - 0.04 * span * (low < 0), high + 0.06 * span
 
 

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
@@ -145,16 +144,11 @@ def _draw_kymograph(ax: Axes, tracking: Tracking) -> None:
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """Return a picture averaged to at most `largest_px` pixels per side, ignoring NaN. Shape (height, width)."""
-    for axis in (0, 1):
-        step = -(-picture.shape[axis] // largest_px)
-        if step > 1:
-            starts = np.arange(0, picture.shape[axis], step)
-            known = np.isfinite(picture)
-            sums = np.add.reduceat(np.where(known, picture, 0).astype(np.float32), starts, axis=axis)
-            counts = np.add.reduceat(known.astype(np.float32), starts, axis=axis)
-            picture = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
-    return picture
+    """Return a picture averaged to at most `largest_px` pixels per side. Shape (height, width)."""
+    import cv2
+
+    height, width = (min(side, largest_px) for side in picture.shape)
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
@@ -265,9 +259,8 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
             pen.line(line, fill=edge.colour, width=thick)
     _scale_bar(pen, view)
     whole = Image.new("RGB", (width, height + bar_px), _BAR)
-    whole.paste(_legend(view, tuple((edge.name, edge.colour) for edge in edges), bar_px), (0, 0))
     whole.paste(small, (0, bar_px))
-    _numbers(ImageDraw.Draw(whole), view, edges, frame, time_ms)
+    _write_bar(ImageDraw.Draw(whole), view, edges, frame, time_ms)
     return np.asarray(whole)
 
 
@@ -297,21 +290,23 @@ def _scale_bar(pen: ImageDraw, view: ClipView) -> None:
     pen.text((left, bottom - thick - 3), f"{length_mm:g} mm", font=_font(view.line_px), **style)
 
 
-@lru_cache(maxsize=2)
-def _legend(view: ClipView, names: tuple[tuple[str, str], ...], bar_px: int) -> Image:
-    """The constant part of the bar above; numbers are written over it."""
-    from PIL import Image, ImageDraw
-
-    width, line_px = view.picture_px[0], view.line_px
-    bar = Image.new("RGB", (width, bar_px), _BAR)
-    pen = ImageDraw.Draw(bar)
-    for i, (name, colour) in enumerate(names):
-        y, words = view.row_y(i), _shortened(name, 0.42 * width, _font(line_px))
-        pen.line([(line_px, y), (2.6 * line_px, y)], fill=colour, width=max(line_px // 4, 3))
-        pen.text((3.2 * line_px, y), words, font=_font(line_px), fill=_BAR_INK, anchor="lm")
-    title = _shortened(view.title, 0.3 * width, _font(line_px, True))
-    pen.text((width - line_px, view.row_y(0)), title, font=_font(line_px, True), fill=_BAR_INK, anchor="rm")
-    return bar
+def _write_bar(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time_ms: float) -> None:
+    """Write names and errors of the edges at the left of the bar above, the title and the time at its right."""
+    width, line_px, font, bold = view.picture_px[0], view.line_px, _font(view.line_px), _font(view.line_px, True)
+    for i, edge in enumerate(edges):
+        y = view.row_y(i)
+        pen.line([(line_px, y), (2.6 * line_px, y)], fill=edge.colour, width=max(line_px // 4, 3))
+        pen.text((3.2 * line_px, y), _shortened(edge.name, 0.42 * width, font), font=font, fill=_BAR_INK, anchor="lm")
+        if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
+            words = f"{st.with_minus(edge.off_mm[frame], '+.1f')} mm"
+            pen.text((0.6 * width, y), words, font=font, fill=_BAR_INK, anchor="rm")
+    right, title = width - line_px, _shortened(view.title, 0.3 * width, bold)
+    pen.text((right, view.row_y(0)), title, font=bold, fill=_BAR_INK, anchor="rm")
+    words = f"frame {frame}"
+    if math.isfinite(time_ms):
+        before = " (before release)" if time_ms < 0 else ""
+        words = f"{st.with_minus(time_ms, '.1f')} ms{before}, {view.slowed:.3g} times slower"
+    pen.text((right, view.row_y(1)), words, font=font, fill=_GREY, anchor="rm")
 
 
 def _shortened(text: str, room_px: float, font: FreeTypeFont) -> str:
@@ -320,19 +315,6 @@ def _shortened(text: str, room_px: float, font: FreeTypeFont) -> str:
     while text and font.getlength(text + "…") > room_px:
         text = text[:-1]
     return text.rstrip() + "…"
-
-
-def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time_ms: float) -> None:
-    width, font = view.picture_px[0], _font(view.line_px)
-    for i, edge in enumerate(edges):
-        if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
-            words = f"{st.with_minus(edge.off_mm[frame], '+.1f')} mm"
-            pen.text((0.6 * width, view.row_y(i)), words, font=font, fill=_BAR_INK, anchor="rm")
-    words = f"frame {frame}"
-    if math.isfinite(time_ms):
-        before = " (before release)" if time_ms < 0 else ""
-        words = f"{st.with_minus(time_ms, '.1f')} ms{before}, {view.slowed:.3g} times slower"
-    pen.text((width - view.line_px, view.row_y(1)), words, font=font, fill=_GREY, anchor="rm")
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:

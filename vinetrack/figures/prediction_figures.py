@@ -101,14 +101,12 @@ def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str
     if len(drawn) == 1:
         _draw_shares(axes[1, 1], drawn[0])
     else:
-        ax = axes[1, 1]  # the condition of each colour, instead of the bars
-        ax.set_axis_off()
-        for k, (colour, title) in enumerate(zip(st.VINE_COLOURS, titles, strict=False)):
-            y = 0.97 - 0.155 * k
-            ax.plot([0.0, 0.07], [y - 0.025] * 2, color=colour, lw=3, transform=ax.transAxes, clip_on=False)
-            ax.text(0.1, y, textwrap.fill(title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
+        named = zip(st.VINE_COLOURS, titles, strict=False)  # the condition of each colour, instead of the bars
+        keys = [st.line_key(textwrap.fill(title, 50), color=colour, lw=3) for colour, title in named]
         if (n_more := len(titles) - len(st.VINE_COLOURS)) > 0:
-            ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=st.MUTED)
+            keys.append(st.line_key(f"and {n_more} more, not drawn", ls="none"))
+        axes[1, 1].set_axis_off()
+        axes[1, 1].legend(handles=keys, loc="upper left", fontsize=9.2, labelspacing=1.0, borderaxespad=0.0)
     title = titles[0] if len(drawn) == 1 else f"{len(titles)} conditions"
     fig.text(0.075, 0.955, title, fontweight="bold", fontsize=st.fitting_size(title, 0.9 * 72 * width_in, 12))
     words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
@@ -233,9 +231,8 @@ def draw_power(power: Power) -> Figure | None:
     ])  # fmt: skip
     fig = st.new_figure(9.6, 0.31 * n + 1.75)
     ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
-    edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, n_columns + 1)
     shades = LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", st.BLUE, "#003f66"])
-    mesh = ax.pcolormesh(edges, np.arange(n + 1) - 0.5, probabilities, cmap=shades, vmin=0, vmax=1, rasterized=True)
+    mesh = ax.pcolormesh(parts, np.arange(n), probabilities, cmap=shades, vmin=0, vmax=1, rasterized=True)
     ax.set(xscale="log", xlim=(least, most), ylim=(n - 0.5, -0.5), xlabel="size relative to the largest plausible")
     ax.grid(visible=False)
     ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])

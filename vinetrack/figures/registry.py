@@ -8,7 +8,7 @@ as attributes. A function without anything to show returns None, and the figure 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -176,9 +176,12 @@ class FigureTables:
 
     @cached_property
     def trajectories(self) -> dict[str, pd.DataFrame]:
-        """Measurement and models by condition, with the final model if effects were added."""
+        """Measurement and models by condition, with `model_after_m` of the final model if effects were added."""
         tables = {name: read_result(self.results.trajectories(name)) for name in self.comparison["condition"]}
-        return with_final_model(tables, self.diagnosed)
+        if self.diagnosed is None or not self.diagnosed.added:
+            return tables
+        after = self.diagnosed.trials[["trial", "time_s", "model_after_m"]]
+        return {name: table.merge(after, "left", ["trial", "time_s"]) for name, table in tables.items()}
 
     @property
     def curves(self) -> pd.DataFrame:
@@ -200,45 +203,23 @@ class FigureTables:
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
     """Add pressure and a short label of the condition to `trials.csv`, for the panels of the overview."""
-    by_name: dict[str, Any] = {trial.name: trial for trial in known}
+    by_name = {trial.name: trial for trial in known}
     labels, pressures = [], []
-    for row in trials.itertuples():
-        trial = by_name.get(str(row.trial))
-        if trial is None:
-            labels.append(str(row.condition) or "not readable")
-            pressures.append(float("nan"))
-            continue
-        labels.append(", ".join([f"{1e3 * trial.diameter_m:g} mm", *features(trial)[1:]]))
-        pressures.append(1e-3 * trial.pressure_Pa)
+    for name, condition in zip(trials["trial"], trials["condition"], strict=True):
+        trial = by_name.get(str(name))
+        size = f"{1e3 * trial.diameter_m:g} mm" if trial else str(condition) or "not readable"
+        labels.append(", ".join([size, *(features(trial)[1:] if trial else ())]))
+        pressures.append(1e-3 * trial.pressure_Pa if trial else float("nan"))
     return trials.assign(condition_label=labels, pressure_kPa=pressures)
 
 
 def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
     """Add vine and label of each condition to `comparison.csv`, sorted by vine and then pressure."""
-    first = described.drop_duplicates("condition").set_index("condition")
-    vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
-    labelled = comparison[comparison["condition"].isin(first.index)]
-    labels = first.loc[labelled["condition"]]
-    table = labelled.assign(vine=labels["vine"].to_numpy(), condition_label=labels["condition_label"].to_numpy())
-    order = sorted(range(len(table)), key=lambda i: (vines[table["vine"].iloc[i]], labels["pressure_kPa"].iloc[i]))
-    return table.iloc[order].reset_index(drop=True)
-
-
-def with_final_model(
-    trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None
-) -> dict[str, pd.DataFrame]:
-    """Add the positions of the final model, `model_after_m`, m, to trajectories of as many rows."""
-    if diagnosed is None or not diagnosed.added or not len(diagnosed.trials):
-        return dict(trajectories)
-    final_m = {
-        str(trial): part["model_after_m"].to_numpy() for trial, part in diagnosed.trials.groupby("trial", sort=False)
-    }
-    extended = {}
-    for condition, table in trajectories.items():
-        parts = [final_m.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
-        after_m = np.concatenate(parts)
-        extended[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
-    return extended
+    first = described.drop_duplicates("condition")[["condition", "vine", "condition_label", "pressure_kPa"]]
+    place = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
+    table = comparison.merge(first, on="condition")
+    table = table.assign(place=table["vine"].map(place))
+    return table.sort_values(["place", "pressure_kPa"], kind="stable", ignore_index=True)
 
 
 def describe_trial(trial: Trial) -> str:

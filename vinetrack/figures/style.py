@@ -12,7 +12,6 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -53,19 +52,12 @@ class VineStyle:
     marker: str
 
 
-@cache
-def _settings() -> Any:
-    from matplotlib import rc_params_from_file
-
-    return rc_params_from_file(Path(__file__).with_name("figures.mplstyle"), use_default_template=False)
-
-
 @contextmanager
 def look() -> Iterator[None]:
     """Context manager that applies the project's matplotlib settings and restores the former ones."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_settings()):
+    with mpl.rc_context(fname=Path(__file__).with_name("figures.mplstyle")):
         yield
 
 

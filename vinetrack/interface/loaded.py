@@ -414,9 +414,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
         curves.append(pd.DataFrame({**of_trial, **positions}))
     trials = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=list(CURVE_COLUMNS))
     conditions = _described([fitted.trial for fitted in shown.fits[0].trials] if shown.fits else [])
-    tables = diagnosis_tables(shown)
-    names = ("along_position.csv", "drift_groups.csv", "missing_force.csv", "learned_force.csv")
-    return assemble_tables(shown, conditions, trials, *(tables.get(name, pd.DataFrame()) for name in names))
+    return assemble_tables(shown, conditions, trials, diagnosis_tables(shown))
 
 
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:

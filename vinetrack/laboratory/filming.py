@@ -58,7 +58,11 @@ def _write_video(renderer: FrameRenderer, path: Path) -> None:
         stream.width, stream.height, stream.pix_fmt = scene.camera.width_px, scene.camera.height_px, pixel_format
         stream.codec_context.thread_count = 1
         if is_h264:
-            stream.options = {"preset": "superfast", "bf": "0", "sc_threshold": "0", **_rate(scene)}
+            rate = {"crf": str(encoding.crf)}
+            if encoding.bitrate_Mbit_s is not None:
+                per_s = f"{encoding.bitrate_Mbit_s * 1000:.0f}k"
+                rate = {"b": per_s, "maxrate": per_s, "bufsize": per_s}
+            stream.options = {"preset": "superfast", "bf": "0", "sc_threshold": "0", **rate}
             stream.gop_size = encoding.gop
             stream.codec_context.color_range = 1  # levels of 16…235
         for index in range(renderer.n_frames):
@@ -69,13 +73,6 @@ def _write_video(renderer: FrameRenderer, path: Path) -> None:
             picture.pts = index
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
-
-
-def _rate(scene: Scene) -> dict[str, str]:
-    if scene.encoding.bitrate_Mbit_s is None:
-        return {"crf": str(scene.encoding.crf)}
-    rate = f"{scene.encoding.bitrate_Mbit_s * 1000:.0f}k"
-    return {"b": rate, "maxrate": rate, "bufsize": rate}
 
 
 def _chroma(scene: Scene) -> tuple[Frame, Frame]:
@@ -126,6 +123,8 @@ def make_filming(content: dict[str, Any]) -> Filming:
 
 def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -> Truth:
     """Film one simulated trial, with a tube of the stated size; its truth is returned and not written."""
+    from scipy.interpolate import PchipInterpolator
+
     stated, scene = trial.stated, preset(filming.scene)
     subject, capture_fps = scene.subject, stated.capture_fps
     if isinstance(subject, Tube):
@@ -135,9 +134,9 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
     scene = replace(scene, subject=subject, camera=filming.camera, exposure_fraction=filming.exposure_fraction)
     n_frames = int(trial.track.time_s.size)
     time_s = np.linspace(0.0, n_frames / capture_fps, 8 * n_frames + 1)  # 8 samples a frame (chosen)
-    motion = time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m
+    moved = PchipInterpolator(time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m)
     how: dict[str, Any] = {"n_frames": n_frames, "capture_fps": capture_fps, "out_path": out_path, "seed": seed}
-    return render_recording(scene, motion, **how)
+    return render_recording(scene, lambda at_s: moved(np.minimum(at_s, time_s[-1])), **how)
 
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:

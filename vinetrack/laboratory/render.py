@@ -308,8 +308,6 @@ def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> 
 # ------------------------------------------------------------------------------
 # Compiled loops of the renderer: tube, ball and sensor, one pass each over the pixels that it touches.
 
-Whole = NDArray[np.int64]
-
 NORMAL_BITS = 12  # Bits of a random number per normal deviate (chosen)
 
 
@@ -369,15 +367,15 @@ def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, s
 
 @njit(fastmath=True, nogil=True)
 def shade_tube(
-    out: Image, along: Image, across: Image, first_x: Whole, last_x: Whole, shift_along: float, shift_across: float,
+    out: Image, along: Image, across: Image, shift_along: float, shift_across: float,
     tip_px: float, sway: float, sway_length: float, table: Image, table_first: float, table_step: float, fold_row: int,
-    setback: Floats, slope_row: Whole, side: Image, core: Image, per_px: int, transmission: Image, glow: Image,
-    girth: Image, tail: Image, tail_from: float, tail_to: float, tail_end: float, tail_opacity: float,
+    setback: Floats, slope_row: NDArray[np.int64], side: Image, core: Image, per_px: int, transmission: Image,
+    glow: Image, girth: Image, tail: Image, tail_from: float, tail_to: float, tail_end: float, tail_opacity: float,
     tail_level: float, tail_contrast: float, fold_glow: float, ghost: float, ghost_across: float,
 ) -> None:  # fmt: skip
     """Draw the tube over `out`, in place. For each pixel: the mirror image is added, the tail is laid over the
     backdrop, then the film over both, in proportion to the coverage by the moving edge. Shapes: out, along, across
-    (height, width); first_x, last_x (height,).
+    (height, width).
     """
     half_profile = (setback.size - 1) // 2
     reach = (half_profile - 1) / per_px
@@ -387,7 +385,7 @@ def shade_tube(
     columns = transmission.shape[1]
     n = table.shape[1]
     for y in range(out.shape[0]):
-        for x in range(first_x[y], last_x[y]):
+        for x in range(out.shape[1]):
             u = along[y, x] - shift_along
             v = across[y, x] - shift_across
             grown = min(max(u / sway_length, 0.0), 1.5)
@@ -446,20 +444,21 @@ def shade_tube(
 @njit(fastmath=True, nogil=True)
 def shade_ball(
     out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
-    radius_px: float, sigma_px: float, surface: Image, box: Whole, min_along: float,
+    radius_px: float, sigma_px: float, surface: Image, min_along: float,
 ) -> None:  # fmt: skip
-    """Draw a ball over `out` within `box`, averaged over its positions `path_px` during the exposure. Shapes: out,
-    along, across (height, width); path_px (n_pieces,).
+    """Draw a ball over `out`, averaged over its positions `path_px` during the exposure. Shapes: out, along, across
+    (height, width); path_px (n_pieces,).
     """
     half = (surface.shape[0] - 1) // 2
-    for y in range(box[1], box[3]):
-        for x in range(box[0], box[2]):
+    first, last = path_px.min() - half, path_px.max() + half
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
             v = across[y, x] - shift_across
-            if abs(v) >= half - 1:
+            place = along[y, x] - shift_along
+            if abs(v) >= half - 1 or place < first or place > last:
                 continue
             coverage_sum = 0.0
             light_sum = 0.0
-            place = along[y, x] - shift_along
             for k in range(path_px.size):
                 u = place - path_px[k]
                 inside = (radius_px - math.sqrt(u * u + v * v)) / sigma_px
@@ -520,15 +519,7 @@ def expose(
 #
 # All positions are in plane pixels (see `camera`), all times in seconds from the start of the first exposure.
 
-Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]  # Lead position in metres against time in seconds
-
-
-def _interpolated(time_s: Floats, lead_position_m: Floats) -> Callable[[Floats], Floats]:
-    """A sampled motion as a function: monotone cubics (PCHIP), constant outside."""
-    from scipy.interpolate import PchipInterpolator
-
-    cubic = PchipInterpolator(time_s, lead_position_m)
-    return lambda at_s: np.asarray(cubic(np.clip(at_s, time_s[0], time_s[-1])))
+Motion = Callable[[Floats], Floats]  # Lead position in metres against time in seconds
 
 
 class SceneMotion:
@@ -538,7 +529,7 @@ class SceneMotion:
         self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float, seed: int
     ) -> None:
         self.scene, self.capture_fps, self.exposure_s = scene, capture_fps, exposure_s
-        self._position_m = motion if callable(motion) else _interpolated(*motion)
+        self._position_m = motion
         grid_s = np.arange(0, (n_frames + 1) * 10) / (10 * capture_fps)
         lead_m = np.asarray(self._position_m(grid_s), dtype=float)
         moving = np.flatnonzero(lead_m > lead_m[0] + 1e-5)
@@ -670,15 +661,6 @@ class TubeLayer:
         self._tail = tail_sums(self._tube, rng, radius, period_px=4096)
         self._profiles = tip_profiles(self._tube, radius, self._psf_px)
         self._ghost_across = 1.35 * radius
-        shake = 4 * scene.shake_px
-        reach = radius + 8 + 2.3 * abs(self._tube.wobble_px) + shake
-        touched = np.abs(maps.across) < reach
-        if self._tube.reflection:
-            touched |= np.abs(maps.across - self._ghost_across) < reach
-        touched &= maps.along > -4 - shake
-        # First and one-past-last column of each row that the tube may touch, equal where it touches none.
-        in_row, last = touched.any(axis=1), touched.shape[1] - touched[:, ::-1].argmax(axis=1)
-        self._first_x, self._last_x = np.where(in_row, touched.argmax(axis=1), 0), np.where(in_row, last, 0)
         self._payload: BallLayer | None = None
         if self._tube.payload_diameter_m:
             size_m, brightness = self._tube.payload_diameter_m, 2 * self._tube.payload_brightness
@@ -700,7 +682,7 @@ class TubeLayer:
         # Averaged over one pixel at least, so that the tail's texture is as soft at rest as in motion.
         slack = max(0.0, 1.0 - (tail_to - tail_from)) / 2
         shade_tube(
-            light, self._maps.along, self._maps.across, self._first_x, self._last_x, *shift, tip,
+            light, self._maps.along, self._maps.across, *shift, tip,
             scene_motion.sway_px(middle_s), scene_motion.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
             setback, slope_row, side, core, PROFILE_PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
             tail_to + slack,
@@ -766,23 +748,10 @@ class BallLayer:
         ends = self._centre_px(begin_s + np.array([0, span_s]))
         pieces = int(min(max(math.ceil(abs(ends[1] - ends[0]) / 0.7), 3), 80))
         path = self._centre_px(begin_s + span_s * (np.arange(pieces) + 0.5) / pieces)
-        box = self._box(path, max(abs(part) for part in shift), (light.shape[0], light.shape[1]))
-        if box[2] > box[0] and box[3] > box[1]:
-            shade_ball(
-                light, self._maps.along, self._maps.across, *shift, path, self._radius_px, scene_motion.scene.psf_px,
-                self._surface, box, self._from_px,
-            )  # fmt: skip
-
-    def _box(self, path: Floats, shake: float, shape: tuple[int, int]) -> NDArray[np.int64]:
-        """Columns and rows (x0, y0, x1, y1) that the ball can touch."""
-        scene = self._motion.scene
-        reach = 1.15 * (self._radius_px + 6) + 1.5 * shake
-        ends = np.array([path.min(), path.max()])[:, None] * np.array(scene.direction) + np.array(scene.origin)
-        corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * reach
-        seen = scene.camera.picture_from_plane(ends[:, None, :] + corners).reshape(-1, 2)
-        (x0, y0), (x1, y1) = np.floor(seen.min(axis=0)), np.ceil(seen.max(axis=0))
-        limits = [max(x0, 0), max(y0, 0), min(x1, shape[1]), min(y1, shape[0])]
-        return np.array(limits).astype(np.int64)
+        shade_ball(
+            light, self._maps.along, self._maps.across, *shift, path, self._radius_px, scene_motion.scene.psf_px,
+            self._surface, self._from_px,
+        )  # fmt: skip
 
 
 class DoorLayer:
@@ -897,16 +866,9 @@ class FrameRenderer:
         rng = np.random.default_rng([self.seed, 0])
         self._canvas = backdrop_canvas(self.scene, rng, (y1 - y0 + 1, x1 - x0 + 1), (x0, y0))
         self._canvas_x, self._canvas_y = maps.plane_x - np.float32(x0), maps.plane_y - np.float32(y0)
-        target, psf_px = self.scene.target, self.scene.psf_px
-        if target is not None and self.scene.shake_px:
-            across, down = np.meshgrid(np.arange(x0, x1 + 1), np.arange(y0, y1 + 1))
-            offset_px = np.stack([across, down], axis=-1) - np.array(self.scene.camera.centre_px)
-            self._canvas = lay_target(self._canvas, target, offset_px * self.scene.camera.m_per_px, psf_px)
         #: radiance of the static scene, shape (height, width)
         self.still = np.empty(maps.plane_x.shape, dtype=np.float32)
         sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self.still)
-        if target is not None and not self.scene.shake_px:
-            self.still = lay_target(self.still, target, plane_seen(self.scene.camera), psf_px)
 
     def _prepare_sensor(self) -> None:
         """Prepare the gain of every pixel (vignetting, fixed pattern), and normal deviates."""

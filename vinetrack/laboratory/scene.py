@@ -229,13 +229,11 @@ class Scene:
     camera: Camera = field(default_factory=Camera)
     subject: Tube | Ball = field(default_factory=Tube)
     door: Door | None = field(default_factory=Door)
-    target: Target | None = None
     backdrop: Backdrop = field(default_factory=Backdrop)
     light: Light = field(default_factory=Light)
     sensor: Sensor = field(default_factory=Sensor)
     encoding: Encoding = field(default_factory=Encoding)
     growth_angle_deg: float = 0.0
-    origin_px: tuple[float, float] | None = None
     start_m: float = 0.012
     psf_px: float = 0.75
     shake_px: float = 0.0
@@ -249,9 +247,7 @@ class Scene:
 
     @property
     def origin(self) -> tuple[float, float]:
-        """Start of the path, plane pixels: `origin_px`, or 60 px inside the border, upstream of the middle."""
-        if self.origin_px is not None:
-            return self.origin_px
+        """Start of the path, plane pixels: 60 px inside the border, upstream of the middle."""
         cx, cy = self.camera.centre_px
         ux, uy = self.direction
         reach = min((cx - 60) / abs(ux) if abs(ux) > 1e-9 else math.inf, (cy - 60) / abs(uy) if abs(uy) > 1e-9 else 1e9)

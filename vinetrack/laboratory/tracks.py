@@ -27,7 +27,6 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
 from vinetrack.tracks.position_noise import ar1_noise
 
-BASE = BASE_EFFECTS
 DAMPING = "eversion_damping.B"
 
 
@@ -38,7 +37,7 @@ class GroundTruth:
     pressures.
     """
 
-    effects: tuple[str, ...] = BASE
+    effects: tuple[str, ...] = BASE_EFFECTS
     values: Mapping[str, Value] = field(default_factory=dict)
     damping_scatter: float = 0.03
     pressure_scatter: float = 0.01
@@ -153,10 +152,6 @@ def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str 
 # ------------------------------------------------------------------------------
 # Campaigns: vines, pressures, payloads and number of replicates. The published ones are in `data/paper`.
 
-CAPTURE_FPS = published.CAPTURE_FPS
-PAPER_B = published.DAMPING_B
-PAPER_N = published.EXPONENT
-
 
 @dataclass(frozen=True)
 class Vine:
@@ -167,7 +162,9 @@ class Vine:
     length_mm: float
     yield_pressure_kPa: float = 3.0
 
-    def trial(self, name: str, pressure_kPa: float, payload_g: float = 0.0, capture_fps: float = CAPTURE_FPS) -> Trial:
+    def trial(
+        self, name: str, pressure_kPa: float, payload_g: float = 0.0, capture_fps: float = published.CAPTURE_FPS
+    ) -> Trial:
         """Make one trial with this vine."""
         return Trial(
             name=name,
@@ -203,5 +200,5 @@ def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | floa
     """True parameters for the isometric vines among these trials: the printed B by vine, the printed n. Returns values
     as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
     """
-    by_vine = {trial.vine: PAPER_B[round(trial.diameter_m / 6e-3)] for trial in trials}
-    return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}
+    by_vine = {trial.vine: published.DAMPING_B[round(trial.diameter_m / 6e-3)] for trial in trials}
+    return {"eversion_damping.B": by_vine, "eversion_damping.n": published.EXPONENT}

@@ -133,7 +133,7 @@ def exchanged(
         before = best
         for k in range(len(design)):
             values = worth_with(design[:k] + design[k + 1 :])
-            if np.max(values) > 1.005 * best:  # a gain, not rounding
+            if np.max(values) > (1 + 1e-6) * best:  # a gain, not rounding
                 design[k], best = int(allowed[int(np.argmax(values))]), float(np.max(values))
         if best <= before:
             break
