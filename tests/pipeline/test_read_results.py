@@ -143,7 +143,7 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of_and_without_one_t
             assert len(getattr(found, diagnosis_figures()[name].data)) > 0
     for name, content in (("none", None), ("refused", refused())):
         assert drawn.read_diagnosis_tables(folder(tmp_path / name, content), conditions()) is None
-    assert not any(draw(name, pictures.DiagnosisTables()) for name in diagnosis_figures())
+    assert not any(draw(name, drawn.DiagnosisTables()) for name in diagnosis_figures())
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path):
