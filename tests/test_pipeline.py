@@ -4,6 +4,7 @@ import csv
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -131,6 +132,13 @@ def test_the_files_are_those_people_rely_on_and_nothing_is_left_to_do(campaign):
     assert again.returncode == 0
     assert "Nothing to be done" in again.stderr
     assert again.stdout.strip().splitlines()[-1] == done.stdout.strip().splitlines()[-1]
+    # Run from elsewhere, Snakemake knows nothing of the run before; results of another version are still told.
+    shutil.rmtree(results.parents[1] / ".snakemake" / "metadata")
+    for version, is_due in ((None, False), ("another", True)):
+        if version:
+            (results / "logs" / "version").write_text(version)
+        planned = snakemake(results.parents[1], "-n", "--config", "experiment=my vines (1)")
+        assert ("Nothing to be done" not in planned.stdout + planned.stderr) == is_due
 
 
 @through_snakemake

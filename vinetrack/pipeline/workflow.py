@@ -189,9 +189,15 @@ class WorkflowPlan:
     published: bool
 
     @property
-    def version(self) -> str:
-        """Hash of the package, whose edit reruns everything, and the state of inputs that Snakemake cannot watch."""
-        return f"{code_hash()} {self.unwatched}"
+    def version_file(self) -> str:
+        """A file of the results that changes with the package, which reruns everything, and with inputs that Snakemake
+        cannot watch. Parameters of rules would not do: Snakemake compares them only with what it ran from the same
+        folder, and `snakemake` and `vinetrack run` run from different ones.
+        """
+        path, version = self.results / "logs" / "version", f"{code_hash()} {self.unwatched}"
+        if not path.exists() or path.read_text(encoding="utf-8") != version:
+            write_text(path, version)
+        return path.as_posix()
 
     @property
     def jobs(self) -> dict[str, tuple[str, Stage, Sequence[str]]]:
