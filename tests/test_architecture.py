@@ -37,7 +37,7 @@ BUDGETS = {
     "kinematics": (1811, 6, 12),
     "laboratory": (1734, 6, 9),
     "narrative": (1874, 3, 12),
-    "pages": (3363, 8, 24),
+    "pages": (3360, 8, 24),
     "paper": (842, 3, 15),
     "pipeline": (3033, 10, 13),
     "planning": (2147, 4, 18),

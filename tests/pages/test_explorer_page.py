@@ -35,7 +35,7 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_data import FitError
 from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.pages import controls
-from vinetrack.pages.campaign import BackgroundFit, Campaign, choice_in_use, commands, predict_choice, slider_range
+from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, commands, predict_choice, slider_range
 from vinetrack.pages.page import Page, open_campaign, start_server
 from vinetrack.pages.page import address as where
 from vinetrack.pages.plots import RecordingView, decode, recording_view
@@ -524,3 +524,14 @@ def test_no_route_answers_under_another_name_or_without_the_secret():
             assert status(where(server) + route, name) == 403
         assert status(f"http://127.0.0.1:{port}/{route}", f"127.0.0.1:{port}") == 404
     server.stop()
+
+
+def test_what_a_stopped_job_has_yet_to_tell_is_not_told():
+    queued, told = [], []
+    job = Job(lambda _: "an old fit", print, lambda *outcome: told.append(outcome), queued.append)
+    job.wait()
+    job.cancel()
+    for call in queued:
+        call()
+    assert len(queued) == 1
+    assert told == []

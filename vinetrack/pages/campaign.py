@@ -515,8 +515,11 @@ class Job(Generic[Progress, Outcome]):
         except Exception:
             log.exception("a job of the explorer")
             reason = "A fault of the program, not of your data: --log FILE of vinetrack explore keeps the traceback."
-        if not self._cancelled.is_set():
-            self._soon(partial(self._on_end, outcome, reason))
+        self._soon(partial(self._tell, outcome, reason))
+
+    def _tell(self, outcome: Outcome | None, reason: str) -> None:
+        if not self._cancelled.is_set():  # as it may have been while it waited to be called
+            self._on_end(outcome, reason)
 
     def _watch(self, step: Progress) -> None:
         if self._cancelled.is_set():

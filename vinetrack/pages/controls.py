@@ -304,8 +304,6 @@ class ProposalPanel:
         self._task = task
 
     def _done(self, outcome: tuple[WrittenProposal, Campaign, ModelChoice] | None, reason: str) -> None:
-        if self._job is None:
-            return
         if outcome is None:
             self._ended(f'<p class="bad">{escape(reason)}</p>')
             return

@@ -441,8 +441,6 @@ class Page:
         self._soon(self._update_text, TEXT_MS)
 
     def _fit_ended(self, fitted: Fitted | None, reason: str) -> None:
-        if self._job is None:
-            return
         if fitted is not None:
             self._job = None
             self.fits.append(fitted)

@@ -572,8 +572,6 @@ class FilmPanel:
             self.caption.text = progress_bar(share, f"decoding {view.path.name}: {count} frames")
 
     def _decoded(self, view: RecordingView, film: Film | None, reason: str) -> None:
-        if view is not self._view:
-            return
         self._job, self._film = None, film
         if film is None:
             self._show_track(reason)
