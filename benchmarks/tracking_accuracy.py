@@ -259,7 +259,7 @@ def plain_rows(seeds: list[int], folder: Path) -> list[Row]:
             n = len(scene.frames)
             truth = Truth(
                 np.arange(n) / CAPTURE_FPS, scene.edge_px, scene.edge_px, tips[:, 0], tips[:, 1],
-                np.ones(n, bool), 1.0, 0.0, CAPTURE_FPS, plan.exposure / CAPTURE_FPS,
+                np.ones(n, bool), 0.0, plan.exposure / CAPTURE_FPS,
             )  # fmt: skip
             rows.append(measure(f"plain_{name}_{seed}", path, truth, 2.0)[0])
     return rows
