@@ -39,7 +39,7 @@ BUDGETS = {
     "narrative": (1874, 3, 12),
     "pages": (3360, 8, 24),
     "paper": (842, 3, 15),
-    "pipeline": (3033, 10, 13),
+    "pipeline": (3028, 10, 13),
     "planning": (2147, 4, 18),
     "report": (747, 2, 3),
     "results": (251, 2, 8),

@@ -479,7 +479,7 @@ def verdict_line(diagnosis: Diagnosis) -> str:
 
 def _headline(diagnosis: Diagnosis) -> str:
     if diagnosis.odd_trials or diagnosis.contradicted_columns:
-        return verdict_sentence(diagnosis).rstrip(".").replace("The measurements", "the measurements")
+        return verdict_sentence(diagnosis).rstrip(".")
     if diagnosis.verdict == MISSING:
         return joined(list(diagnosis.effects)) + (" is missing" if len(diagnosis.effects) == 1 else " are missing")
     if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:

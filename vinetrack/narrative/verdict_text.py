@@ -149,7 +149,7 @@ def listed_names(names: Sequence[str], last: str = "and") -> str:
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence; what contradicts the sheet in its place, since any verdict rests on it."""
     if diagnosis.contradicted_columns:
-        return f"The measurements contradict the sheet in {joined(diagnosis.contradicted_columns)}: correct that first."
+        return f"{joined(diagnosis.contradicted_columns)} in the sheet cannot fit the measurements: correct it first."
     verdict, answers = diagnosis.verdict, list(diagnosis.answer_set)
     added = list(diagnosis.effects)
     if verdict == MISSING:

@@ -272,9 +272,9 @@ class ProposalPanel:
 
     def show(self) -> None:
         """Update after a change of the diagnosis, and as time passes."""
-        diagnosis = self._page.diagnosis
-        unexplained = diagnosis is not None and UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
-        unexplained &= diagnosis is not None and not diagnosis.contradicted_columns
+        unexplained = False
+        if (diagnosis := self._page.diagnosis) is not None and not diagnosis.contradicted_columns:
+            unexplained = UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
         self.root.visible = self._job is not None or self._outcome is not None or unexplained
         if self._job is not None:
             passed_s = time.monotonic() - self._begun_s

@@ -34,7 +34,7 @@ from vinetrack.report.build import (
     paper_section,
     tally,
 )
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,10 +78,7 @@ def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings
 def compare_with_paper(job: Job) -> list[str]:
     """Write `paper.csv`, and the tables and figures of the comparison."""
     experiment, results = job.experiment, Results(job.results)
-    kind = experiment.settings.published
-    if kind is None:
-        raise ResultsError("experiment.yaml has no key `published`: set it to `simulated` or `measured`")
-    mark = paper.SIMULATED if kind == "simulated" else paper.MEASURED
+    mark = paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED
     tables = _tables(experiment, results)
     measured = paper.ExperimentResults(
         mark=mark,

@@ -23,6 +23,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
+from vinetrack.core.records import Track
 from vinetrack.core.tables import write_bytes
 
 if TYPE_CHECKING:
@@ -253,8 +256,6 @@ def _read(path: Path) -> bytes:
 
 def packed(tracking: Tracking) -> bytes:
     """A tracking in pixels as a file of arrays without pickled objects."""
-    import numpy as np
-
     from vinetrack.video.curved_axis import axis_entry
 
     track, ending = tracking.track, tracking.ending
@@ -277,9 +278,6 @@ def packed(tracking: Tracking) -> bytes:
 
 def unpacked(data: bytes) -> Tracking:
     """Read what `packed` wrote."""
-    import numpy as np
-
-    from vinetrack.core.records import Track
     from vinetrack.video.curved_axis import axis_from_entry
     from vinetrack.video.point_quality import Ending
     from vinetrack.video.track import Tracking
