@@ -166,16 +166,23 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20(trials, scatter
     assert 0.92 < np.mean(held) < 0.99
 
 
-def test_systematic_errors_that_imitate_a_shape_are_integrated_out():
+def test_systematic_errors_that_imitate_a_shape_are_integrated_out(monkeypatch):
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
-    together = scores(np.random.default_rng(20609), 12, 5)
-    turn = score_test._marginalisation(together.information, 3)
-    score, information = score_test._marginalised(together.score, together.information, turn)
-    A, B, C = together.information[:3, :3], together.information[:3, 3:], together.information[3:, 3:]
-    inner = np.linalg.inv(C + np.eye(2))
-    assert information == pytest.approx(A - B @ inner @ B.T)
-    assert score == pytest.approx(together.score[:3] - B @ inner @ together.score[3:])
-    assert (together.trial_scores @ turn).sum(axis=0) == pytest.approx(score)
+    columns = np.random.default_rng(20609).standard_normal((12, 40, 6))  # two errors, the residual, three shapes
+    blocks = np.swapaxes(columns, 1, 2) @ columns
+    places = np.tile([0, 1], (12, 1))
+    monkeypatch.setattr(score_test, "products_without_trial_effects", lambda *_: blocks)
+    arrays = {"prior_mean": np.zeros(2), "prior_precision": np.ones(2), "free": np.ones(2, dtype=bool)}
+    problem = SimpleNamespace(places=places, places_of_pairs=np.tile([0, 1, 3, 4], 12), **arrays)
+    products = SimpleNamespace(problem=problem, n_unknowns=2, n_shapes=3)
+    state = marginal_likelihood.FitState(np.zeros(0), np.zeros((12, 4)), (1e-5, 1e-5), 0.0, np.ones(12))
+    found = score_test.projected(SimpleNamespace(numbers=()), products, state)
+    total = blocks.sum(axis=0)
+    A, B, C, inner = total[3:, 3:], total[3:, :2], total[:2, :2], np.linalg.inv(total[:2, :2] + np.eye(2))
+    assert np.linalg.eigvalsh(C).min() > 1
+    assert found.information == pytest.approx(A - B @ inner @ B.T)
+    assert found.score == pytest.approx(total[3:, 2] - B @ inner @ total[:2, 2])
+    assert (found.fitted, found.step_of_fit.tolist()) == (0, [0.0, 0.0])
 
 
 def number_of(key: str, value: float, sigma: float) -> fit_result.Number:
@@ -269,15 +276,14 @@ def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_ada
     columns = np.random.default_rng(5).standard_normal((n, 4))  # two parameters, the residual, one effect
     columns[:, 2] += 3 * columns[:, 1] + 0.5 * columns[:, 3]
     blocks = (columns.T @ columns)[None]
-    monkeypatch.setattr(score_test, "products_without_trial_effects", lambda *given: blocks / given[2].variance[0])
+    monkeypatch.setattr(score_test, "products_without_trial_effects", lambda _, state: blocks / state.variance[0])
     arrays = {"index": [[0, 1]], "places": [[0, 1]], "places_of_pairs": [0, 1, 3, 4], "points": [float(n)]}
     arrays |= {"prior_mean": np.zeros(2), "prior_precision": np.zeros(2), "free": [True, True]}
     problem = SimpleNamespace(**{name: np.array(values) for name, values in arrays.items()})
     state = marginal_likelihood.FitState(np.zeros(2), np.zeros((1, 4)), (1e-5, 1e-5), 0.0, np.ones(1))
     numbers = [SimpleNamespace(bound=math.nan), SimpleNamespace(bound=bound)]
     fit = SimpleNamespace(solution=SimpleNamespace(state=state, problem=problem), numbers=numbers)
-    sizes = {"n_keys": 2, "n_shapes": 1, "n_tested": 1}
-    products = SimpleNamespace(parts=[np.array([0])], tested_indices=np.array([[0]]), **sizes)
+    products = SimpleNamespace(parts=[np.array([0])], problem=problem, n_unknowns=2, n_shapes=1)
     gain, size = score_test.linear_gains(fit, products, 0.0)
 
     def squares(of: list[int]) -> tuple[float, float]:

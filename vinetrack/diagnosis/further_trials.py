@@ -32,6 +32,7 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, Fit
+from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.discriminating_design import (
     NEW_VINE,
@@ -366,30 +367,24 @@ def tests_with_conditions(
 
 
 def _products_by_trial(tests: MisfitTests, indices: Sequence[int]) -> Floats:
-    """Cross products of each trial: free parameters, shared systematic errors and effects of these shapes, in order."""
-    fit, products, problem = tests.fit, tests.products, tests.fit.solution.problem
-    blocks = products_without_trial_effects(fit, products, fit.state)
-    keys, free, n = products.n_keys, problem.prior_mean.size, len(blocks)
-    shapes = [keys + 1 + index for index in indices]
-    systematics = np.arange(keys + 1 + products.n_shapes, blocks.shape[1])
-    columns = np.concatenate([np.arange(keys), systematics, shapes])
+    """Cross products of each trial: unknowns of its fit and effects of these shapes, in order."""
+    products = tests.products
+    blocks = products_without_trial_effects(products, tests.fit.state)
+    problem = with_shapes(products.problem, len(indices))
+    columns = np.concatenate([np.arange(products.n_unknowns), products.n_unknowns + 1 + np.array(indices, dtype=int)])
+    aligned = np.zeros((len(blocks), problem.prior_mean.size + 1, problem.prior_mean.size + 1))
+    rows = np.arange(len(blocks))[:, None, None]
     selected = blocks[:, columns[:, None], columns]
-    size = free + products.n_systematics + len(shapes)
-    # Unknowns that a trial does not depend on are collected in a last row and column, which is dropped.
-    of_systematics = np.where(products.places < products.n_systematics, free + products.places, size)
-    of_effects = np.tile(np.arange(size - len(shapes), size), (n, 1))
-    index = np.concatenate([np.where(problem.index < 0, size, problem.index), of_systematics, of_effects], axis=1)
-    aligned = np.zeros((n, size + 1, size + 1))
-    np.add.at(aligned, (np.arange(n)[:, None, None], index[:, :, None], index[:, None, :]), selected)
-    return aligned[:, :size, :size]
+    np.add.at(aligned, (rows, problem.places[:, :, None], problem.places[:, None, :]), selected)
+    return aligned[:, :-1, :-1]
 
 
 def _prior_precision(tests: MisfitTests, n_effects: int) -> Floats:
-    """Prior precision of the same unknowns: systematic errors have standard deviation 1, sizes of effects none."""
+    """Prior precision of the same unknowns: sizes of effects have none."""
     # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
     # (chosen)
-    free = np.maximum(tests.fit.solution.problem.prior_precision, 1e-6)
-    return np.diag(np.concatenate([free, np.ones(tests.products.n_systematics), np.zeros(n_effects)]))
+    free = np.maximum(tests.products.problem.prior_precision, 1e-6)
+    return np.diag(np.append(free, np.zeros(n_effects)))
 
 
 def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:

@@ -117,16 +117,11 @@ def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
     """Add errors to a solution as parameters, each with a prior of mean 0 and standard deviation 1."""
     if not errors.n_columns:
         return base
-    columns = [
-        np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1]])
-        for of_fit, systematic in zip(errors.at_zero_errors(base.columns), errors.columns, strict=True)
-    ]
-    places = np.where(errors.places < errors.count, base.problem.prior_mean.size + errors.places, -1)
-    problem = with_shapes(base.problem, errors.count)
+    columns, problem = errors.added_to(base.columns, base.problem)
     return replace(
         base,
         state=replace(base.state, theta=np.append(base.state.theta, np.zeros(errors.count))),
-        problem=replace(problem, index=np.column_stack([base.problem.index, places])),
+        problem=problem,
         cross_products=fit.predictor.products(columns),
         columns=tuple(columns),
     )

@@ -137,9 +137,7 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Noisel
             return 1.0
         systematics = systematics_of(refit.predictor, refit.solution, refit.trials)
         # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
-        scores = scores_of(
-            refit, products_of(refit, systematics.at_zero_errors(refit.solution.columns), sensitivities, systematics)
-        )
+        scores = scores_of(refit, products_of(refit, refit.solution.columns, sensitivities, systematics))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
@@ -161,11 +159,10 @@ def residual_displacements(fit: Fit, products: Products) -> Floats:
     """Distance of a fit without an effect from trajectories with a unit of its size, to first order. Returns root mean
     square over trials of the largest distance, all parameters and trial effects re-estimated. Shape (n_shapes,).
     """
-    problem, state, n_shapes = fit.solution.problem, fit.state, products.n_shapes
-    response = projected(fit, products, state).lever[:, :n_shapes]
-    of_keys = np.vstack([response, np.zeros((1, n_shapes))])[problem.index]
+    problem, state, n_shapes = products.problem, fit.state, products.n_shapes
+    of_keys = np.vstack([projected(fit, products, state).lever_of_fit, np.zeros((1, n_shapes))])[problem.places]
     precision = trial_effect_prior(problem, state)[1]
-    residual = N_TRIAL_EFFECTS + products.n_keys
+    residual = N_TRIAL_EFFECTS + products.n_unknowns
     effects, keys = slice(N_TRIAL_EFFECTS), slice(N_TRIAL_EFFECTS, residual)
     shapes = slice(residual + 1, residual + 1 + n_shapes)
     largest = []

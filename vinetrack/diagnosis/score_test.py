@@ -328,37 +328,27 @@ def _change(fit: Fit, shape: CandidateShape, baseline: Sequence[Trajectory]) -> 
 
 
 # ------------------------------------------------------------------------------
-# Columns of a fit, of candidates and of systematic errors, and their cross products by trial.
+# Columns of a fit and of candidates, and their cross products by trial.
 #
-# In this order: trial effects, parameters of the fit (keys), residual, shapes of candidates, shared systematic
-# errors.
+# In this order: trial effects, unknowns, residual, shapes of candidates. The unknowns are the parameters of the fit and
+# its systematic errors, which have a standard normal prior each.
 
 
 @dataclass(frozen=True)
 class Products:
-    """Columns of a fit, of candidate shapes and of systematic errors, shape (n_points, n_columns) a trial. In this
-    order: trial effects, keys, residual, shapes, systematic errors.
+    """Columns of a fit, with its systematic errors, and of candidate shapes, shape (n_points, n_columns) a trial.
+    `problem` is that of the fit with the systematic errors as further parameters.
     """
 
     columns: tuple[Floats, ...]
     data: Sequence[FitTrial]
-    n_keys: int
+    problem: MixedProblem
     n_shapes: int
-    places: NDArray[np.int_]
-    n_systematics: int = 0
 
     @property
-    def n_tested(self) -> int:
-        """Number of shapes and systematic errors of the campaign."""
-        return self.n_shapes + self.n_systematics
-
-    @property
-    def tested_indices(self) -> NDArray[np.int_]:
-        """Indices of each trial's shapes and systematic errors among all, shape (n_trials, n_shapes + n_affecting).
-        `n_tested` for a systematic error that does not affect a trial.
-        """
-        shapes = np.tile(np.arange(self.n_shapes), (len(self.columns), 1))
-        return np.concatenate([shapes, self.n_shapes + self.places], axis=1)
+    def n_unknowns(self) -> int:
+        """Number of columns of the unknowns of a trial."""
+        return self.problem.index.shape[1]
 
     @cached_property
     def parts(self) -> list[slice]:
@@ -375,7 +365,7 @@ class Products:
     def of(self, places: Sequence[int]) -> Products:
         """The same for some of the trials, which may be repeated."""
         columns, data = tuple(self.columns[k] for k in places), [self.data[k] for k in places]
-        return replace(self, columns=columns, data=data, places=self.places[list(places)])
+        return replace(self, columns=columns, data=data, problem=problem_of(self.problem, list(places)))
 
     @cached_property
     def _all_cross_products(self) -> Floats:
@@ -403,32 +393,33 @@ def fit_columns(fit: Fit) -> list[Floats]:
 def products_of(
     fit: Fit, columns: Sequence[Floats], sensitivities: EffectSensitivities, systematics: Systematics
 ) -> Products:
-    """Assemble the columns of a fit, of the candidates and of the systematic errors. Afterwards the columns of
+    """Assemble the columns of a fit, of its systematic errors and of the candidates. Afterwards the columns of
     `sensitivities` are views of those made here, so that no trial's are held twice.
     """
-    keys, shapes = columns[0].shape[1] - N_TRIAL_EFFECTS - 1, len(sensitivities.shapes)
-    of_shapes = slice(N_TRIAL_EFFECTS + keys + 1, N_TRIAL_EFFECTS + keys + 1 + shapes)
+    of_fit, problem = systematics.added_to(columns, fit.solution.problem)
     assembled: list[Floats] = []
-    for i, (of_fit, systematic) in enumerate(zip(columns, systematics.columns, strict=True)):
-        assembled.append(np.column_stack([of_fit, sensitivities.columns[i], systematic]))
-        sensitivities.columns[i] = assembled[-1][:, of_shapes]
-    return Products(tuple(assembled), fit.predictor.data, keys, shapes, systematics.places, systematics.count)
+    for i, columns_of_trial in enumerate(of_fit):
+        assembled.append(np.column_stack([columns_of_trial, sensitivities.columns[i]]))
+        sensitivities.columns[i] = assembled[-1][:, columns_of_trial.shape[1] :]
+    return Products(tuple(assembled), fit.predictor.data, problem, len(sensitivities.shapes))
 
 
-def products_without_trial_effects(fit: Fit, products: Products, state: FitState) -> Floats:
-    """Cross products of keys, residual, shapes and systematic errors of every trial, its trial effects integrated out.
-    Shape (n_trials, n_keys + 1 + n_shapes + n_affecting, the same again).
+def products_without_trial_effects(products: Products, state: FitState) -> Floats:
+    """Cross products of unknowns, residual and shapes of every trial, its trial effects integrated out. Shape
+    (n_trials, n_unknowns + 1 + n_shapes, the same again).
     """
-    size = products.columns[0].shape[1] - N_TRIAL_EFFECTS
+    size = products.n_unknowns + 1 + products.n_shapes
     blocks = np.empty((len(products.columns), size, size))
     for part in products.parts:
-        of_part = _of_trials(fit.solution.problem, state, part)
-        blocks[part] = trial_effects_eliminated(products.cross_products(part), products.n_keys, *of_part)
+        of_part = replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part])
+        blocks[part] = trial_effects_eliminated(
+            products.cross_products(part), products.n_unknowns, problem_of(products.problem, part), of_part
+        )
     return blocks
 
 
-def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
-    """Problem and state restricted to a part of the trials."""
+def problem_of(problem: MixedProblem, trials: slice | list[int]) -> MixedProblem:
+    """The problem of some of the trials, with all its parameters."""
     arrays = (
         "index",
         "has_deviation",
@@ -438,10 +429,7 @@ def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[Mix
         "points",
         "stretches",
     )
-    return (
-        replace(problem, **{name: getattr(problem, name)[part] for name in arrays}),
-        replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part]),
-    )
+    return replace(problem, **{name: getattr(problem, name)[trials] for name in arrays})
 
 
 @dataclass(frozen=True)
@@ -503,101 +491,84 @@ class Scores:
 
 @dataclass(frozen=True)
 class Projection:
-    """Shapes and systematic errors with the trial effects eliminated and the free parameters projected off. `blocks`,
-    shape (n_trials, q, q), are cross products of keys, residual, shapes, and the systematic errors to which each trial
-    responds.
+    """Shapes with the trial effects eliminated and the unknowns projected off. `blocks`, shape (n_trials, q, q), are
+    cross products of unknowns, residual and shapes; `lever` and `step` are the change of the unknowns by a unit of each
+    shape's size, and by the residual; `lever_of_fit` and `step_of_fit` are the same with systematic errors held at
+    zero, as in the fit.
     """
 
     blocks: Floats
     lever: Floats
     step: Floats
-    estimated: NDArray[np.intp]
+    lever_of_fit: Floats
+    step_of_fit: Floats
+    fitted: int
     score: Floats
     information: Floats
     empty: NDArray[np.bool_]
 
 
 def projected(fit: Fit, products: Products, state: FitState) -> Projection:
-    """Project shapes and residual on the free parameters of a fit, with the trial effects eliminated."""
-    problem = fit.solution.problem
-    p, size, n_tested = products.n_keys, problem.prior_mean.size, products.n_tested
+    """Project shapes and residual on the unknowns of a fit, with the trial effects eliminated."""
+    problem, p = products.problem, products.n_unknowns
     X, r, C = slice(0, p), p, slice(p + 1, None)
-    blocks, places = products_without_trial_effects(fit, products, state), products.tested_indices
+    blocks = products_without_trial_effects(products, state)
     hessian = sum_matrix_blocks(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
-    gradient = sum_vector_blocks(blocks[:, X, r], problem) - problem.prior_precision * (
-        state.theta - problem.prior_mean
-    )
-    # Parameters and errors to which a trial does not respond are added up in a last row and column, and dropped.
-    cross, total, score = (
-        np.zeros((size + 1, n_tested + 1)),
-        np.zeros((n_tested + 1, n_tested + 1)),
-        np.zeros(n_tested + 1),
-    )
-    np.add.at(cross, (problem.index[:, :, None], places[:, None, :]), blocks[:, X, C])
-    for part in products.parts:
-        total += _sum_of_blocks(blocks[part, C, C], places[part], n_tested + 1)
-    np.add.at(score, places, blocks[:, C, r])
-    cross, total, score = cross[:size, :n_tested], total[:n_tested, :n_tested], score[:n_tested]
-    estimated = _adapting(fit, hessian)
-    inverse = inverse_of_block(hessian, estimated)
-    lever, step = inverse @ cross, inverse @ gradient
-    information, empty = _without_rounding(total - cross.T @ lever, total)
-    score = score - cross.T @ step
+    gradient = sum_vector_blocks(blocks[:, X, r], problem) - problem.prior_precision * _deviation(problem, state)
+    # Unknowns to which a trial does not respond are added up in a last row, and dropped.
+    cross = np.zeros((problem.prior_mean.size + 1, products.n_shapes))
+    np.add.at(cross, problem.places, blocks[:, X, C])
+    total = blocks[:, C, C].sum(axis=0)
+    estimated = _adapting(fit, problem, hessian)
+    of_fit = estimated[estimated < state.theta.size]
+    inverse, held = inverse_of_block(hessian, estimated), inverse_of_block(hessian, of_fit)
+    lever, step = inverse @ cross[:-1], inverse @ gradient
+    information, empty = _without_rounding(total - cross[:-1].T @ lever, total)
+    score = blocks[:, C, r].sum(axis=0) - cross[:-1].T @ step
     score[empty] = 0.0
-    return Projection(blocks, lever, step, estimated, score, information, empty)
+    lever_of_fit, step_of_fit = held @ cross[:-1], held @ gradient
+    return Projection(blocks, lever, step, lever_of_fit, step_of_fit, of_fit.size, score, information, empty)
 
 
-def _sum_of_blocks(blocks: Floats, places: NDArray[np.int_], size: int) -> Floats:
-    """Sum of the trials' blocks, each row and column added at its place, shape (size, size)."""
-    flat = places[:, :, None] * size + places[:, None, :]
-    total = np.bincount(flat.ravel(), weights=blocks.ravel(), minlength=size**2)
-    return np.asarray(total.reshape(size, size), dtype=float)
+def _deviation(problem: MixedProblem, state: FitState) -> Floats:
+    """Unknowns minus their prior means; systematic errors are at theirs."""
+    return np.append(state.theta, problem.prior_mean[state.theta.size :]) - problem.prior_mean
 
 
 def levers_of(fit: Fit, products: Products) -> Floats:
     """Bias of each parameter per unit of an omitted effect's size (omitted-variable bias), by the linear model. A
-    parameter falls by this much when the effect is added. Returns I_θθ⁻¹ I_θs with systematic errors integrated out, in
-    units of the parameter over those of the size. Shape (n_numbers, n_shapes).
+    parameter falls by this much when the effect is added. Returns I_θθ⁻¹ I_θs in units of the parameter over those of
+    the size. Shape (n_numbers, n_shapes).
     """
-    projection = projected(fit, products, fit.state)
-    lever = projection.lever @ _marginalisation(projection.information, products.n_shapes)
     free = fit.predictor.layout.free
     derivatives = [
         number.value if parameter.logarithmic else parameter.scale
         for parameter, number in zip(free, fit.numbers, strict=True)
     ]
-    return np.asarray(lever[: len(free)] * np.array(derivatives)[:, None])
+    return np.asarray(projected(fit, products, fit.state).lever[: len(free)] * np.array(derivatives)[:, None])
 
 
 def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
     """Compute the scores at a fit, or with the noise and between-trial standard deviations of another `state`."""
     projection = projected(fit, products, state or fit.state)
-    blocks, index, tested = projection.blocks, fit.solution.problem.index, products.tested_indices
-    p, n_shapes = products.n_keys, products.n_shapes
-    X, r, C, S = slice(0, p), p, slice(p + 1, None), slice(p + 1, p + 1 + n_shapes)
-    M = _marginalisation(projection.information, n_shapes)
-    score, information = _marginalised(projection.score, projection.information, M)
-    M_counted = np.where(projection.empty[:, None], 0.0, M)
-    # Parameters and errors to which a trial does not respond point at a last row of zeros.
-    lever_M, lever_M_counted, lever, M, M_counted = (
-        np.vstack([rows, np.zeros((1, rows.shape[1]))])
-        for rows in (projection.lever @ M, projection.lever @ M_counted, projection.lever[:, :n_shapes], M, M_counted)
-    )
-    step = np.append(projection.step, 0.0)
-    trial_scores = np.empty((len(blocks), n_shapes))
-    trial_informations = np.empty((len(blocks), n_shapes, n_shapes))
+    blocks, places, p = projection.blocks, products.problem.places, products.n_unknowns
+    X, r, C = slice(0, p), p, slice(p + 1, None)
+    # Unknowns to which a trial does not respond point at a last row of zeros. What systematic errors move is part of
+    # the scatter of trials: the residuals are those of the fit.
+    none = np.zeros((1, products.n_shapes))
+    lever, lever_of_fit = np.vstack([projection.lever, none]), np.vstack([projection.lever_of_fit, none])
+    step = np.append(projection.step_of_fit, 0.0)
+    trial_scores = np.empty((len(blocks), products.n_shapes))
+    trial_informations = np.empty((len(blocks), products.n_shapes, products.n_shapes))
     for part in products.parts:
-        of_part, keys, places = blocks[part], index[part], tested[part]
-        residual = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[keys])
-        trial_scores[part] = np.einsum("nc,ncs->ns", residual[:, C], M_counted[places]) - np.einsum(
-            "nk,nks->ns", residual[:, X], lever_M_counted[keys]
-        )
-        of_shapes, of_parameters = np.swapaxes(M[places], 1, 2), np.swapaxes(lever_M[keys], 1, 2)
-        trial_informations[part] = of_shapes @ (of_part[:, C, S] - of_part[:, C, X] @ lever[keys]) - of_parameters @ (
-            of_part[:, X, S] - of_part[:, X, X] @ lever[keys]
-        )
+        of_part, lever_of_part, moved = blocks[part], lever[places[part]], lever_of_fit[places[part]]
+        residual = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[places[part]])
+        trial_scores[part] = residual[:, C] - np.einsum("nk,nks->ns", residual[:, X], lever_of_part)
+        trial_informations[part] = of_part[:, C, C] - of_part[:, C, X] @ moved
+        trial_informations[part] -= np.swapaxes(lever_of_part, 1, 2) @ (of_part[:, X, C] - of_part[:, X, X] @ moved)
+    trial_scores[:, projection.empty] = 0.0
     groups = coarsest_groups([trial.trial for trial in fit.trials])
-    return Scores(score, information, trial_scores, trial_informations, projection.estimated.size, groups)
+    return Scores(projection.score, projection.information, trial_scores, trial_informations, projection.fitted, groups)
 
 
 def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float, float]]) -> Floats:
@@ -605,12 +576,10 @@ def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float,
     `scores_of`, but summed over trials first: the standard deviations only change the contribution of each trial's two
     deviations, of rank two, so that no block of all shapes is needed for any trial. Shape (n_spreads, n_shapes).
     """
-    state, size, p = fit.state, fit.solution.problem.prior_mean.size, products.n_keys
-    problem = with_shapes(fit.solution.problem, products.n_tested)
-    total = problem.prior_mean.size
-    keys = fit.solution.problem.index
-    index = np.concatenate([np.where(keys < 0, total, keys), size + products.tested_indices], axis=1)
-    problem = replace(problem, index=index)
+    state, p = fit.state, products.n_unknowns
+    # Shapes are further parameters, without a prior.
+    problem = with_shapes(products.problem, products.n_shapes, prior_precision=0.0)
+    total, index = problem.prior_mean.size, problem.places
     whole, squares, levers = np.zeros((total, total)), [], []
     for part in products.parts:
         # The information does not depend on the residual.
@@ -620,35 +589,29 @@ def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float,
         white = at_correlation(cross_products, state.rho) / state.variance[part, None, None]
         release_origin = white[:, :2, :2] + problem.release_origin_precision[part, :, None] * np.eye(2)
         eliminated = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(release_origin, white[:, :2, 2:])
-        whole += sum_matrix_blocks(eliminated[:, 2:, 2:], replace(problem, index=problem.index[part]))
+        whole += sum_matrix_blocks(eliminated[:, 2:, 2:], problem_of(problem, part))
         lever = np.zeros((len(eliminated), 2, total + 1))
         for k in range(index.shape[1]):
             lever[np.arange(len(eliminated)), :, index[part, k]] += eliminated[:, :2, 2 + k]
         squares.append(eliminated[:, :2, :2])
         levers.append(lever[:, :, :total])
     square, lever = np.concatenate(squares), np.concatenate(levers)
+    unknowns, shapes = slice(0, total - products.n_shapes), slice(total - products.n_shapes, None)
     diagonals = []
     for spread in spreads:
         precision = 1 / np.maximum(between_trial_sd(problem, spread), LEAST_BETWEEN_TRIAL_SD) ** 2
         explained = solve_per_trial(square + precision[:, :, None] * np.eye(2), lever)
-        information = whole - lever.reshape(-1, total).T @ explained.reshape(-1, total)
-        diagonals.append(np.diag(_shape_information(fit, information, products.n_shapes)))
+        information = (
+            whole - lever.reshape(-1, total).T @ explained.reshape(-1, total) + np.diag(problem.prior_precision)
+        )
+        hessian, cross, alone = (
+            information[unknowns, unknowns],
+            information[unknowns, shapes],
+            information[shapes, shapes],
+        )
+        inverse = inverse_of_block(hessian, _adapting(fit, products.problem, hessian))
+        diagonals.append(np.diag(_without_rounding(alone - cross.T @ inverse @ cross, alone)[0]))
     return np.array(diagonals)
-
-
-def _shape_information(fit: Fit, information: Floats, n_shapes: int) -> Floats:
-    """Information of the shapes, with the free parameters projected off and systematic errors integrated out.
-    `information` is that of free parameters, shapes and systematic errors together, without the parameters' priors.
-    """
-    problem = fit.solution.problem
-    size = problem.prior_mean.size
-    hessian = information[:size, :size] + np.diag(problem.prior_precision)
-    estimated = _adapting(fit, hessian)
-    cross = information[:size, size:]
-    before = information[size:, size:]
-    projected_off, _ = _without_rounding(before - cross.T @ inverse_of_block(hessian, estimated) @ cross, before)
-    marginalisation = _marginalisation(projected_off, n_shapes)
-    return _marginalised(np.zeros(len(projected_off)), projected_off, marginalisation)[1]
 
 
 def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -657,37 +620,17 @@ def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDAr
     """
     # 1e-9: share of its information below which what remains of a shape is rounding, because other columns
     # reproduce it exactly (derived)
-    empty = np.diag(information) < 1e-9 * np.maximum(np.diag(before)[: len(information)], 1e-300)
+    empty = np.diag(information) < 1e-9 * np.maximum(np.diag(before), 1e-300)
     cleaned = information.copy()
     cleaned[empty, :] = cleaned[:, empty] = 0.0
     return cleaned, empty
 
 
-def _marginalisation(information: Floats, n_shapes: int) -> Floats:
-    """Matrix that integrates systematic errors of standard deviation 1 out, shape (n_tested, n_shapes). Applied to the
-    columns of shapes and systematic errors, it gives those of the shapes with the errors integrated out.
-    """
-    n_tested = len(information)
-    matrix = np.zeros((n_tested, n_shapes))
-    matrix[:n_shapes] = np.eye(n_shapes)
-    if n_tested > n_shapes:
-        inner = information[n_shapes:, n_shapes:] + np.eye(n_tested - n_shapes)
-        matrix[n_shapes:] = -np.linalg.solve(inner, information[n_shapes:, :n_shapes])
-    return matrix
-
-
-def _marginalised(score: Floats, information: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Score and information of the shapes with systematic errors integrated out, see `_marginalisation`."""
-    of_shapes, empty = _without_rounding(information[: matrix.shape[1]] @ matrix, information)
-    shape_score = matrix.T @ score
-    shape_score[empty] = 0.0
-    return shape_score, of_shapes
-
-
-def _adapting(fit: Fit, hessian: Floats) -> NDArray[np.intp]:
-    """Indices of the parameters that adapt to an effect: those estimated that are not at a bound."""
-    at_bound = np.array([math.isfinite(number.bound) for number in fit.numbers], dtype=bool)
-    return np.flatnonzero(fit.solution.problem.free & (np.diag(hessian) > 0) & ~at_bound)
+def _adapting(fit: Fit, problem: MixedProblem, hessian: Floats) -> NDArray[np.intp]:
+    """Indices of the unknowns that adapt to an effect: those estimated that are not at a bound."""
+    at_bound = np.zeros(len(hessian), dtype=bool)
+    at_bound[: len(fit.numbers)] = [math.isfinite(number.bound) for number in fit.numbers]
+    return np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~at_bound)
 
 
 def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floats]:
@@ -702,22 +645,20 @@ def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floa
     for _ in range(4):
         trial_state = FitState(state.theta, state.trial_effects, (0.01, 0.03), rho, variance)
         projection = projected(fit, products, trial_state)
-        marginalisation = _marginalisation(projection.information, products.n_shapes)
-        score, information = _marginalised(projection.score, projection.information, marginalisation)
-        residual_sum = _residual_sum(fit, projection, products.n_keys, trial_state)
+        score, information = projection.score, np.diag(projection.information)
+        residual_sum = _residual_sum(products, projection, trial_state)
         variance = np.full_like(variance, float(np.mean(variance)) * max(residual_sum / total, 1e-6))
-    diagonal = np.maximum(np.diag(information), 1e-300)
-    size = np.where(np.diag(information) > 0, score / diagonal, 0.0)
+    size = np.where(information > 0, score / np.maximum(information, 1e-300), 0.0)
     reduced_sum = np.maximum(residual_sum - score * size, 1e-3 * residual_sum)
     return np.asarray(total * np.log(residual_sum / reduced_sum)), size
 
 
-def _residual_sum(fit: Fit, projection: Projection, p: int, state: FitState) -> float:
-    """Residual sum of squares, in units of the noise, with the fit's parameters at their best; priors included.
-    Parameters at a bound, or fixed, stay where they are, as in `projected`: their steps there are 0.
+def _residual_sum(products: Products, projection: Projection, state: FitState) -> float:
+    """Residual sum of squares, in units of the noise, with the fit's unknowns at their best; priors included. Those at
+    a bound, or fixed, stay where they are, as in `projected`: their steps there are 0.
     """
-    problem, blocks = fit.solution.problem, projection.blocks
-    deviation = state.theta - problem.prior_mean
+    problem, blocks, p = products.problem, projection.blocks, products.n_unknowns
+    deviation = _deviation(problem, state)
     gradient = sum_vector_blocks(blocks[:, :p, p], problem) - problem.prior_precision * deviation
     total = blocks[:, p, p].sum() + float(np.sum(problem.prior_precision * deviation**2))
     return max(float(total - projection.step @ gradient), 1e-9 * float(total))

@@ -381,8 +381,8 @@ def _newton_on_fixed_columns(
     return state, cross_products, total_change, level
 
 
-def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
-    """The problem with the sizes of the shapes as further free parameters, each with a standard normal prior."""
+def with_shapes(problem: MixedProblem, count: int, prior_precision: float = 1.0) -> MixedProblem:
+    """The problem with the sizes of the shapes as further free parameters, each with a normal prior of mean 0."""
     places = problem.prior_mean.size + np.arange(count)
     # A column that belongs to no free parameter has index −1, the appended zero.
     index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])
@@ -390,7 +390,7 @@ def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
         problem,
         index=index,
         prior_mean=np.append(problem.prior_mean, np.zeros(count)),
-        prior_precision=np.append(problem.prior_precision, np.ones(count)),
+        prior_precision=np.append(problem.prior_precision, np.full(count, prior_precision)),
         lower=np.append(problem.lower, np.full(count, -np.inf)),
         upper=np.append(problem.upper, np.full(count, np.inf)),
         free=np.append(problem.free, np.ones(count, dtype=bool)),

@@ -19,6 +19,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.marginal_likelihood import (
+    MixedProblem,
     by_parameter,
     inverse_of_block,
     matrix_root,
@@ -26,7 +27,7 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information
+from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information, with_shapes
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor, position_change
 
 # ------------------------------------------------------------------------------
@@ -81,6 +82,18 @@ class Systematics:
     def n_columns(self) -> int:
         """Number of columns of each trial."""
         return self.places.shape[1]
+
+    def added_to(self, columns: Sequence[Floats], problem: MixedProblem) -> tuple[list[Floats], MixedProblem]:
+        """Columns and problem of a fit with the errors as further parameters, each with a standard normal prior; the
+        residual is that at zero errors. Shapes: columns (n_points, k) → (n_points, k + n_columns).
+        """
+        extended = [
+            np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1]])
+            for of_fit, systematic in zip(self.at_zero_errors(columns), self.columns, strict=True)
+        ]
+        places = np.where(self.places < self.count, problem.prior_mean.size + self.places, -1)
+        widened = with_shapes(problem, self.count)
+        return extended, replace(widened, index=np.column_stack([problem.index, places]))
 
 
 def systematics_of(
