@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import vinetrack as vt
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.units import number
-from vinetrack.narrative.verdict_text import estimate_text, summary_facts
+from vinetrack.narrative.verdict_text import estimate_text, verdict_table
 from vinetrack.pages.page import open_campaign
 from vinetrack.results.folder_layout import ResultsError
 
@@ -154,9 +154,9 @@ def test_the_report_quotes_the_final_model_first(report, loaded):
     for entry in diagnosis.parameters:
         assert estimate_text(entry).partition(" = ")[2].partition(" (")[0].split(" N·")[0].split(" kPa")[0] in report
     assert report.index("The final model:") < report.index("The initial model, which the diagnosis refutes")
-    for fact in summary_facts(diagnosis, diagnosis.ladder):
-        assert f"{fact.question} {fact.answer}" in report
-        assert fact.note in report
+    for row in verdict_table(diagnosis)[1:]:
+        assert f"{row.question} {row.answer}" in report
+        assert row.note in report
 
 
 def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):

@@ -15,7 +15,7 @@ from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials,
 from vinetrack.diagnosis.result import VERDICTS, Diagnosis
 from vinetrack.narrative import SENTENCES
 from vinetrack.narrative.diagnosis_text import REMARKS, further_lines
-from vinetrack.narrative.verdict_text import summary_facts, verdict_meaning, verdict_sentence
+from vinetrack.narrative.verdict_text import verdict_sentence
 
 PACKAGE = Path(vinetrack.__file__).parent
 FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
@@ -57,8 +57,7 @@ def verdicts() -> str:
     told = [Diagnosis.from_json(diagnosis(verdict)) for verdict in VERDICTS]
     parts = []
     for said in told:
-        facts = [f"{fact.question}: {fact.answer} ({fact.note})" for fact in summary_facts(said, None)]
-        parts.append("\n".join([verdict_sentence(said), verdict_meaning(said), *facts, "", str(said)]))
+        parts.append("\n".join([verdict_sentence(said), "", str(said)]))
     return "\n\n----\n".join(parts)
 
 

@@ -14,13 +14,7 @@ from vinetrack.core.notebook import html_table
 from vinetrack.core.problems import joined
 from vinetrack.core.units import PREDICTION_UNITS, decimals, display_unit, number, with_error, with_interval
 from vinetrack.diagnosis.result import (
-    ADEQUATE,
-    AMBIGUOUS,
-    ARTEFACT,
-    DROPPED_FRAMES,
-    MISSING,
     NOT_TESTABLE,
-    UNEXPLAINED,
     Candidate,
     Diagnosis,
     Round,
@@ -29,16 +23,15 @@ from vinetrack.effects import Effect, remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.narrative.verdict_text import (
     MOST_NAMED,
-    ODD_MEANING,
-    difference_headline,
+    SHARED_REMEDIES,
     estimates_text,
     listed_names,
     odd_deciding_in_words,
     odd_in_words,
     spaced_name,
-    summary_facts,
-    trials_differ,
+    verdict_line,
     verdict_sentence,
+    verdict_table,
 )
 
 if TYPE_CHECKING:
@@ -82,41 +75,12 @@ def _at_largest(power: EffectPower) -> float:
     return power.probability_at(power.largest)
 
 
-def effect_sentence(power: EffectPower, n_trials: int) -> str:
-    """Return the sizes of one effect that the trials detect, in a sentence."""
-    trials = f"These {n_trials} trials detect" if n_trials != 1 else "This trial detects"
-    at_largest, little = _at_largest(power), f"less than {percent(LOW_POWER)}"
-    seen, unseen_below = (f"{power.symbol} = {size_text(power, power.size_at(0.9))}", power.size_at(LOW_POWER))
-    if at_largest < 0.9:
-        how_often = f"{little} power even" if at_largest < LOW_POWER else f"{percent(at_largest)} power"
-        largest = f"{power.symbol} = {size_text(power, power.largest)}"
-        sizes = f"with {how_often} at its largest plausible size, {largest}"
-    elif power.least != power.zero and power.probability_at(power.least) >= 0.9:
-        sizes = f"of any plausible size (90 % power at {seen})"
-    else:
-        beyond, within = ("above", "below") if power.largest > power.zero else ("below", "above")
-        sizes = f"with at least 90 % power {beyond} {seen}, and with {little} {within} {size_text(power, unseen_below)}"
-    text = f"{trials} {spaced_name(power.effect)} {sizes}"
-    if power.taken_for and at_largest >= LOW_POWER:
-        names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:2]]
-        text += f"; it would be mistaken for {joined(names)} of campaigns"
-    return f"{text}."
-
-
 def false_alarm_sentence(power: Power) -> str:
     """Return the false-alarm rate of such trials: how often something is called missing where nothing is."""
     return (
         f"If nothing is missing, such trials raise a false alarm in at most {percent(power.false_alarm_rate)} of "
         "campaigns, provided that noise and scatter are as fitted."
     )
-
-
-def power_brief(power: Power) -> str:
-    """Return the false-alarm rate and the number of detectable effects, which must stand beside a verdict."""
-    alarms = f"false alarms in at most {percent(power.false_alarm_rate)} of such campaigns"
-    if power.wary or not power.effects:
-        return alarms
-    return f"{alarms}; {detectable_count(power)} would have been detected {AT_LARGEST}"
 
 
 def detectable_count(power: Power) -> str:
@@ -191,13 +155,9 @@ POWER_COLUMNS = (
 
 
 def power_lines(power: Power) -> list[str]:
-    """Return what `vinetrack power` prints: all effects in a table, visible ones first, and a sentence on each if they
-    are few, else on the physical ones of the lowest power.
-    """
+    """Return what `vinetrack power` prints: all effects in a table, visible ones first."""
     from vinetrack.core.terminal import table
 
-    few = 4  # Effects that get a sentence each, at most (chosen)
-    physical = sorted((entry for entry in power.effects if entry.kind == "physical"), key=_at_largest)
     listed = power_rows(sorted(power.effects, key=lambda entry: (not entry.is_visible, entry.effect)))
     lines = [f"Power of {power.n_trials} trials to detect effects beyond {' + '.join(power.model)}"]
     lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
@@ -205,9 +165,7 @@ def power_lines(power: Power) -> list[str]:
         lines.append(f"! {power.wary}")
     lines += table(listed, POWER_COLUMNS, indent="  ", align="<" * len(POWER_COLUMNS))
     lines += [f"  not testable: {spaced_name(name)}: {why}" for name, why in power.not_testable.items()]
-    told = power.effects if len(power.effects) <= few else physical[:few]
-    lines += [effect_sentence(entry, power.n_trials) for entry in told]
-    lines += [false_alarm_sentence(power)]
+    lines.append(false_alarm_sentence(power))
     if power.numbers:
         halves = [percent(one.half_width) if one.is_relative else number(one.half_width, 2) for one in power.numbers]
         names = [f"{one.name} ({one.vine})" if one.vine else one.name for one in power.numbers]
@@ -429,22 +387,11 @@ def _count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
-_HEADLINES = {
-    ADEQUATE: "no missing effect can be detected",
-    MISSING: "one effect is missing",
-    AMBIGUOUS: "one of several effects is missing, and these data cannot tell which",
-    ARTEFACT: "a fault of the measurement, not missing physics",
-    UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
-}
-
-
 def diagnosis_text(diagnosis: Diagnosis) -> str:
     """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors, next experiment."""
     if not diagnosis.rounds:
         return diagnosis.explanation
-    lines = [verdict_line(diagnosis), "", diagnosis.explanation]
-    if diagnosis.power is not None:
-        lines += ["", false_alarm_sentence(diagnosis.power), *could_have_seen(diagnosis.power)]
+    lines = [verdict_line(diagnosis), *table_lines(diagnosis), "", diagnosis.explanation]
     for step in diagnosis.rounds:
         if step.ranking:
             lines += ["", f"{' + '.join(step.model)}: {step.verdict}", *_ranking(step)]
@@ -455,41 +402,18 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     if diagnosis.next_experiment:
         lines += ["", str(diagnosis.next_experiment.get("text", ""))]
     lines += [f"! {note}" for note in diagnosis.notes]
-    if next_step := to_go_on(diagnosis):
-        lines += ["", next_step]
     return "\n".join(lines)
 
 
-def to_go_on(diagnosis: Diagnosis) -> str:
-    """Return what to do next where no effect of the catalogue explains the trials; blank elsewhere."""
-    if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict) or diagnosis.contradicted_columns:
-        return ""
-    if diagnosis.odd_trials:
-        return ODD_MEANING
-    return (
-        "Next: look at the figures of the missing force in the report, and run `vinetrack propose` on the results "
-        "folder. It looks for a law that describes the missing force and writes the law as an effect file of your own."
-    )
-
-
-def verdict_line(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one line."""
-    return f"{diagnosis.verdict}: {_headline(diagnosis)}"
-
-
-def _headline(diagnosis: Diagnosis) -> str:
-    if diagnosis.odd_trials or diagnosis.contradicted_columns:
-        return verdict_sentence(diagnosis).rstrip(".")
-    if diagnosis.verdict == MISSING:
-        return joined(list(diagnosis.effects)) + (" is missing" if len(diagnosis.effects) == 1 else " are missing")
-    if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:
-        if diagnosis.answer_set == (DROPPED_FRAMES,):
-            return "frames are missing from the recordings"
-        if trials_differ(diagnosis.answer_set):
-            return f"the trials differ, and no physics is missing: {difference_headline(diagnosis.answer_set)}"
-        return f"{_HEADLINES[diagnosis.verdict]}: {joined(list(diagnosis.answer_set), 'or')}"
-    power = f" ({power_brief(diagnosis.power)})" if diagnosis.power is not None else ""
-    return _HEADLINES[diagnosis.verdict] + power
+def table_lines(diagnosis: Diagnosis, notes: bool = True) -> list[str]:
+    """Return the rows of the verdict table below its headline, as aligned lines of at most 120 characters."""
+    first, *rows = verdict_table(diagnosis)
+    width = max((len(row.question) for row in rows), default=0)
+    lines = [f"  {first.note}"] if first.note else []
+    for row in rows:
+        told = [line for text in (row.answer, row.note if notes else "") for line in textwrap.wrap(text, 116 - width)]
+        lines += [f"  {'' if k else row.question:<{width}}  {line}" for k, line in enumerate(told)]
+    return lines
 
 
 def _ranking(step: Round) -> list[str]:
@@ -573,7 +497,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
 
 def diagnosis_page(diagnosis: Diagnosis) -> str:
     """Return the first screen of a diagnosis as HTML, for a notebook."""
-    rows = [(fact.question, fact.answer, fact.note) for fact in summary_facts(diagnosis, diagnosis.ladder)]
+    rows = [(row.question, row.answer, row.note) for row in verdict_table(diagnosis)[1:]]
     title = f"{diagnosis.verdict or 'refused'}: {verdict_sentence(diagnosis)}"
     return html_table(("", "", ""), rows, title, [diagnosis.explanation])
 
@@ -932,11 +856,7 @@ def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -
 
 def mostly_shared_text(names: Sequence[str], source: str) -> str:
     """Return the message that a measurement would improve numbers more than further trials."""
-    remedies = {
-        "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
-        "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
-    }  # fmt: skip
-    return f"most of the error of {', '.join(names)} comes from what all trials share: {remedies[source]}"
+    return f"most of the error of {', '.join(names)} comes from what all trials share: {SHARED_REMEDIES[source]}"
 
 
 def _recordings(trials: Sequence[str]) -> str:

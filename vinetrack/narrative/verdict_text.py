@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import joined
 from vinetrack.core.units import decimals, display_unit, number, with_error
-from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
     BETWEEN,
     BETWEEN_TRIALS,
+    DROPPED_FRAMES,
     MISSING,
     N_BY_VINE,
     NOT_TESTABLE,
     ORDER_DRIFT,
+    REFITTED,
     SPECIMEN,
     UNEXPLAINED,
     Confounder,
@@ -28,6 +29,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.diagnosis.score_test import slip_of
 from vinetrack.dynamics.model import base_model
+from vinetrack.effects import catalogue, remedy
 from vinetrack.experiment.folder import CONFOUNDING_CORRELATION, order_pressure_correlation, trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
 from vinetrack.inference.fit_summary import FILM
@@ -116,24 +118,27 @@ def _range(numbers: Sequence[Number], factor: float, unit: str) -> str:
 
 
 # ------------------------------------------------------------------------------
-# Summary of a diagnosis: what is missing, how significant that is, and how much adding it reduces the error.
-#
-# Report, figures, notebooks and explorer use these sentences; `diagnosis_text` prints a whole diagnosis.
+# The verdict as a table, the same in terminal, report, notebook and `diagnosis.json`.
 
 ODD_MEANING = (
     "The row of a trial in the sheet contradicts its motion. The verdict in full covers the other trials. Correct its "
     "row, or leave it out with `use: no`, and run again."
 )
 
+# What would make the part of an error smaller that all trials share, by its source
+SHARED_REMEDIES = {
+    "payloads": "weigh the payloads", "set pressures": "calibrate the gauge", "gauge": "record a quieter pressure",
+    "tracking": "film sharper edges", "lens": "calibrate the lens with a board",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
-class Fact:
-    """One entry of the first screen: the quantity, its value, and a line below it."""
+class Row:
+    """A row of the verdict table: a question, its answer, and what there is to say beside it."""
 
     question: str
     answer: str
     note: str = ""
-    code: str = ""
 
 
 def spaced_name(effect: str) -> str:
@@ -146,118 +151,216 @@ def listed_names(names: Sequence[str], last: str = "and") -> str:
     return joined([spaced_name(name) for name in names], last)
 
 
+def verdict_line(diagnosis: Diagnosis) -> str:
+    """Return the verdict in one line, with the names of effects as commands take them."""
+    return f"{diagnosis.verdict}: {_told(diagnosis, str)}"
+
+
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence; what contradicts the sheet in its place, since any verdict rests on it."""
+    told = _told(diagnosis, spaced_name)
+    return f"{told[0].upper()}{told[1:]}."
+
+
+def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
+    verdict, answers = diagnosis.verdict, diagnosis.answer_set
+    names = [shown(name) for name in (diagnosis.effects if verdict == MISSING else ()) or answers]
     if diagnosis.contradicted_columns:
-        return f"{joined(diagnosis.contradicted_columns)} in the sheet cannot fit the measurements: correct it first."
-    verdict, answers = diagnosis.verdict, list(diagnosis.answer_set)
-    added = list(diagnosis.effects)
-    if verdict == MISSING:
-        return f"Missing from the model: {listed_names(added or answers, 'and')}."
-    if verdict == AMBIGUOUS:
-        return f"Missing from the model: {listed_names(answers, 'or')}. These trials cannot tell which."
-    if verdict == ARTEFACT and trials_differ(answers):
-        return f"The trials differ, and no physics is missing: {difference_headline(answers)}."
-    if verdict == ARTEFACT:
-        return f"A fault of the measurement, not missing physics: {listed_names(answers, 'or')}."
-    if verdict == ADEQUATE:
-        return "No missing effect can be detected."
+        return f"{joined(diagnosis.contradicted_columns)} in the sheet cannot fit the measurements: correct it first"
     if diagnosis.odd_trials:
-        verb = "is" if len(diagnosis.odd_trials) == 1 else "are"
-        return f"{joined(diagnosis.odd_trials)} {verb} inconsistent with the others, which the model explains."
-    if verdict == UNEXPLAINED:
-        return "The model fails, and no effect of the catalogue explains it."
-    return "No diagnosis could be made."
+        are = "is" if len(diagnosis.odd_trials) == 1 else "are"
+        return f"{joined(diagnosis.odd_trials)} {are} inconsistent with the others, which the model explains"
+    if answers == (DROPPED_FRAMES,):
+        return "frames are missing from the recordings"
+    if verdict == ARTEFACT and trials_differ(answers):
+        return f"the trials differ, and no physics is missing: {difference_headline(answers)}"
+    return {
+        MISSING: f"{joined(names)} {'is' if len(names) == 1 else 'are'} missing",
+        AMBIGUOUS: f"{joined(names, 'or')} is missing, and these trials cannot tell which",
+        ARTEFACT: f"a fault of the measurement, not missing physics: {joined(names, 'or')}",
+        ADEQUATE: "no missing effect can be detected",
+        UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
+    }.get(verdict, "no diagnosis could be made")
 
 
-def verdict_meaning(diagnosis: Diagnosis) -> str:
-    """Return what the verdict means, and the verdict on the model with all added effects."""
+def verdict_table(diagnosis: Diagnosis) -> list[Row]:
+    """Return the verdict as rows: what is missing, how sure, how large, the damping law, what it could be instead,
+    what cannot be excluded, and what to do now. A row without an answer is left out.
+    """
+    rows = [Row("What is missing", verdict_sentence(diagnosis), _thereafter(diagnosis))]
+    if diagnosis.verdict and not diagnosis.contradicted_columns:
+        rows += [
+            Row("How sure", *_how_sure(diagnosis)),
+            Row("How large", *_how_large(diagnosis)),
+            Row("F = B·ẋⁿ", *_damping_law(diagnosis)),
+            Row("What it could be instead", *_instead(diagnosis)),
+            Row("What cannot be excluded", *_not_excluded(diagnosis)),
+        ]
+    rows.append(Row("What to do now", *_to_do(diagnosis)))
+    return [row for row in rows if row.answer]
+
+
+def _thereafter(diagnosis: Diagnosis) -> str:
+    """What the model lacks once all that was found is in it; blank where that is the verdict itself."""
+    if not diagnosis.effects:
+        return ""
+    it = "it" if len(diagnosis.effects) == 1 else "them"
+    last = diagnosis.rounds[-1]
+    return {
+        ADEQUATE: f"With {it} in the model, no further effect can be detected.",
+        AMBIGUOUS: f"A further effect is missing: {listed_names(last.answer_set, 'or')}.",
+        ARTEFACT: f"What remains is a fault of the measurement: {listed_names(last.answer_set, 'or')}.",
+        UNEXPLAINED: f"With {it} in the model, it still fails, and no effect of the catalogue explains the rest.",
+    }.get(last.verdict, "")
+
+
+def _how_sure(diagnosis: Diagnosis) -> tuple[str, str]:
+    from vinetrack.narrative.diagnosis_text import percent
+
+    tested = [row for row in diagnosis.ranking if row.status != NOT_TESTABLE and is_finite(row.sigma)]
+    inside = [row for row in tested if row.in_answer_set]
+    answer = ""
+    if diagnosis.verdict == ADEQUATE and tested:
+        # Ranked by the score: a predicted Δχ² may belong to a size of the wrong sign.
+        best = max(tested, key=lambda row: abs(row.sigma))
+        answer = (
+            f"{spaced_name(best.effect)}, the most significant of {len(tested)} candidates, reaches {_sigmas(best)} σ"
+        )
+    elif inside:
+        answer = f"{_sigmas(max(inside, key=attrgetter('delta_chi2')))} σ"
+        if len(inside) > 1:
+            answer += f"; {len(inside)} of {len(tested)} candidates fit equally well"
+    notes = [_errors(diagnosis.ladder)]
+    if diagnosis.power is not None:
+        notes.append(f"false alarms in at most {percent(diagnosis.power.false_alarm_rate)} of such campaigns")
+    note = "; ".join(filter(None, notes))
+    return (answer, note) if answer else (note, "")
+
+
+def _errors(ladder: pd.DataFrame | None) -> str:
+    """The error of position before and after, on conditions left out where there are such."""
+    ladder = None if ladder is None else settled_rows(ladder)
+    if ladder is None or not len(ladder):
+        return ""
+    first, last = ladder.iloc[0], ladder.iloc[-1]
+    key, what = "rms_left_out_m", "error on conditions left out"
+    if not math.isfinite(float(first[key])):
+        key, what = "rms_in_sample_m", "error of position"
+    then = f" → {number(1e3 * float(last[key]))}" if len(ladder) > 1 else ""
+    floor = 1e3 * float(last["floor_m"])
+    scatter = f", replicate scatter {number(floor)} mm" if math.isfinite(floor) else ""
+    return f"{what} {number(1e3 * float(first[key]))}{then} mm{scatter}"
+
+
+def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it."""
+    return table[~table["partial"].astype(bool)] if "partial" in table else table
+
+
+def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
+    """Sizes of what was added, else of the members of the answer set."""
+    if diagnosis.effects:
+        added = [p for p in diagnosis.parameters if p.key.split(".")[0] in diagnosis.effects]
+        wider = [f"{interval_text(p)}{_confounded_interval(diagnosis, p.key)}" for p in added]
+        return ", ".join(map(split_estimate, added)), "; ".join([*wider, *_shared_remedies(added)])
+    members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
+    return "; ".join(f"{spaced_name(row.effect)}: {estimates_text(row)}" for row in members[:MOST_NAMED]), ""
+
+
+def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
+    """N and B of the last model."""
+    law = [p for p in diagnosis.parameters if p.key in (EXPONENT, DAMPING) and is_finite(p.value)]
+    # 5: n and the B of as many vines as a line has room for
+    law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]
+    with_them = [f"with {listed_names(diagnosis.effects)} in the model"] if law and diagnosis.effects else []
+    notes = [*(f"n {interval_text(p)}" for p in law[:1]), *with_them, *_shared_remedies(law)]
+    return ", ".join(map(estimate_text, law)), "; ".join(notes)
+
+
+def _shared_remedies(numbers: Sequence[Number]) -> list[str]:
+    """What would make the shared part of the errors smaller, where that is most of an error."""
+    most = [p for p in numbers if p.shared and p.shared_sigma**2 > 0.5 * p.sigma**2]
+    sources = dict.fromkeys(max(p.shared, key=lambda source: p.shared[source]) for p in most)
+    return [f"what all trials share is most of the error: {SHARED_REMEDIES[source]}" for source in sources]
+
+
+def _instead(diagnosis: Diagnosis) -> tuple[str, str]:
+    """The other members of the answer set with their weights; else the nearest rivals, and why they are none."""
+    fitted = [row for row in diagnosis.ranking if row.status == REFITTED and is_finite(row.delta_chi2)]
+    members = [row for row in fitted if row.in_answer_set]
+    rivals = sorted((row for row in fitted if not row.in_answer_set), key=lambda row: -row.delta_chi2)
+    best = max((row.delta_chi2 for row in members), default=math.nan)
+    why = "; ".join(_why_not(row, best) for row in rivals[:MOST_NAMED])
+    if len(members) < 2:
+        return ("" if diagnosis.verdict == ADEQUATE else why), ""
+    weights = [f" {100 * row.posterior_weight:.0f} %" if row.posterior_weight > 0 else "" for row in members]
+    return ", ".join(f"{spaced_name(row.effect)}{w}" for row, w in zip(members, weights, strict=True)), why
+
+
+def _why_not(row: Candidate, best: float) -> str:
+    """A candidate outside the answer set, and why: its reason, or how far it is behind."""
+    # An implausible candidate may have the larger Δχ².
+    behind = f"worse by Δχ² = {number(best - row.delta_chi2)}" if best > row.delta_chi2 else f"{_sigmas(row)} σ"
+    return f"{spaced_name(row.effect)}: {', '.join(filter(None, [behind, str(row.reason)]))}"
+
+
+def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
+    from vinetrack.narrative.diagnosis_text import AT_LARGEST, detectable_count, unseen
+
+    power = diagnosis.power
+    if power is None:
+        return "", ""
+    if power.wary or not power.effects:
+        return "sizes that trials would detect were not computed", str(power.wary)
+    undetectable = unseen(power)
+    bounded = (
+        [row for row in diagnosis.rounds[-1].ranking if row.largest] if diagnosis.final_verdict == ADEQUATE else []
+    )
+    notes = [f"limits of {len(bounded)} undetected sizes are in the report"] if bounded else []
+    notes += [f"not even then: {listed_names(undetectable[:6])}" + " and others" * (len(undetectable) > 6)] * bool(
+        undetectable
+    )
+    return f"smaller effects: {detectable_count(power)} would have been detected {AT_LARGEST}", "; ".join(notes)
+
+
+def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:
+    """The next step, and how the effects in question are measured or reduced."""
+    verdict, last = diagnosis.verdict, diagnosis.final_verdict
     if diagnosis.contradicted_columns:
         told = " ".join(f"{str(note).rstrip('.')}." for note in diagnosis.notes[: len(diagnosis.contradicted_columns)])
-        return f"{told} With the sheet as it is, the verdict is {diagnosis.verdict}; correct the sheet and run again."
+        return "correct the sheet and run again", f"{told} With the sheet as it is, the verdict is {verdict}."
     if diagnosis.odd_trials:
-        return ODD_MEANING
-    meanings = {
-        MISSING: "An effect is missing from the model. It was identified, added, and the model fitted again.",
-        AMBIGUOUS: "An effect is missing, and these trials cannot tell which of several: nothing was added. "
-        "The next experiment below says how to separate them.",
-        ARTEFACT: "A fault of the measurement, not missing physics, explains the misfit: nothing was added. "
-        "Correct the measurement first.",
-        ADEQUATE: "Every candidate was tested, and none improves the fit significantly. "
-        "Upper limits on the size of each are listed below.",
-        UNEXPLAINED: "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
-        "The missing force is drawn below; `vinetrack propose` looks for a law that describes it.",
-    }
-    text = meanings.get(diagnosis.verdict, diagnosis.refused)
-    if diagnosis.verdict == ARTEFACT and trials_differ(list(diagnosis.answer_set)):
-        text = (
-            "A difference between trials, not missing physics, explains the misfit: nothing was added. The explanation "
-            "below says what to do."
+        return "correct the row of that trial, or leave it out with `use: no`, and run again", ""
+    if UNEXPLAINED in (verdict, last):
+        return (
+            "look at the figures of the missing force, and run `vinetrack propose`",
+            "it looks for a law that describes the missing force, and writes the law as an effect file of your own",
         )
-    thereafter = {
-        MISSING: "A further effect is still missing.",
-        AMBIGUOUS: "A further effect is missing, and these trials cannot tell which.",
-        ARTEFACT: "The remaining misfit is explained by a fault of the measurement.",
-        ADEQUATE: "With it, no further effect can be detected.",
-        UNEXPLAINED: "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
-    }
-    added = diagnosis.effects
-    final = thereafter.get(diagnosis.final_verdict, "") if added else ""
-    return f"{text} {final.replace('With it,', 'With them,') if len(added) > 1 else final}".strip()
+    if diagnosis.next_experiment:
+        return str(diagnosis.next_experiment.get("text", "")), ""
+    if last == ARTEFACT:
+        names = diagnosis.rounds[-1].answer_set
+        return "correct the measurement, and run again", _remedies(names)
+    if verdict == MISSING:
+        saved = " ".join(f"`vinetrack add {name} RESULTS --save`" for name in diagnosis.effects)
+        return f"keep it with {saved}, and measure its size by other means", _remedies(diagnosis.effects)
+    if verdict == AMBIGUOUS:
+        return "measure what tells them apart", _remedies(diagnosis.answer_set)
+    return ("use the model where you filmed" if verdict == ADEQUATE else str(diagnosis.refused)), ""
 
 
-def summary_facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
-    """Return significance, sizes, power, change of the error and damping exponent, as far as the verdict has them."""
-    bounded = [row for row in diagnosis.ranking if row.largest] if diagnosis.verdict == ADEQUATE else []
-    n, B = ([p for p in diagnosis.parameters if p.key == key and is_finite(p.value)] for key in (EXPONENT, DAMPING))
-    vines = [estimate_text(p) for p in B[:3]]  # as many as a tile has room for
-    return [
-        *filter(None, [_significance(diagnosis)]),
-        *_sizes(diagnosis),
-        *([Fact("Upper limits", f"{len(bounded)} candidates", "of undetected sizes, listed below")] if bounded else []),
-        *_power_facts(diagnosis),
-        *_errors(ladder),
-        *(Fact("Damping law", estimate_text(p), "; ".join([interval_text(p), *vines])) for p in n[:1]),
+def _remedies(names: Sequence[str]) -> str:
+    """How each of these is measured, reduced or corrected."""
+    known = catalogue()
+    told = [
+        remedy(known[name]) if name in known else BETWEEN[name].remedy for name in names if name in {**known, **BETWEEN}
     ]
+    return " ".join(f"{words.rstrip('.')}." for words in told if words)
 
 
 def is_finite(value: Any) -> bool:
     """Return whether a value of a JSON file is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
-
-
-def _significance(diagnosis: Diagnosis) -> Fact | None:
-    ranking, verdict = diagnosis.ranking, diagnosis.verdict
-    tested = [row for row in ranking if is_finite(row.delta_chi2)]
-    others = [row for row in tested if not row.in_answer_set]
-    by_gain = attrgetter("delta_chi2")
-    best = max(tested, key=by_gain, default=None)
-    if verdict == ADEQUATE:
-        # Ranked by the score: a predicted Δχ² may belong to a size of the wrong sign.
-        scored = [row for row in ranking if is_finite(row.sigma)]
-        best = max(scored, key=lambda row: abs(row.sigma), default=None)
-        note = f"largest of {len(scored)} candidates: {spaced_name(best.effect)}" if best else ""
-        return Fact("Most significant candidate", f"{_sigmas(best)} σ", note, "most_significant") if best else None
-    if diagnosis.odd_trials:
-        return None
-    if verdict == UNEXPLAINED and best is not None:
-        note = f"{_sigmas(best)} σ better" + (f", but {best.reason}" if best.reason else "")
-        return Fact("Nearest candidate", spaced_name(best.effect), note)
-    inside = [row for row in tested if row.in_answer_set]
-    best = max(inside, key=by_gain, default=None)
-    if best is None:
-        return None
-    n_tested = sum(row.status != NOT_TESTABLE for row in ranking)
-    note = f"of {n_tested} candidates tested" if n_tested > 1 else "the only candidate"
-    note = f"{len(inside)} of {n_tested} candidates fit equally well" if len(inside) > 1 else note
-    # A candidate that contains the answer as a limiting case fits as well by construction, and is no rival.
-    rival = max([row for row in others if not row.plausible or not row.reason], key=by_gain, default=None)
-    if rival is not None:
-        behind = best.delta_chi2 - rival.delta_chi2
-        # An implausible candidate, or one whose Δχ² is only predicted, may have the larger Δχ².
-        note = f"next best: {spaced_name(rival.effect)}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
-        note += "" if rival.plausible else ", not plausible"
-    return Fact("Significance", f"{_sigmas(best)} σ", note, "significance")
 
 
 def _sigmas(row: Candidate) -> str:
@@ -276,6 +379,17 @@ def estimate_text(entry: Number) -> str:
     return f"{entry.title} = {quantity_text(entry)}"
 
 
+def split_estimate(entry: Number) -> str:
+    """Return a fitted number with its standard error, that of trials apart from that of what all trials share."""
+    if is_finite(entry.bound) or not (entry.shared_sigma > 0 and is_finite(entry.sigma)):
+        return estimate_text(entry)
+    unit, factor = display_unit(entry.unit)
+    digits = decimals(factor * entry.sigma)
+    own, shared = math.sqrt(max(entry.sigma**2 - entry.shared_sigma**2, 0.0)), entry.shared_sigma
+    value, own_text, shared_text = (f"{factor * each:.{digits}f}" for each in (entry.value, own, shared))
+    return f"{entry.title} = {value} ± {own_text} (trials) ± {shared_text} (shared) {unit}".rstrip()
+
+
 def quantity_text(entry: Number) -> str:
     """Return a fitted number with its standard error in its display unit: `1.170 ± 0.004`."""
     unit, factor = display_unit(entry.unit)
@@ -292,24 +406,6 @@ def estimates_text(row: Candidate) -> str:
     text = ", ".join(estimate_text(entry) for entry in row.numbers if is_finite(entry.value))
     # 2.0: standard errors below which a size is reported as not significant
     return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < 2.0 else text
-
-
-def _sizes(diagnosis: Diagnosis) -> list[Fact]:
-    """The size of each added effect in the final model; without one, the sizes of the members of the answer set."""
-    if diagnosis.effects:
-        of = {name: [n for n in diagnosis.parameters if n.key.split(".")[0] == name] for name in diagnosis.effects}
-        return [
-            Fact(
-                f"Size of {spaced_name(name)}",
-                estimate_text(n[0]),
-                interval_text(n[0]) + _confounded_interval(diagnosis, n[0].key),
-                "size",
-            )
-            for name, n in of.items()
-            if n
-        ]
-    members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
-    return [Fact(f"If {spaced_name(row.effect)}", estimates_text(row)) for row in members[:3]]
 
 
 def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
@@ -339,44 +435,6 @@ def bounds_text(entry: Number, unit: str = "") -> str:
     text = f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
     ends = entry.ends_at
     return f"{text} (its {ends} bound{'s' if ' ' in ends else ''})" if ends else text
-
-
-def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
-    """The false-alarm rate of such trials, and the effects that they could have detected."""
-    if diagnosis.power is None:
-        return []
-    from vinetrack.narrative.diagnosis_text import AT_LARGEST, detectable_count, percent, unseen
-
-    power = diagnosis.power
-    alarm = Fact(
-        "False alarms", f"at most {percent(power.false_alarm_rate)}", "of such campaigns if nothing is missing"
-    )
-    if power.wary or not power.effects:
-        return [alarm, Fact("Detectable effects", "not computed", str(power.wary))]
-    undetectable = unseen(power)
-    # 6: undetectable effects listed on the first screen, at most (chosen)
-    listing = f"; not even then: {listed_names(undetectable)}" if 0 < len(undetectable) <= 6 else ""
-    return [alarm, Fact("Detectable effects", detectable_count(power), f"{AT_LARGEST}{listing}")]
-
-
-def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
-    ladder = None if ladder is None else settled_rows(ladder)
-    if ladder is None or not len(ladder):
-        return []
-    first, last = ladder.iloc[0], ladder.iloc[-1]
-    key, what = "rms_left_out_m", "Error on conditions left out"
-    if not math.isfinite(float(first[key])):
-        key, what = "rms_in_sample_m", "Error of position"
-    before, floor = 1e3 * float(first[key]), 1e3 * float(last["floor_m"])
-    answer = f"{number(before)} mm"
-    if len(ladder) > 1:
-        answer = f"{number(before)} → {number(1e3 * float(last[key]))} mm"
-    return [Fact(what, answer, f"replicate scatter {number(floor)} mm" if math.isfinite(floor) else "")]
-
-
-def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it."""
-    return table[~table["partial"].astype(bool)] if "partial" in table else table
 
 
 MOST_NAMED = 3  # Parameters or effects named in a sentence, at most (chosen)
@@ -418,10 +476,7 @@ def _missing(step: SelectionStep, model: str, trials: str) -> str:
             f"{text} The model predicts compression in the tail, which thin film cannot carry: `tail_slack: free` in "
             "experiment.yaml lets the tail go slack."
         )
-    return (
-        f"{text} With it in the model, no other candidate and no smooth force improves the fit."
-        f"{_chamber(step.answer_set)}{confounders_in_words(step.confounded)}{_runner_up(step)}"
-    )
+    return f"{text}{_chamber(step.answer_set)}{confounders_in_words(step.confounded)}"
 
 
 def _ambiguous(step: SelectionStep, model: str, trials: str) -> str:
@@ -429,7 +484,7 @@ def _ambiguous(step: SelectionStep, model: str, trials: str) -> str:
     return (
         f"{model} lacks an effect, and these data cannot tell which: {joined(list(step.answer_names), 'or')}. "
         f"{_hypotheses(answers)}. Their fits to {trials} lie within Δχ² = 9 of each other{_by_film(answers)}."
-        f"{_weights(answers)}{_chamber(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
+        f"{_chamber(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
     )
 
 
@@ -504,15 +559,6 @@ def _change_in_words(confounder: Confounder, digits: int) -> str:
     change = f"{abs(confounder.value - confounder.number.value) * factor:.{digits}f}{' ' + unit if unit else ''}"
     limit = f"{confounder.symbol} up to {confounder.limit * limit_factor:.2g}{' ' + limit_unit if limit_unit else ''}"
     return f"{change} because of {confounder.effect} ({limit})"
-
-
-def _weights(answers: Sequence[LikelihoodRatio]) -> str:
-    """Posterior weights of the hypotheses in the answer set, largest first."""
-    from vinetrack.diagnosis.likelihood_ratio import weights_of
-
-    weights = sorted(weights_of(answers).items(), key=lambda pair: -pair[1])
-    each = ", ".join(f"{label.replace('+', ' with ')} {100 * weight:.0f} %" for label, weight in weights)
-    return f" Posterior weights, with the plausible range of each size as its prior: {each}."
 
 
 def _chamber(answers: Sequence[LikelihoodRatio]) -> str:
@@ -614,17 +660,9 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
         names = tests.sensitivities.effects
         thresholds = [tests.family.threshold(name) for name in names]
         best = int((tests.one_sided_z - thresholds).argmax())
-        stricter = " (the level once an effect was added)" if tests.level < FALSE_ALARM_LEVEL_FIRST_ROUND else ""
-        # Those that the ranking does not call not testable
-        count = sum(
-            effect.name not in tests.sensitivities.silent
-            and (tests.upper_limits(effect)[1] or tests.best_z(effect.name)[0] >= tests.family.threshold(effect.name))
-            for effect in tests.effects
-        )
         text += (
-            f" The most significant of {count} candidates, {names[best]}, reaches "
-            f"{tests.one_sided_z[best]:.1f} σ; its threshold is {thresholds[best]:.1f} σ. Where nothing is missing, "
-            f"chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns{stricter}."
+            f" Nearest to its threshold is {names[best]}, {tests.one_sided_z[best]:.1f} of {thresholds[best]:.1f} σ;"
+            f" chance takes a candidate to it in one of {1 / tests.level:.0f} campaigns."
         )
         kind = next(effect.kind for effect in tests.effects if effect.name == names[best])
         # 3.0: significance from which a fault of the measurement below its threshold is named as worth a
@@ -638,20 +676,6 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
         f"{text} However, the trials seem to differ, which biases the fitted numbers: {difference_in_words(unstated)}"
         f" (Δχ² = {unstated.delta_chi2:.0f}).{remedies_in_words(step, [unstated])}"
     )
-
-
-def _runner_up(step: SelectionStep) -> str:
-    from vinetrack.diagnosis.likelihood_ratio import best_of
-
-    answers, excluded = {result.names for result in step.answer_set}, dict(step.rejected)
-    others = [r for r in step.fitted if len(r.names) == 1 and r.names not in answers and r.label not in excluded]
-    text = ""
-    if others:
-        best = best_of(others)
-        text = f" The next best, {best.names[0]}, is worse by Δχ² = {best.deviance_excess(step.answer_set[0]):.0f}."
-    for name, why in step.rejected:
-        text += f" {name} fits as well, but {why}."
-    return text
 
 
 def _capital(note: Remark) -> str:

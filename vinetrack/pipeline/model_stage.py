@@ -19,7 +19,6 @@ from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.core.terminal import table as aligned
-from vinetrack.core.units import with_error
 from vinetrack.diagnosis.drift import drift_groups
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
@@ -48,12 +47,10 @@ from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 from vinetrack.narrative.diagnosis_text import (
     added_in_words,
-    power_brief,
     sentences_of,
-    to_go_on,
-    verdict_line,
+    table_lines,
 )
-from vinetrack.narrative.verdict_text import settled_rows, summary_facts, verdict_meaning
+from vinetrack.narrative.verdict_text import settled_rows, verdict_line, verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
 from vinetrack.planning.predictive_inputs import pressure_problems
@@ -230,7 +227,7 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
         return diagnosis
     notes = (*contradictions.values(), *diagnosis.notes)
     contradicted = replace(diagnosis, contradicted_columns=tuple(contradictions), notes=notes)
-    return replace(contradicted, explanation=f"{verdict_meaning(contradicted)} {diagnosis.explanation}")
+    return replace(contradicted, explanation=f"{verdict_sentence(contradicted)} {diagnosis.explanation}")
 
 
 def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
@@ -264,7 +261,8 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]):
         write_csv(results.predictions(one.name), table)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
-    write_json(results.diagnosis, diagnosis.to_json())
+    summary = [vars(row) for row in verdict_table(diagnosis)]
+    write_json(results.diagnosis, {**diagnosis.to_json(), "summary": summary})
 
 
 def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:
@@ -334,33 +332,7 @@ def diagnosis_lines(folder: Path, brief: bool = False) -> list[str]:
         raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
     if not diagnosis.verdict:
         return [diagnosis.explanation]
-    power = power_brief(diagnosis.power) if diagnosis.power is not None else ""
-    sizes = [fact.answer for fact in summary_facts(diagnosis, None) if fact.code in ("significance", "size")]
-    told = sizes and not diagnosis.contradicted_columns
-    headline = verdict_line(diagnosis) + (f" ({'; '.join(sizes)})" if told else "")
-    reasons, notes = sentences_of(diagnosis.explanation), diagnosis.notes
-    if brief:
-        more = [f"… {len(reasons) - 2} more reasons in the report"] if len(reasons) > 2 else []
-        reasons, notes, power = [*reasons[:2], *more], notes[:1], ""
-    return [
-        headline,
-        *(f"  {line}" for line in reasons),
-        *([f"{power[0].upper()}{power[1:]}"] if power and power not in headline else []),
-        *_damping_line(diagnosis),
-        *(f"! {note}" for note in notes),
-        *filter(None, [to_go_on(diagnosis)]),
-    ]
-
-
-def _damping_line(diagnosis: Diagnosis) -> list[str]:
-    """Return the damping law of the final model, F = B·ẋⁿ, as a line; empty if that model has none."""
-    numbers = [number for number in diagnosis.parameters if number.key in ("eversion_damping.B", "eversion_damping.n")]
-    if not numbers:
-        return []
-    parts = [
-        f"{number.symbol}{f' ({number.vine})' if number.vine else ''} = {with_error(number.value, number.sigma)}"
-        f"{f' {number.unit}' if number.unit != '1' else ''}"
-        for number in sorted(numbers, key=lambda number: number.key != "eversion_damping.n")
-    ]
-    with_effects = f" with {' + '.join(diagnosis.effects)} in the model" if diagnosis.effects else ""
-    return [f"F = B·ẋⁿ{with_effects}: {', '.join(parts)}; ± is one standard error"]
+    lines = [verdict_line(diagnosis), *table_lines(diagnosis, notes=not brief)]
+    if not brief:
+        lines += [f"  {line}" for line in sentences_of(diagnosis.explanation)]
+    return [*lines, *(f"! {note}" for note in diagnosis.notes[: 1 if brief else None])]

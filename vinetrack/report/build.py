@@ -46,9 +46,8 @@ from vinetrack.narrative.verdict_text import (
     quantity_text,
     settled_rows,
     spaced_name,
-    summary_facts,
-    verdict_meaning,
     verdict_sentence,
+    verdict_table,
 )
 
 if TYPE_CHECKING:
@@ -184,9 +183,8 @@ def diagnosis_section(content: ReportContent) -> dict[str, Any] | None:
         "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
         "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
         "sentence": verdict_sentence(diagnosis),
-        "meaning": verdict_meaning(diagnosis),
         "summaries": [effects[name].summary for name in named if name in effects],
-        "facts": summary_facts(diagnosis, diagnosis.ladder),
+        "table": verdict_table(diagnosis),
         "explanation": diagnosis.explanation,
         "ladder": ladder_rows(diagnosis.ladder),
         "where": [line for line in map(str, diagnosis.where) if line not in drifting],
