@@ -21,7 +21,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, ParameterMap, make_layout
+from vinetrack.inference.fit_result import BetweenTerm, Fit, Number, groups_of
 from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.marginal_likelihood import (
     FitState,
@@ -30,7 +30,7 @@ from vinetrack.inference.marginal_likelihood import (
     estimate_between_trial_sd,
     marginal,
 )
-from vinetrack.inference.optimiser import Solution, is_poor_fit, make_problem
+from vinetrack.inference.optimiser import Solution, is_poor_fit
 from vinetrack.inference.position_errors import with_shapes, with_smooth_errors
 from vinetrack.inference.robust_covariance import (
     FEWEST_CLUSTERS,
@@ -40,7 +40,7 @@ from vinetrack.inference.robust_covariance import (
     robust_covariance,
     systematics_of,
 )
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE
 
 # ------------------------------------------------------------------------------
 # Likelihood gain of a difference between trials, from the linear mixed model of a fit, without simulations.
@@ -128,55 +128,42 @@ def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
 
 
 def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, MixedProblem, FitState]:
-    """Cross products, problem and state of a solution with the coefficients of a difference added, all zero."""
-    old, state = fit.predictor.layout, base.state
-    data, options = fit.predictor.data, fit.options
-    layout = make_layout(
-        old.model, data, fixed=options["fixed"], free=options["free"],
-        shared={**options["shared"], **difference.shared}, between=(*old.between, *difference.terms),
-    )  # fmt: skip
-    problem = make_problem(Predictor(layout, data, fit.predictor.host), state.trial_effects)
-    problem = replace(problem, release_origin_mean=base.problem.release_origin_mean)
-    theta = layout.start
-    known = {number.name: number.from_scaled(float(at)) for number, at in zip(old.free, state.theta, strict=False)}
-    for k, number in enumerate(layout.free):
-        value = known.get(number.name, known.get(number.key))
-        theta[k] = theta[k] if value is None else number.to_scaled(value)
-    shapes = base.problem.index.shape[1] - len(old.keys)
-    if shapes:
-        error_values, error_index = state.theta[len(old.free) :], base.problem.index[:, len(old.keys) :]
-        shifted = np.where(error_index < 0, -1, error_index - len(old.free) + len(layout.free))
-        problem = replace(with_shapes(problem, error_values.size), index=np.column_stack([problem.index, shifted]))
-        theta = np.append(theta, error_values)
-    T = _column_map(old, layout, shapes)
-    cross_products = np.einsum("nka,nckl,nlb->ncab", T, base.cross_products, T, optimize=True)
-    return cross_products, problem, replace(state, theta=theta)
-
-
-def _column_map(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
-    """Matrices that map the columns of one layout to those of another, shape (n_trials, n_columns before, after).
-    Columns are those of the trial effects, the keys, the shapes of smooth errors, and the residual.
+    """Cross products, problem and state of a solution with the coefficients of a difference added, all zero. Each is a
+    multiple of a column that the solution has: that of a trial's deviation, or of a parameter that vines shared.
     """
-    count, size = len(old.keys), N_TRIAL_EFFECTS + len(layout.keys) + shapes + 1
-    matrix = np.zeros((len(layout.index), N_TRIAL_EFFECTS + count + shapes + 1, size))
-    matrix[:, range(N_TRIAL_EFFECTS), range(N_TRIAL_EFFECTS)] = 1.0
-    errors_and_residual = np.arange(shapes + 1)
-    matrix[
-        :, N_TRIAL_EFFECTS + count + errors_and_residual, N_TRIAL_EFFECTS + len(layout.keys) + errors_and_residual
-    ] = 1.0
-    before_scale = np.array([number.scale for number in old.free] + [1.0])
-    scale = np.array([number.scale for number in layout.free] + [0.0])
-    logarithmic = np.array([number.logarithmic for number in layout.free] + [False])
-    for column, key in enumerate(layout.keys):
-        term, place = layout.term(key), layout.index[:, column]
-        if term is not None and key not in old.keys:
-            source = PRESSURE if term.pressure else DAMPING_DEVIATION
-            matrix[:, source, N_TRIAL_EFFECTS + column] = np.where(place >= 0, term.scale * term.regressor, 0.0)
-            continue
-        former = old.keys.index(key)
-        ratio = scale[place] / before_scale[old.index[:, former]]
-        matrix[:, N_TRIAL_EFFECTS + former, N_TRIAL_EFFECTS + column] = np.where(logarithmic[place], 1.0, ratio)
-    return matrix
+    columns, groups, factors, precisions = [], [], [], []
+    for term in difference.terms:
+        columns.append(PRESSURE if term.pressure else DAMPING_DEVIATION)
+        groups.append(term.groups)
+        factors.append(term.scale * term.regressor)
+        precisions.append((term.scale / term.prior_sd) ** 2)
+    for key, how in difference.shared.items():
+        columns.append(N_TRIAL_EFFECTS + fit.predictor.layout.keys.index(key))
+        of_trials = groups_of([trial.trial for trial in fit.trials], how)
+        groups.append(tuple("" if group == of_trials[0] else group for group in of_trials))
+        factors.append(np.ones(len(of_trials)))
+        precisions.append(0.0)
+    members = [[group for group in dict.fromkeys(of_trials) if group] for of_trials in groups]
+    first = base.problem.prior_mean.size + np.cumsum([0, *map(len, members)])
+    places = [
+        [begin + names.index(group) if group else -1 for group in of_trials]
+        for begin, names, of_trials in zip(first[:-1], members, groups, strict=True)
+    ]
+    precision = np.repeat(precisions, [len(names) for names in members])
+    problem = with_shapes(base.problem, precision.size, precision)
+    problem = replace(
+        problem,
+        index=np.column_stack([base.problem.index, *places]),
+        random=np.append(base.problem.random, precision > 0),
+    )
+    size = base.cross_products.shape[-1]
+    T = np.zeros((len(base.cross_products), size, size + len(columns)))
+    T[:, range(size - 1), range(size - 1)] = T[:, -1, -1] = 1.0
+    for k, (column, factor) in enumerate(zip(columns, factors, strict=True)):
+        T[:, column, size - 1 + k] = np.where(problem.index[:, base.problem.index.shape[1] + k] >= 0, factor, 0.0)
+    cross_products = np.einsum("nka,nckl,nlb->ncab", T, base.cross_products, T, optimize=True)
+    theta = np.append(base.state.theta, np.zeros(precision.size))
+    return cross_products, problem, replace(base.state, theta=theta)
 
 
 # ------------------------------------------------------------------------------

@@ -381,7 +381,7 @@ def _newton_on_fixed_columns(
     return state, cross_products, total_change, level
 
 
-def with_shapes(problem: MixedProblem, count: int, prior_precision: float = 1.0) -> MixedProblem:
+def with_shapes(problem: MixedProblem, count: int, prior_precision: float | Floats = 1.0) -> MixedProblem:
     """The problem with the sizes of the shapes as further free parameters, each with a normal prior of mean 0."""
     places = problem.prior_mean.size + np.arange(count)
     # A column that belongs to no free parameter has index −1, the appended zero.
