@@ -20,45 +20,34 @@ import argparse
 import csv
 import importlib
 import multiprocessing
+import pkgutil
 import sys
 import warnings
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from types import ModuleType
 
 import pandas as pd
 from hidden import make, tables
 from rich.progress import track
 
+import vinetrack.diagnosis
+
 THRESHOLDS = (
+    *("FALSE_ALARM_LEVEL_FIRST_ROUND", "FALSE_ALARM_LEVEL_LATER_ROUNDS", "SINGLE_PROBE_LEVEL", "FAR_OFF_CHI2_PER_DOF"),
+    *("MISSED_FRACTION", "MISSED_FRACTION_WITHOUT_SLOW_ERRORS", "SEARCH_CHI2_PER_DOF", "SEARCH_SIGMAS"),
     *(
-        ("misfit_tests", name)
-        for name in (
-            "FALSE_ALARM_LEVEL_FIRST_ROUND",
-            "FALSE_ALARM_LEVEL_LATER_ROUNDS",
-            "SINGLE_PROBE_LEVEL",
-            "FAR_OFF_CHI2_PER_DOF",
-            "MISSED_FRACTION",
-        )
+        "TESTABLE_SIGMAS",
+        "CAREFUL_PRESSURE_SCATTER",
+        "CAREFUL_DAMPING_SCATTER",
+        "ANSWER_SET_DELTA_CHI2",
+        "OUT_OF_REACH",
     ),
-    *(
-        ("misfit_tests", name)
-        for name in ("MISSED_FRACTION_WITHOUT_SLOW_ERRORS", "SEARCH_CHI2_PER_DOF", "SEARCH_SIGMAS", "TESTABLE_SIGMAS")
-    ),
-    *(
-        ("likelihood_ratio", name)
-        for name in ("ANSWER_SET_DELTA_CHI2", "OUT_OF_REACH", "CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS")
-    ),
-    *(("selection", name) for name in ("CLEAR_SCORE_EXCESS", "STALLED_CHI2_SHARE", "PARTIAL_SHARE")),
-    ("plausibility_prior", "RANGE_EDGE_DISTANCE"),
-    *(("candidate_fits", name) for name in ("MIN_SHARE_OF_SUBSET_GAIN", "LINEAR_REACH")),
-    *(("between_trials", name) for name in ("MIN_LINEAR_GAIN", "PLAUSIBLE_DRIFT", "SYSTEMATICS_CHECK_P_VALUE")),
-    ("contradictions", "CONTRADICTING_DRIFT_SIGMAS"),
-    ("drift", "FALSE_ALARM_LEVEL"),
-    ("trial_effect_tests", "CAREFUL_PRESSURE_SCATTER"),
-    ("slack_hypothesis", "MIN_PUSH_FRACTION"),
+    *("CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS", "RANGE_EDGE_DISTANCE", "PARTIAL_SHARE", "MIN_LINEAR_GAIN"),
+    *("SYSTEMATICS_CHECK_P_VALUE", "CONTRADICTING_DRIFT_SIGMAS", "FALSE_ALARM_LEVEL"),
 )
-"""Numbers of `vinetrack.diagnosis` that decide between one verdict and another, by module. Those that only bound the
-time of a search, or the words of a sentence, are not among them."""
+"""Numbers of `vinetrack.diagnosis` that decide between one verdict and another. Those that only bound the time of a
+search, or the words of a sentence, are not among them."""
 
 KINDS = (
     *("null:anything", "null:correlated", "null:large_B_scatter", "null:trace"),
@@ -76,16 +65,15 @@ Change = tuple[str, float]
 Task = tuple[Change, str, int, int]
 
 
-def changed(name: str, factor: float) -> None:
-    """Multiply a threshold in the module that declares it, and in every module that has imported it."""
-    for module_name, threshold in THRESHOLDS:
-        if threshold == name:
-            before = getattr(importlib.import_module(f"vinetrack.diagnosis.{module_name}"), name)
-            for module in [module for key, module in sys.modules.items() if key.startswith("vinetrack")]:
-                if getattr(module, name, None) is before:
-                    setattr(module, name, before * factor)
-            return
-    raise SystemExit(f"there is no threshold {name!r} among {', '.join(known for _, known in THRESHOLDS)}")
+def holders(name: str) -> list[ModuleType]:
+    """The modules that have a threshold, of those of the diagnosis and what they import."""
+    for known in pkgutil.iter_modules(vinetrack.diagnosis.__path__, "vinetrack.diagnosis."):
+        importlib.import_module(known.name)
+    loaded = [module for key, module in sys.modules.items() if key.startswith("vinetrack.")]
+    found = [module for module in loaded if name in vars(module)]
+    if not found:
+        raise SystemExit(f"the diagnosis has no threshold {name!r}")
+    return found
 
 
 def ask(task: Task) -> dict[str, object]:
@@ -93,9 +81,9 @@ def ask(task: Task) -> dict[str, object]:
     (name, factor), kind, seed, trials = task
     import vinetrack as vt
 
-    vt.diagnose  # noqa: B018  modules are imported when they are first asked for
     if name != AS_IT_IS[0]:
-        changed(name, factor)
+        for module in holders(name):
+            setattr(module, name, getattr(module, name) * factor)
     campaign = make(kind, seed, trials=trials)
     truth = campaign.truth
     row: dict[str, object] = {"threshold": name, "factor": factor, "kind": kind, "seed": seed}
@@ -169,7 +157,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="comma-separated thresholds")
     parser.add_argument("--rows", type=Path, help="CSV that keeps every answer")
     given = parser.parse_args()
-    names = given.only.split(",") if given.only else [name for _, name in THRESHOLDS]
+    names = given.only.split(",") if given.only else list(THRESHOLDS)
+    list(map(holders, names))  # a name that is none is told before the first campaign
     changes: list[Change] = [AS_IT_IS, *((name, factor) for name in names for factor in FACTORS)]
     seeds = range(given.first_seed, given.first_seed + given.campaigns)
     kinds = given.kinds.split(",")
