@@ -10,11 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from queue import Queue
 from typing import Self
 
 from chrome import Chrome, end, until
+from tornado.ioloop import IOLoop
 
-from vinetrack.pages.setup_server import SetupServer, start_server
+from vinetrack.pages.local_page import PageServer
+from vinetrack.pages.setup_server import Desk, start_server
 
 PROGRAM = "from vinetrack.cli.main import main; main()"
 
@@ -57,16 +60,22 @@ class Served:
 
 
 @contextmanager
-def served_here(clips: Path) -> Iterator[SetupServer]:
+def served_here(clips: Path) -> Iterator[PageServer]:
     """The set-up page of a folder, served by this process."""
-    server = start_server(clips, 0)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+    made: Queue[PageServer] = Queue()
+
+    def serve() -> None:
+        made.put(start_server(Desk(clips), 0))
+        IOLoop.current().start()
+
+    thread = threading.Thread(target=serve, daemon=True)
     thread.start()
+    server = made.get(timeout=30)
     try:
         yield server
     finally:
-        server.shutdown()
-        server.server_close()
+        server.loop.add_callback(server.stop)
+        server.loop.add_callback(server.loop.stop)
         thread.join(10)
 
 

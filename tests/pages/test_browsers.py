@@ -259,6 +259,8 @@ def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(pers
         " field.dispatchEvent(new ClipboardEvent('paste', {clipboardData, bubbles: true, cancelable: true})); })()"
     )
     person.chrome.wait("document.querySelectorAll('#pasted li').length === 1", "the row of no clip")
+    assert person.chrome.run(cells) == before[0]
+    person.press("#put-in")
     assert [float(cell) for cell in person.chrome.run(cells)] == pytest.approx([24.1317, 30.3369])
     assert person.chrome.run(names) == before[1]
     person.key("z", 90, modifiers=2)

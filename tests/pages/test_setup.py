@@ -12,7 +12,8 @@ from served import served_here
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import list_recordings, parse_yaml, read_table
 from vinetrack.pages import draft_files as draft
-from vinetrack.pages.setup_server import SetupServer, draft_from_json, draft_problems, page_state, write_templates
+from vinetrack.pages.local_page import PageServer
+from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state, write_templates
 from vinetrack.video.curved_axis import axis_through
 
 
@@ -139,7 +140,7 @@ def test_what_matches_nothing_is_named_and_changes_nothing():
     assert changed(text) == {(0, "pressure_kPa"): "24"}
     assert changed("24\n30\n36\n42", 1, "pressure_kPa") == {(1, "pressure_kPa"): "24", (2, "pressure_kPa"): "30"}
     assert changed("1\t2\n3\t4", 0, "trial") == {}
-    assert [notes(text), notes("24\n30\n36\n42", "pressure_kPa"), notes("1\t2\n3\t4")] == [2, 2, 1]
+    assert [notes(text), notes("24\n30\n36\n42", "pressure_kPa"), notes("1\t2\n3\t4")] == [3, 2, 1]
     assert notes("24\t0\t5", "pressure_kPa") == 1
     # A name of two recordings is of neither.
     rows = [{"trial": "a", "video": "x/1.mp4"}, {"trial": "b", "video": "y/1.mp4"}]
@@ -207,8 +208,8 @@ def server(clips):
         yield made
 
 
-def ask(server: SetupServer, path: str, body=None, headers=OURS, secret=None) -> tuple[int, bytes, str]:
-    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)) as connection:
+def ask(server: PageServer, path: str, body=None, headers=OURS, secret=None) -> tuple[int, bytes, str]:
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", server.port, timeout=120)) as connection:
         method, data = ("GET", None) if body is None else ("POST", json.dumps(body))
         connection.request(method, (server.secret if secret is None else secret) + path, data, headers)
         answer = connection.getresponse()
@@ -217,7 +218,7 @@ def ask(server: SetupServer, path: str, body=None, headers=OURS, secret=None) ->
 
 def test_the_page_frames_and_the_axis_along_the_tube_are_served(server):
     assert b"<title>vinetrack set-up</title>" in ask(server, "/")[1]
-    assert b"--ink" in ask(server, "/setup.css")[1]
+    assert b"--ink" in ask(server, "/api/frame.css")[1]
     assert ask(server, "/table.js")[2].startswith("text/javascript")
     assert ask(server, "/setup_server.py")[0] == 404
     status, data, kind = ask(server, "/api/frame?recording=d15%2024kPa%201.mp4&frame=3")
@@ -267,5 +268,5 @@ def test_other_pages_names_and_requests_without_the_secret_get_nothing(server, c
     assert not (clips / "trials.csv").exists()
     assert len(server.secret) > 20
     for path in ("/", "/setup.js", "/api/state", "/api/frame?recording=a.mp4&frame=0"):
-        assert ask(server, path, headers={"Host": f"evil.example:{server.server_port}"})[0] == 403
-        assert ask(server, path, secret="")[0] == 403
+        assert ask(server, path, headers={"Host": f"evil.example:{server.port}"})[0] == 403
+        assert ask(server, path, secret="")[0] == 404

@@ -6,7 +6,6 @@ import logging
 import math
 import shlex
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -16,18 +15,17 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import Floats, Kinematics, Track, Trial
+from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import SLIDER_UNITS, display_unit
-from vinetrack.diagnosis.ladder import compare
-from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.replicates import align_replicates, first_that_counts
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
 from vinetrack.inference.fit import fit, predict_from_rest, refit, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
-from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
+from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.local_page import THREAD_PREFIX
@@ -37,6 +35,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.experiment.folder import Experiment
+    from vinetrack.inference.fit_summary import FitSummary
 
 
 @dataclass(frozen=True)
@@ -86,35 +85,34 @@ def drawn_rows(count: int, first: int) -> slice:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A results folder with its experiment, read by `read_campaign`. `numbers` are the estimates of the fit in
-    `fit.json`, by name, SI; empty if the fit was refused, with the reason in `refused`. `log_likelihood` is that of the
-    same fit, NaN if it was refused. `in_use` are the effects of the model that the results are of. `bands` are time,
-    mean and standard deviation of the replicates of a condition, shape (3, n_times).
+    """A results folder with its experiment, read by `read_campaign`. `stored` is its fit; `in_use` are the effects of
+    the model that the results are of. `bands` are time, mean and standard deviation of the replicates of a condition,
+    shape (3, n_times).
     """
 
-    name: str
     folder: Path
     experiment: Experiment
     pairs: tuple[tuple[Trial, Track], ...]
-    kinematics: Mapping[str, Kinematics]
     trials: tuple[ExplorerTrial, ...]
     left_out: Mapping[str, str]
     bands: Mapping[str, Floats]
     floors_m: Mapping[str, float]
-    numbers: Mapping[str, float]
-    log_likelihood: float
-    refused: str
+    stored: FitSummary
     effects: Mapping[str, Effect]
     unusable: Mapping[str, str]
     in_use: tuple[str, ...]
 
     @cached_property
-    def conditions(self) -> tuple[str, ...]:
-        """Conditions ordered by vine (as in the sheet), payload and pressure."""
+    def examples(self) -> Mapping[str, Trial]:
+        """The first trial of each condition, ordered by vine (as in the sheet), payload and pressure."""
         first = {aligned.condition: aligned.data.trial for aligned in reversed(self.trials)}
-        vines = list(dict.fromkeys(aligned.data.trial.vine for aligned in self.trials))
-        rank = {name: (vines.index(t.vine), t.payload_kg, t.pressure_Pa) for name, t in first.items()}
-        return tuple(sorted(rank, key=lambda name: rank[name]))
+        rank = {name: (self.vines.index(t.vine), t.payload_kg, t.pressure_Pa) for name, t in first.items()}
+        return {name: first[name] for name in sorted(first, key=lambda name: rank[name])}
+
+    @cached_property
+    def conditions(self) -> tuple[str, ...]:
+        """Conditions in the same order."""
+        return tuple(self.examples)
 
     @cached_property
     def vines(self) -> tuple[str, ...]:
@@ -128,8 +126,7 @@ class Campaign:
     @cached_property
     def labels(self) -> Mapping[str, str]:
         """A short name of every condition: those of its settings that vary."""
-        first = {aligned.condition: aligned.data.trial for aligned in reversed(self.trials)}
-        return condition_labels({name: first[name] for name in self.conditions})
+        return condition_labels(self.examples)
 
     @cached_property
     def host(self) -> Model:
@@ -154,14 +151,14 @@ class Campaign:
 def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[str, Effect]) -> Campaign:
     """Read the results folder of an experiment."""
     results = Results(folder)
-    pairs, kinematics = measured_trials(experiment, results)
+    pairs, _ = measured_trials(experiment, results)
     data, left_out = prepare(pairs, weighted=False)
     if not data:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"
         raise ResultsError(f"{folder} has no trial to explore: {why}")
-    fitted = read_fit(results)
+    stored = read_fit(results)
     floors_m: dict[str, float] = {}
-    if not fitted.refused:
+    if not stored.refused:
         table = read_result(results.comparison).astype({"condition": str, "replicate_floor_m": float})
         floors_m = dict(zip(table["condition"], table["replicate_floor_m"], strict=True))
     compared = {name: read_result(results.trajectories(name)) for name in floors_m}
@@ -179,20 +176,16 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         except EffectError:
             unusable[effect.name] = f"needs {' and '.join(effect.needs)} in the sheet"
     return Campaign(
-        name=folder.name,
         folder=folder,
         experiment=experiment,
         pairs=tuple(pairs),
-        kinematics=kinematics,
         trials=tuple(_align_trials(data, compared)),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
         bands=bands,
         floors_m=floors_m,
-        numbers={entry.name: entry.value for entry in fitted.numbers},
-        log_likelihood=fitted.log_likelihood,
-        refused=fitted.refused,
+        stored=stored,
         effects=effects,
-        in_use=fitted.names if fitted.names and set(fitted.names) <= set(effects) else tuple(experiment.settings.model),
+        in_use=stored.names if stored.names and set(stored.names) <= set(effects) else tuple(experiment.settings.model),
         unusable=unusable,
     )
 
@@ -262,7 +255,9 @@ class Prediction:
 
 
 def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[str, float] | None = None) -> Prediction:
-    """Predict every trial by a choice; the scatter of replicates hardly depends on it, and is taken as given."""
+    """Predict every trial by a choice. The scatter of replicates hardly depends on it, and takes as long: while a
+    slider is dragged it is given.
+    """
     data = []
     for aligned in campaign.trials:
         trial = aligned.data.trial
@@ -272,12 +267,14 @@ def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[st
             yield_Pa = choice.numbers.get(f"{YIELD_PRESSURE}[{group}]", yield_Pa)
         data.append(replace(aligned.data, trial=replace(trial, yield_pressure_Pa=yield_Pa)))
     predicted = predict_from_rest(sized_model(campaign, choice), data, campaign.host)
-    squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in predicted]
-    errors_m = {
-        condition: math.sqrt(float(np.mean([squares[i] for i in campaign.indices_of_condition(condition)])))
-        for condition in campaign.conditions
-    }
-    return Prediction(tuple(predicted), errors_m, campaign.floors_m if floors_m is None else floors_m)
+    members = {name: [predicted[i] for i in campaign.indices_of_condition(name)] for name in campaign.conditions}
+    errors_m = {}
+    for name, trials in members.items():
+        squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
+        errors_m[name] = math.sqrt(float(np.mean(squares)))
+    if floors_m is None:
+        floors_m = {name: align_replicates(trials).floor_m for name, trials in members.items()}
+    return Prediction(tuple(predicted), errors_m, floors_m)
 
 
 def overall_m(errors: Mapping[str, float]) -> float:
@@ -341,7 +338,8 @@ class ModelChoice:
 def choice_in_use(campaign: Campaign) -> ModelChoice:
     """Return the model in use with its fitted values, and all other parameters at their defaults."""
     sizes = [size for effect in campaign.effects.values() for size in sizes_of(campaign, effect)]
-    return ModelChoice(campaign.in_use, {size.name: size.parameter.default for size in sizes} | {**campaign.numbers})
+    numbers = {number.name: number.value for number in campaign.stored.numbers}
+    return ModelChoice(campaign.in_use, {size.name: size.parameter.default for size in sizes} | numbers)
 
 
 def sizes_of(campaign: Campaign, effect: Effect) -> list[SizeControl]:
@@ -389,41 +387,45 @@ class Cancelled(Exception):  # noqa: N818 - nothing went wrong
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """A fit, the choice with its estimates, and what it predicts."""
+class Evaluated:
+    """A choice with what it predicts, and the fit that its sizes are from, if they are from one."""
 
     choice: ModelChoice
-    fit: Fit
     prediction: Prediction
-    seconds: float
+    fitted: Fit | None = None
 
-    def number(self, name: str) -> Number | None:
-        """Return the estimate of a parameter, None if it was not fitted."""
-        return next((number for number in self.fit.numbers if number.name == name), None)
+    @property
+    def fit(self) -> Fit:
+        """The fit, of a choice known to have one."""
+        assert self.fitted is not None
+        return self.fitted
+
+    @property
+    def numbers(self) -> dict[str, Number]:
+        """The fitted numbers by name."""
+        return {} if self.fitted is None else {number.name: number for number in self.fitted.numbers}
 
 
-def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
+def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Evaluated:
     """Fit the model in use, as the model stage of the workflow does. The likelihood to be reached is in `fit.json`: if
     the first start reaches it, no others are tried.
     """
-    started = time.perf_counter()
     model = sized_model(campaign, choice)
     # A falling body has no other parameter.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     bare = replace(model, values={})
     run_fit = partial(fit, bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
     result = run_fit(thorough=False)
-    if not result.log_likelihood > campaign.log_likelihood - CLEARLY_WORSE:
+    if not result.log_likelihood > campaign.stored.log_likelihood - CLEARLY_WORSE:
         result = run_fit()
-    return _evaluated(campaign, choice, result, time.perf_counter() - started)
+    return _evaluated(campaign, choice, result)
 
 
 @in_one_blas_thread
-def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
+def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watch | None = None) -> Evaluated:
     """Fit the chosen model, starting from an earlier fit, with the chosen sizes of new effects. If the result is worse
     than without the new effects, or has not converged, it is refitted from their defaults.
     """
-    started = time.perf_counter()
     sized = sized_model(campaign, choice)
     model = replace(sized, values={})
     new = [effect for effect in model if effect.name not in before.model]
@@ -435,43 +437,12 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
         defaults: dict[str, Value] = {f"{e.name}.{p.name}": p.default for e in new for p in e.parameters}
         other = refit(before, model, start=defaults, watch=watch)
         result = max((result, other), key=lambda result: result.log_likelihood)
-    return _evaluated(campaign, choice, result, time.perf_counter() - started)
+    return _evaluated(campaign, choice, result)
 
 
-def _evaluated(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: float) -> Fitted:
-    """A fit with what it predicts of every trial, exactly as `vinetrack compare` does."""
-    fitted_choice = choice.with_sizes({number.name: number.value for number in result.numbers})
-    comparison = compare(result, campaign.pairs, kinematics=campaign.kinematics)
-    by_name = {trial.name: trial for trial in comparison.trials}
-    table = comparison.table.set_index("condition")
-    errors_m, floors_m = (
-        dict(zip(campaign.conditions, map(float, table.loc[list(campaign.conditions), column]), strict=True))
-        for column in ("rms_position_m", "replicate_floor_m")
-    )
-    prediction = Prediction(tuple(by_name[trial.name] for trial in campaign.trials), errors_m, floors_m)
-    return Fitted(fitted_choice, result, prediction, seconds)
-
-
-def likelihood_change_text(before: Fit, after: Fit) -> str:
-    """Return how −2 ln L changed with a larger or smaller model, as a sentence."""
-    gain = 2 * (after.log_likelihood - before.log_likelihood)
-    more = len(after.numbers) - len(before.numbers)
-    count = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
-    change = f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f}"
-    return f"{change} for {count}." if more else f"{change} with the same number of parameters."
-
-
-def correlated_pairs_text(result: Fit) -> list[str]:
-    """Return the pairs of strongly correlated estimates, largest correlation first, as text."""
-    # Chosen: with this correlation each standard error is 1/√(1 − 0.9²) = 2.3 times its value with the other
-    # parameter known
-    strong_correlation = 0.9
-    with np.errstate(invalid="ignore", divide="ignore"):
-        sigma = np.sqrt(np.diag(result.covariance))
-        correlation = np.triu(result.covariance / np.outer(sigma, sigma), 1)
-    strong = [(i, k) for i, k in np.argwhere(np.abs(correlation) > strong_correlation) if sigma[i] > 0 < sigma[k]]
-    pairs = [(correlation[i, k], result.numbers[i].title, result.numbers[k].title) for i, k in strong]
-    return [f"{a} and {b}: correlation {r:+.2f}" for r, a, b in sorted(pairs, key=lambda pair: -abs(pair[0]))]
+def _evaluated(campaign: Campaign, choice: ModelChoice, fitted: Fit) -> Evaluated:
+    choice = choice.with_sizes({number.name: number.value for number in fitted.numbers})
+    return Evaluated(choice, predict_choice(campaign, choice), fitted)
 
 
 Progress = TypeVar("Progress")
@@ -529,7 +500,8 @@ class Job(Generic[Progress, Outcome]):
 
 class BackgroundFit:
     """Computes in a thread the `prediction` of the model in use, then its fit. `failure` is the reason if it
-    failed, else blank. The listeners are called from that thread whenever there is a new result or step.
+    failed, else blank. The listeners are called from that thread whenever there is a
+    new result or step.
     """
 
     def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
@@ -537,29 +509,32 @@ class BackgroundFit:
         self.initial = choice_in_use(campaign)
         self.opening_choice = self.initial if choice in (None, self.initial) else choice
         self.prediction: Prediction | None = None
-        self.fitted: Fitted | None = None
+        self.fitted: Evaluated | None = None
         self.step: Step | None = None
         self.failure = ""
         self.listeners: list[Callable[[], None]] = []
-        self._job: Job[Step, Fitted] | None = None
+        self._job: Job[Step, Evaluated] | None = None
 
     def begin(self) -> BackgroundFit:
         """Start the thread."""
         self._job = Job(self._work, self._on_step, self._on_end)
         return self
 
-    def wait(self, timeout_s: float | None = None) -> None:
-        """Wait until it has finished or failed."""
+    def wait(self) -> Evaluated:
+        """Wait for the fit and return it; a UserError with the reason if there is none."""
         if self._job is not None:
-            self._job.wait(timeout_s)
+            self._job.wait()
+        if self.fitted is None:
+            raise UserError(self.failure)
+        return self.fitted
 
     @property
     def running(self) -> bool:
         """Whether the fit is awaited."""
         return self._job is not None and self.fitted is None and not self.failure
 
-    def _work(self, watch: Watch) -> Fitted:
-        self.prediction = predict_choice(self.campaign, self.initial)
+    def _work(self, watch: Watch) -> Evaluated:
+        self.prediction = predict_choice(self.campaign, self.initial, self.campaign.floors_m)
         self._notify()
         return first_fit(self.campaign, self.initial, watch)
 
@@ -567,45 +542,13 @@ class BackgroundFit:
         self.step = step
         self._notify()
 
-    def _on_end(self, fitted: Fitted | None, reason: str) -> None:
+    def _on_end(self, fitted: Evaluated | None, reason: str) -> None:
         self.fitted, self.failure = fitted, reason
         self._notify()
 
     def _notify(self) -> None:
         for listener in list(self.listeners):
             listener()
-
-
-class FitProgress:
-    """Progress of a fit that began at `now`, as a fraction and as text. The number of steps is unknown. Progress is
-    measured on the logarithm of the predicted decrease of −2 ln L by the next step, from its largest value down to
-    `CONVERGED_DECREASE`, where a fit stops.
-    """
-
-    def __init__(self, now: float) -> None:
-        self._started = now
-        self._largest = 0.0
-        self._fraction = 0.04  # Chosen: visible at a width of 200 pixels
-        self._step: Step | None = None
-
-    def update(self, step: Step) -> None:
-        """Take the latest step of the fit into account."""
-        self._step = step
-        if math.isfinite(step.predicted_decrease) and step.predicted_decrease > 0:
-            self._largest = max(self._largest, step.predicted_decrease)
-            to_go = math.log10(max(step.predicted_decrease, CONVERGED_DECREASE) / CONVERGED_DECREASE)
-            whole = math.log10(max(self._largest, 10 * CONVERGED_DECREASE) / CONVERGED_DECREASE)
-            self._fraction = max(self._fraction, min(1 - to_go / whole, 0.97))
-
-    def state(self, now: float, task: str, other: Step | None = None) -> tuple[float, str]:
-        """Return the fraction done and the text of the status line."""
-        step = other or self._step
-        if step is not None:
-            task += f" · step {step.iteration}"
-            if math.isfinite(step.predicted_decrease):
-                gain = f"the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
-                task += f" · {gain if step.predicted_decrease < 1e4 else 'still far off'}"
-        return self._fraction, f"{task} · {now - self._started:.1f} s"
 
 
 def commands(campaign: Campaign, choice: ModelChoice, *, fitted: bool, save: bool = False) -> list[str]:

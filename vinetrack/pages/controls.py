@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from bokeh.models import (
     Column,
     ColumnDataSource,
     CustomJS,
+    Div,
     PrintfTickFormatter,
     Slider,
     Toggle,
@@ -23,12 +23,11 @@ from bokeh.models import (
 
 from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.effects import BASE_EFFECTS, load_effect
-from vinetrack.inference.fit_result import Number
+from vinetrack.inference.fit_result import Number, number_row
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
-    Fitted,
     Job,
     ModelChoice,
     SizeControl,
@@ -37,16 +36,7 @@ from vinetrack.pages.campaign import (
     sizes_of,
     slider_range,
 )
-from vinetrack.pages.plots import (
-    button,
-    html_div,
-    panel,
-    progress_bar,
-    set_text,
-    side_by_side,
-    stacked,
-    stylesheet,
-)
+from vinetrack.pages.plots import beside, button, panel, progress_bar, set_text
 from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect
 
 if TYPE_CHECKING:
@@ -69,10 +59,10 @@ class SizeSlider:
             sizing_mode="stretch_width",
             disabled=disabled,
             name=f"size_{size.name}",
-            stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; }")],
+            css_classes=["size"],
             margin=(2, 0, 6, 0),
         )
-        self.fitted = html_div(visible=False, name=f"found_{size.name}")
+        self.fitted = Div(visible=False, name=f"found_{size.name}")
         self.slider.on_change("value", lambda _attr, _old, new: moved(size.name, float(new) / factor))
 
     def _ends(self, value: float) -> dict[str, float]:
@@ -83,36 +73,29 @@ class SizeSlider:
         # 400: steps of a slider; chosen: about one per pixel
         return {"start": low, "end": high, "step": (high - low) / 400 or 1.0}
 
-    def set(self, value: float) -> None:
-        """Move the slider to a value; what does not change is not sent."""
+    def show(self, value: float, number: Number | None) -> None:
+        """Move the slider to a value, and show the estimate of a fit below it, or none."""
         self.slider.update(**self._ends(value), value=value * self.size.shown[1])
-
-    def show_fitted(self, number: Number | None) -> None:
-        """Show the estimate of a fit below the slider, or nothing."""
-        if number is None:
-            self.fitted.visible = False
-            return
-        unit, factor = self.size.shown
-        low, high, value = (factor * x for x in (number.low, number.high, number.value))
-        if math.isfinite(number.bound):
-            text = f"<b>{factor * number.bound:.4g}</b> {escape(unit)}, at its bound"
-        else:
-            error = f" ± {factor * number.sigma:.2g}" if math.isfinite(number.sigma) else ""
+        text = ""
+        if number is not None:
+            _, estimate, error, _, interval, unit = number_row(number)
             ends = f" (its {number.ends_at} bound)" if number.ends_at else ""
-            text = f"<b>{value:.4g}{error}</b> {escape(unit)} · 95 %: {low:.4g} to {high:.4g}{ends}"
-        self.fitted.update(text=f"<small>fitted: {text}</small>", visible=True)
+            reach = f" · 95 %: {interval}{ends}" if interval else ""
+            text = f"<small>fitted: <b>{estimate} {error}</b> {escape(unit)}{reach}</small>"
+        self.fitted.update(text=text, visible=number is not None)
 
 
 def _opens(inside: UIElement, title: str, look: str, **keywords: Any) -> Toggle:
     """A toggle that shows and hides what is inside."""
-    look_of: dict[str, Any] = {"css_classes": [look], "stylesheets": [stylesheet()], "margin": 0}
-    head = Toggle(label=title, active=inside.visible, **look_of, **keywords)
+    head = Toggle(label=title, active=inside.visible, css_classes=[look], **keywords)
     head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
     return head
 
 
 class EffectPanel:
-    """All effects in groups; calls `ticked(effect, wanted)` and `moved(effect, parameter, value)` on user input."""
+    """All effects in groups; calls `ticked(effect, wanted)` and `moved(effect, parameter, value)` whenever a tick or a
+    size changes.
+    """
 
     def __init__(
         self,
@@ -122,8 +105,6 @@ class EffectPanel:
         ticked: Callable[[str, bool], None],
         moved: Callable[[str, str, float], None],
     ) -> None:
-        self._ticked, self._moved = ticked, moved
-        self._updating = False
         self.ticks: dict[str, Checkbox] = {}
         self.sliders: dict[str, list[SizeSlider]] = {}
         rows: dict[str, Column] = {}
@@ -135,17 +116,16 @@ class EffectPanel:
                 disabled=bool(unusable) or name in BASE_EFFECTS,  # all others are added to these
                 name=f"tick_{name}",
                 css_classes=["tick"],
-                stylesheets=[stylesheet()],
                 margin=(6, 0, 0, 0),
             )
-            self.ticks[name].on_change("active", partial(self._on_tick, name))
+            self.ticks[name].on_change("active", lambda _attr, _old, new, name=name: ticked(name, new))
             self.sliders[name] = [
-                SizeSlider(size, choice.numbers[size.name], bool(unusable), partial(self._on_size, name))
+                SizeSlider(size, choice.numbers[size.name], bool(unusable), partial(moved, name))
                 for size in sizes_of(campaign, effect)
             ]
-            about = html_div(f"<small>{escape(unusable or effect.formula)}</small>")
+            about = Div(text=f"<small>{escape(unusable or effect.formula)}</small>")
             parts = [part for one in self.sliders[name] for part in (one.slider, one.fitted)]
-            rows[name] = stacked(self.ticks[name], about, *parts, margin=(0, 0, 4, 0))
+            rows[name] = Column(self.ticks[name], about, *parts, margin=(0, 0, 4, 0))
         in_use = [name for name in rows if name in choice]
         likely = [name for name in suspects if name in rows and name not in in_use][:6]
         others = [name for name in rows if name not in in_use and name not in likely]
@@ -159,31 +139,16 @@ class EffectPanel:
         shown = []
         for title, names, visible in groups:
             if names:
-                inside = stacked(*(rows[name] for name in names), visible=visible)
-                shown.append(stacked(_opens(inside, title, "heading", sizing_mode="stretch_width"), inside))
-        self.root = stacked(*shown, name="effects")
+                inside = Column(*(rows[name] for name in names), visible=visible)
+                shown.append(Column(_opens(inside, title, "heading", sizing_mode="stretch_width"), inside))
+        self.root = Column(*shown, name="effects")
 
-    def _on_tick(self, name: str, _attr: str, _old: bool, new: bool) -> None:
-        if not self._updating:
-            self._ticked(name, new)
-
-    def _on_size(self, effect: str, number: str, value: float) -> None:
-        if not self._updating:
-            self._moved(effect, number, value)
-
-    def show(self, choice: ModelChoice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
-        """Set tick boxes and, optionally, sliders to a choice; show the fitted value at each slider."""
-        self._updating = True
-        try:
-            for name, tick in self.ticks.items():
-                if tick.active != (name in choice):
-                    tick.active = name in choice
-                for one in self.sliders[name]:
-                    if sliders:
-                        one.set(choice.numbers[one.size.name])
-                    one.show_fitted(fitted.number(one.size.name) if fitted is not None and name in choice else None)
-        finally:
-            self._updating = False
+    def show(self, choice: ModelChoice, numbers: Mapping[str, Number]) -> None:
+        """Set tick boxes and sliders to a choice, with the fitted numbers of its effects by name."""
+        for name, tick in self.ticks.items():
+            tick.active = name in choice
+            for one in self.sliders[name]:
+                one.show(choice.numbers[one.size.name], numbers.get(one.size.name) if name in choice else None)
 
 
 class TrialSelector:
@@ -193,19 +158,18 @@ class TrialSelector:
         self.campaign, self._on_change = campaign, on_change
         self._conditions = self._chips([campaign.labels[name] for name in campaign.conditions], "conditions")
         self._trials = self._chips([aligned.name for aligned in campaign.trials], "trials", visible=False)
-        tools = side_by_side(
+        tools = beside(
             button("all", "choose_all", self._all, css_classes=["small"]),
             button("none", "choose_none", lambda: self._conditions.update(active=[]), css_classes=["small"]),
             _opens(self._trials, "single trials …", "small", name="single_trials"),
             css=":host { gap: 4px; }",
         )
-        self.root = stacked(self._conditions, tools, self._trials, name="choose")
+        self.root = Column(self._conditions, tools, self._trials, name="choose")
 
     def _chips(self, labels: list[str], name: str, **keywords: Any) -> CheckboxButtonGroup:
         """Buttons that are all chosen at first."""
-        look: dict[str, Any] = {"css_classes": ["chips", name], "stylesheets": [stylesheet()], **keywords}
-        margin = (4, 0, 0, 0) if name == "trials" else (0, 0, 4, 0)
-        chips = CheckboxButtonGroup(labels=labels, active=list(range(len(labels))), name=name, margin=margin, **look)
+        given = {"name": name, "css_classes": ["chips", name], "margin": (2, 0), **keywords}
+        chips = CheckboxButtonGroup(labels=labels, active=list(range(len(labels))), **given)
         chips.on_change("active", lambda _attr, _old, _new: self._on_change())
         return chips
 
@@ -260,29 +224,27 @@ class ProposalPanel:
         self._page, self._reopen = page, reopen
         self._job: Job[str, tuple[WrittenProposal, Campaign, ModelChoice]] | None = None
         self._task, self._begun_s = "", 0.0
-        self._outcome: tuple[Campaign, ModelChoice] | None = None
+        self._proposed: tuple[Campaign, ModelChoice] | None = None
         self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
         self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)
-        self.text = html_div(name="proposal")
+        command = f"vinetrack propose {page.campaign.folder.as_posix()}"
+        self.text = Div(text=panel("propose", command=command), name="proposal")
         self._reload = ColumnDataSource({"times": [0]}, name="reload")
         self._reload.js_on_change("data", CustomJS(code="location.reload()"))
-        buttons = side_by_side(self.button, self.open)
-        self.root = stacked(self.text, buttons, name="propose_panel", tags=[self._reload])
+        buttons = beside(self.button, self.open)
+        self.root = Column(self.text, buttons, name="propose_panel", tags=[self._reload])
         self.show()
 
     def show(self) -> None:
         """Update after a change of the diagnosis, and as time passes."""
-        unexplained = False
-        if (diagnosis := self._page.diagnosis) is not None and not diagnosis.contradicted_columns:
+        diagnosis, unexplained = self._page.diagnosis, False
+        if diagnosis is not None and not diagnosis.contradicted_columns:
             unexplained = UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict)
-        self.root.visible = self._job is not None or self._outcome is not None or unexplained
+        self.root.visible = self._job is not None or self._proposed is not None or unexplained
         if self._job is not None:
             passed_s = time.monotonic() - self._begun_s
             # 75 s: time in which the progress bar of a search is half full (chosen)
-            share = max(passed_s / (passed_s + 75.0), 0.04)
-            set_text(self.text, progress_bar(share, f"{self._task} · {passed_s:.0f} s"))
-        elif self._outcome is None and not self.text.text:
-            set_text(self.text, panel("propose", command=f"vinetrack propose {self._page.campaign.folder.as_posix()}"))
+            set_text(self.text, progress_bar(passed_s / (passed_s + 75.0), f"{self._task} · {passed_s:.0f} s"))
 
     def close(self) -> None:
         """The page was closed."""
@@ -292,7 +254,7 @@ class ProposalPanel:
     def _propose_or_stop(self) -> None:
         if self._job is not None:
             self._job.cancel()
-            self._ended("<p>The search was stopped; nothing was written.</p>")
+            self._done(None, "The search was stopped; nothing was written.")
             return
         self._task, self._begun_s, self.button.label = "reading the results", time.monotonic(), "Stop"
         soon = self._page.document.add_next_tick_callback
@@ -304,21 +266,14 @@ class ProposalPanel:
         self._task = task
 
     def _done(self, outcome: tuple[WrittenProposal, Campaign, ModelChoice] | None, reason: str) -> None:
-        if outcome is None:
-            self._ended(f'<p class="bad">{escape(reason)}</p>')
-            return
-        written = outcome[0]
-        self._outcome = outcome[1:] if written.files else None
-        self.open.visible = self._outcome is not None and self._reopen is not None
-        self._ended("".join(f"<p>{escape(line)}</p>" for line in written.lines))
-
-    def _ended(self, text: str) -> None:
         self._job, self.button.label = None, PROPOSE
-        self.button.visible = self._outcome is None
-        set_text(self.text, text)
-        self.root.visible = True
+        if outcome is not None and outcome[0].files:
+            self._proposed = outcome[1:]
+            self.button.visible, self.open.visible = False, self._reopen is not None
+        lines = [reason] if outcome is None else outcome[0].lines
+        set_text(self.text, "".join(f"<p>{escape(line)}</p>" for line in lines))
 
     def _open(self) -> None:
-        if self._outcome is not None and self._reopen is not None:
-            self._reopen(BackgroundFit(*self._outcome).begin())
+        if self._proposed is not None and self._reopen is not None:
+            self._reopen(BackgroundFit(*self._proposed).begin())
             self._reload.data = {"times": [1]}

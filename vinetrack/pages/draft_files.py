@@ -354,6 +354,9 @@ def place_block(
             if name and name != "trial":
                 column = column_of(name, columns)
                 placed.append((row, column, in_unit_of(column, name, cell, decimal)))
+    without = [row.get("trial", "") for i, row in enumerate(rows) if i not in {at for at, _, _ in placed}]
+    if name_place is not None and placed and without:
+        notes.append(f"No line for {', '.join(without)}: left as they are.")
     return placed, notes
 
 
@@ -427,6 +430,12 @@ def list_tables(folder: Path) -> list[str]:
     folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
     tables = [path for place in folders for path in entries(place) if path.suffix.lower() == ".csv"]
     names = (path.relative_to(folder).as_posix() for path in tables)
+    return sorted((name for name in names if name not in FILES), key=natural_order)
+
+
+def list_notes(folder: Path) -> list[str]:
+    """Return the files that may be notes on the recordings, by name."""
+    names = [path.name for path in entries(folder) if path.suffix.lower() in (".txt", ".md", ".tsv", ".csv")]
     return sorted((name for name in names if name not in FILES), key=natural_order)
 
 

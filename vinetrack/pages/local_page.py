@@ -1,18 +1,20 @@
-"""What both pages share: address, port and shutdown of their servers, and frames as JPEG."""
+"""What both pages share: a server that answers this machine only, and frames as JPEG."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import secrets
 import signal
 import threading
 import webbrowser
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
+    import tornado.web
     from numpy.typing import NDArray
 
 LOOPBACK = "127.0.0.1"
@@ -20,54 +22,71 @@ FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 page
 
 THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
 
-Server = TypeVar("Server")
+
+Application = TypeVar("Application", bound="tornado.web.Application")
 
 
-def secret_path() -> str:
-    """Return a random first part of a page's path, so that only users who know the address have access."""
-    return f"/{secrets.token_urlsafe(16)}"
-
-
-def is_from_page(headers: Any, port: int) -> bool:
-    """Whether the `Host` and the `Origin` of a request are those of a server's own page; others indicate a page of
-    another site (DNS rebinding).
+class PageServer(Generic[Application]):
+    """A server of the application that `make` returns for the first part of its paths, which is random, so that only
+    who was told the address has access. It has a port, but answers nothing until its loop runs.
     """
-    hosts = (f"{LOOPBACK}:{port}", f"localhost:{port}")
-    return headers.get("Host") in hosts and headers.get("Origin") in (None, *(f"http://{host}" for host in hosts))
 
+    def __init__(self, make: Callable[[str], Application], port: int | None) -> None:
+        from tornado.httpserver import HTTPServer
+        from tornado.ioloop import IOLoop
+        from tornado.netutil import bind_sockets
+        from tornado.routing import Router
+        from tornado.web import ErrorHandler
 
-def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
-    """Start a server on a port, or on the first free one."""
-    ports = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
-    for number in ports:
-        with contextlib.suppress(OSError):
-            return serve(number)
-    raise UserError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
+        self.loop = IOLoop.current()
+        for number in [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]:
+            with contextlib.suppress(OSError):
+                sockets = bind_sockets(number, LOOPBACK)
+                break
+        else:
+            raise UserError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
+        self.secret, self.port = f"/{secrets.token_urlsafe(16)}", int(sockets[0].getsockname()[1])
+        self.address = f"http://{LOOPBACK}:{self.port}{self.secret}/"
+        self.application = application = make(self.secret)
+        hosts = (f"{LOOPBACK}:{self.port}", f"localhost:{self.port}")
 
+        class OwnPageOnly(Router):
+            """Answers 403 to the page of another site, whose name may resolve to this machine (DNS rebinding)."""
 
-def serve_until_stopped(
-    name: str,
-    address: str,
-    run: Callable[[], object],
-    end: Callable[[], object],
-    say: Callable[[str], None],
-    *,
-    browser: bool,
-) -> None:
-    """Run a server whose page is at `address` until Ctrl-C or SIGTERM, which call `end` between two iterations of its
-    loop.
-    """
-    say(f"{name}: {address}")
-    say("For this machine only. Ctrl-C ends it.")
-    if browser:
-        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-    previous = {number: signal.signal(number, lambda *_: end()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        run()
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-    say(f"{name} ended.")
+            def find_handler(self, request: Any, **given: Any) -> Any:
+                origins = (None, *(f"http://{host}" for host in hosts))
+                if request.headers.get("Host") in hosts and request.headers.get("Origin") in origins:
+                    return application.find_handler(request, **given)
+                return application.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
+
+        # 20 MB: chosen: a sheet of ten thousand rows takes a few megabytes
+        self._http = HTTPServer(OwnPageOnly(), max_body_size=20_000_000)
+        self._http.add_sockets(sockets)
+
+    def run(self, name: str, say: Callable[[str], None], *, browser: bool) -> None:
+        """Serve until Ctrl-C or SIGTERM, which end it between two iterations of its loop."""
+        say(f"{name}: {self.address}")
+        say("For this machine only. Ctrl-C ends it.")
+        for library in ("bokeh", "tornado"):
+            logging.getLogger(library).setLevel(logging.ERROR)
+        if browser:
+            threading.Thread(target=webbrowser.open, args=(self.address,), daemon=True).start()
+
+        def end(*_: object) -> None:
+            self.loop.add_callback_from_signal(self.loop.stop)
+
+        previous = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            self.loop.start()
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+        self.stop()
+        say(f"{name} ended.")
+
+    def stop(self) -> None:
+        """Let its port go."""
+        self._http.stop()
 
 
 def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None = None) -> bytes:

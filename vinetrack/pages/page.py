@@ -2,76 +2,61 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 from html import escape
 from pathlib import Path
-from typing import Any
 
-from bokeh.application import Application
-from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
-from bokeh.models import CustomJS
-from bokeh.server.server import Server
-from bokeh.themes import Theme
+from bokeh.models import Column, CustomJS, Div
+from bokeh.server.tornado import BokehTornado
 from markupsafe import Markup
-from tornado.web import ErrorHandler
 
 from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.core.terminal import waiting
-from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.folder import save_model
-from vinetrack.experiment.schema import COLUMNS, LIMITED
-from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.figures.style import TOKENS, follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Number
-from vinetrack.inference.optimiser import Step
+from vinetrack.inference.fit_result import Fit, number_row, numbers_text
+from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.narrative.verdict_text import quantity_text, spaced_name
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
-    FitProgress,
-    Fitted,
+    Evaluated,
     Job,
     ModelChoice,
     Prediction,
     commands,
-    correlated_pairs_text,
     fit_choice,
-    likelihood_change_text,
     model_text,
     overall_m,
     predict_choice,
     read_campaign,
 )
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, TrialSelector
-from vinetrack.pages.local_page import LOOPBACK, is_from_page, secret_path, serve_on_free_port, serve_until_stopped
+from vinetrack.pages.local_page import PageServer
 from vinetrack.pages.plots import (
     TEMPLATES,
-    THEME,
     FilmPanel,
-    HeldModel,
     Plots,
+    beside,
     button,
-    html_div,
     panel,
     progress_bar,
     set_text,
-    side_by_side,
-    stacked,
     templates,
+    theme,
     vine_colours,
 )
 from vinetrack.pipeline.effects_stage import effects_of
+from vinetrack.report.build import next_experiment, tied_pairs
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_source_experiment
 
 # ------------------------------------------------------------------------------
@@ -92,7 +77,7 @@ def headline(
         before=_in_mm(before),
         floor=_in_mm(floor),
         at_floor=now <= 1.15 * floor,  # chosen: an error up to 1.15 times the replicate scatter counts as equal to it
-        refused=campaign.refused,
+        refused=campaign.stored.refused,
         named=model_text(campaign.experiment.settings.model),
         in_use=model_text(campaign.in_use),
         command=f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}",
@@ -104,23 +89,13 @@ def _in_mm(value_m: float) -> str:
 
 
 def numbers_panel(
-    campaign: Campaign, fits: Sequence[Fitted], sizes_changed: bool, held: HeldModel | None, now: HeldModel
+    campaign: Campaign, fits: Sequence[Evaluated], sizes_changed: bool, held: Evaluated | None, now: Evaluated | None
 ) -> str:
-    """Return the held model beside the current one, the parameters of the last fit of this page, and all its fits."""
-    compared = [] if held is None else _compared((held, now))
+    """Return the held model beside the current one, the last fit of this page as it is printed, and all its fits."""
+    compared = [] if held is None or now is None else _compared((held, now))
     if not fits:
         return panel("numbers", compared=compared)
-    seconds, fit = fits[-1].seconds, fits[-1].fit
-    labels = {vine: label for vine, (label, _) in zip(campaign.vines, vine_colours(campaign), strict=True)}
-    known = labels if len(labels) > 1 else {}
-    fixed = {name: "" if spread.estimated else " (fixed)" for name, spread in fit.spreads.items()}
-    spreads = "; ".join(f"{name} {100 * fit.spreads[name].value:.2g} %{words}" for name, words in fixed.items())
-    facts = (
-        f"noise {1e3 * fit.noise_m:.2g} mm",
-        f"χ² per degree of freedom {fit.chi2_per_dof:.3g}" if math.isfinite(fit.chi2_per_dof) else "",
-        f"between-trial standard deviations: {spreads}" if spreads else "",
-        f"{seconds:.2g} s",
-    )
+    fit = fits[-1].fit
     floor = overall_m(campaign.floors_m)
     ladder = []
     for fitted in fits:
@@ -130,113 +105,53 @@ def numbers_panel(
     return panel(
         "numbers",
         compared=compared,
-        rows=[_number_row(number, known.get(number.vine, number.vine) or "all") for number in fit.numbers],
+        rows=[number_row(number) for number in fit.numbers],
         sizes_changed=sizes_changed,
-        facts=facts,
-        messages=list(map(str, fit.messages)),
+        notes=numbers_text(fit)[1 + len(fit.numbers) :],
         ladder=ladder,
         gained=likelihood_change_text(fits[-2].fit, fit) if len(fits) > 1 else "",
     )
 
 
-def _compared(models: Sequence[HeldModel]) -> list[tuple[str, ...]]:
+def likelihood_change_text(before: Fit, after: Fit) -> str:
+    """Return how −2 ln L changed with a larger or smaller model, as a sentence."""
+    gain = 2 * (after.log_likelihood - before.log_likelihood)
+    more = len(after.numbers) - len(before.numbers)
+    count = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
+    change = f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f}"
+    return f"{change} for {count}." if more else f"{change} with the same number of parameters."
+
+
+def _compared(models: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     """Error and every fitted parameter of either of two models."""
     rows = [
-        ("effects", *(model_text(model.effects) for model in models)),
-        ("rms of position", *(_in_mm(overall_m(model.errors_m)) for model in models)),
+        ("effects", *(model_text(model.choice.effects) for model in models)),
+        ("rms of position", *(_in_mm(overall_m(model.prediction.errors_m)) for model in models)),
     ]
-    fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
+    fits = [model.numbers for model in models]
     for name in dict.fromkeys(name for numbers in fits for name in numbers):
         title = next(numbers[name].title for numbers in fits if name in numbers)
         rows.append((title, *(quantity_text(n[name]) if name in n else "–" for n in fits)))
     return rows
 
 
-def _number_row(number: Number, vine: str) -> tuple[str, ...]:
-    unit, factor = display_unit(number.unit, SLIDER_UNITS)
-    name = f"{number.symbol}, {unit}" if unit else number.symbol
-    if math.isfinite(number.bound):
-        return name, vine, f"{number.bound * factor:.4g}", "at its bound", ""
-    if not (math.isfinite(number.sigma) and number.sigma > 0):
-        return name, vine, f"{number.value * factor:.4g}", "undetermined", ""
-    digits = decimals(number.sigma * factor)
-    value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
-    return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
-
-
-def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None, fitted: Fitted | None) -> str:
-    """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations."""
+def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
+    """Return which effects the data cannot separate, as in the report."""
     tied = () if diagnosis is None or len(diagnosis.answer_set) < 2 else diagnosis.answer_set
-    titles, cosines = ([], []) if diagnosis is None or not diagnosis.rounds else _cosine_grid(diagnosis)
     return panel(
         "tied",
         diagnosis=diagnosis,
         diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
         names=[spaced_name(name) for name in tied],
-        titles=titles,
-        cosines=cosines,
-        fitted=fitted is not None,
-        # 6: pairs of correlated parameters shown; chosen: the card has room for six lines
-        pairs=[] if fitted is None else correlated_pairs_text(fitted.fit)[:6],
+        pairs=tied_pairs(diagnosis.rounds[0]) if diagnosis is not None and diagnosis.rounds else (),
     )
-
-
-def _cosine_grid(diagnosis: Diagnosis) -> tuple[list[str], list[list[tuple[str, str]]]]:
-    """The titles of the likeliest candidates and the cosines between their effects; none for fewer than two."""
-    known, cosines = diagnosis.rounds[0].cosine_names, diagnosis.rounds[0].cosines
-    pairs = [(abs(cosines[i][k]), name, other) for i, name in enumerate(known) for k, other in enumerate(known[:i])]
-    tied = sorted((pair for pair in pairs if pair[0] >= TIED_COSINE), key=lambda pair: -pair[0])
-    likely = [name for name in suspects(diagnosis) if name in known]
-    # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
-    names = list(dict.fromkeys([*likely, *(name for _, *pair in tied for name in pair)]))[:8]
-    if len(names) < 2:
-        return [], []
-    place = [known.index(name) for name in names]
-
-    def cell(cosine: float) -> tuple[str, str]:
-        """A cosine and its style: blue if it is positive, vermillion if negative, the deeper the larger."""
-        if not math.isfinite(cosine):
-            return "–", ""
-        strength = min(abs(cosine), 1.0) ** 2
-        colour = f"rgba({'0,114,178' if cosine > 0 else '213,94,0'},{strength:.2f})"
-        return f"{cosine:+.2f}", f"background:{colour};color:{'#fff' if strength > 0.6 else 'inherit'}"
-
-    return [spaced_name(name) for name in names], [[cell(cosines[i][k]) for k in place] for i in place]
 
 
 def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
-    """Return the next experiment of the diagnosis, as HTML."""
-    advice = None if diagnosis is None else diagnosis.next_experiment or {}
-    separations = (advice or {}).get("separation_sigma") or {}
-    return panel(
-        "next",
-        advice=advice,
-        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
-        trials=[_trial_row(trial) for trial in (advice or {}).get("trials", ())],
-        separations=[
-            (spaced_name(pair.replace(" | ", " from ")), f"{sigma:.2g} σ")
-            for pair, sigma in separations.items()
-            if sigma is not None
-        ],
-    )
-
-
-def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:
-    """One condition in the units of the sheet, with what differs from the present rig."""
-    size = f"{_cell(trial.get('diameter_mm'))} mm × {_cell(trial.get('thickness_um'))} µm"
-    changed = trial.get("changed") or ()
-    other = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in changed and trial.get(key)]
-    return (
-        f"{size}{' (new)' if trial.get('new_vine') else ''}",
-        f"{_cell(trial.get('pressure_kPa'))} kPa",
-        f"{_cell(trial.get('payload_g') or 0)} g",
-        _cell(trial.get("replicates", 1)),
-        ", ".join(other),
-    )
-
-
-def _cell(value: Any) -> str:
-    return "–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+    """Return the next experiment of the diagnosis, as in the report."""
+    advice = None if diagnosis is None else next_experiment(diagnosis.next_experiment)
+    diagnose = f"vinetrack diagnose {campaign.folder.as_posix()}"
+    return panel("next", diagnosed=diagnosis is not None, advice=advice, diagnose=diagnose)
 
 
 def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
@@ -245,6 +160,18 @@ def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
         return ()
     ranked = [candidate.effect for candidate in diagnosis.ranking if math.isfinite(candidate.delta_chi2)]
     return tuple(dict.fromkeys([*diagnosis.answer_set, *ranked]))
+
+
+def fit_progress(task: str, step: Step | None, since_s: float) -> str:
+    """Return a progress bar of a fit whose number of steps is unknown, as HTML."""
+    done = 0 if step is None else step.iteration
+    if step is not None:
+        task += f" · step {done}"
+        if math.isfinite(step.predicted_decrease):
+            gain = f"the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
+            task += f" · {gain if step.predicted_decrease < 1e4 else 'still far off'}"
+    # 5: steps after which the bar is half full (chosen)
+    return progress_bar(done / (done + 5), f"{task} · {since_s:.1f} s")
 
 
 # ------------------------------------------------------------------------------
@@ -262,17 +189,17 @@ class Page:
         self.background, self.campaign, self.document = background, background.campaign, document
         self.choice: ModelChoice = background.opening_choice
         self.shown: Prediction | None = None
-        self.fits: list[Fitted] = []
-        self.held: HeldModel | None = None
+        self.fits: list[Evaluated] = []
+        self.held: Evaluated | None = None
         self.diagnosis: Diagnosis | None = None
         self._diagnosed_at = 0.0
         self._read_diagnosis()
         self._sizes_changed = False
         self._pending: set[Callable[[], None]] = set()
-        self._job: Job[Step, Fitted] | None = None
-        self._refit_requested = False
+        self._job: Job[Step, Evaluated] | None = None
+        self._begun_s, self._message = 0.0, ""
         self._step: Step | None = None
-        self._progress, self._message = FitProgress(0.0), ""
+        self._step_is_drawn = True
         self._build(reopen)
         background.listeners.append(self._on_background_change)
         document.on_session_destroyed(lambda _context: self.close())
@@ -285,39 +212,39 @@ class Page:
 
     def _build(self, reopen: Reopen | None) -> None:
         campaign = self.campaign
-        self.headline, self.status = html_div(name="headline"), html_div(name="status")
-        self.numbers, self.tied, self.next = html_div(name="numbers"), html_div(name="tied"), html_div(name="next")
+        self.headline, self.status = Div(name="headline"), Div(name="status")
+        self.numbers, self.tied, self.next = Div(name="numbers"), Div(name="tied"), Div(name="next")
         self.selector = TrialSelector(campaign, self._selection_changed)
         self.plots = Plots(campaign, self.selector.toggle)
         self.panel = EffectPanel(campaign, self.choice, suspects(self.diagnosis), self._ticked, self._size_moved)
         self.film = FilmPanel(campaign, self.document, self._instant)
-        self.saved = html_div(name="saved")
-        save = side_by_side(button("Save the model to experiment.yaml", "save", self._save))
+        self.saved = Div(name="saved")
+        save = beside(button("Save the model to experiment.yaml", "save", self._save))
         self.proposal = ProposalPanel(self, reopen)
         self.refit = button("Refit", "refit", self._refit_or_stop, margin=5, width=110, button_type="primary")
         back = button("As fitted", "as_fitted", self._as_fitted, margin=5, width=96)
         self.hold = button("Hold to compare", "hold", self._hold, margin=5, width=132)
-        self.command_text = html_div(name="commands")
-        buttons = side_by_side(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
-        hint = html_div(
-            "<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps this "
-            "model for comparison.</small>"
+        self.command_text = Div(name="commands")
+        buttons = beside(self.refit, back, self.hold, css=":host { gap: 6px; flex-wrap: wrap; }")
+        hint = Div(
+            text="<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps "
+            "this model for comparison.</small>"
         )
-        actions = stacked(buttons, hint, self.command_text, name="actions")
+        actions = Column(buttons, hint, self.command_text, name="actions")
         texts = [self.headline, self.status, self.numbers, self.tied, self.next]
         figures = [self.plots.motion, self.plots.residual, self.plots.errors]
         panels = [self.selector.root, self.panel.root, self.film.root, self.proposal.root]
-        for root in (*texts, *figures, *panels, actions, stacked(save, self.saved, name="keep")):
+        for root in (*texts, *figures, *panels, actions, Column(save, self.saved, name="keep")):
             self.document.add_root(root)
         style, script = ((TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "screen.js"))
         shown = {"plots": figures, "film": self.film.figure, "tokens": TOKENS}
         self.document.js_on_event("document_ready", CustomJS(args=shown, code=script))
-        self.document.title = f"{campaign.name} – vinetrack explorer"
-        self.document.theme = Theme(json=THEME)
+        self.document.title = f"{campaign.folder.name} – vinetrack explorer"
+        self.document.theme = theme()
         self.document.template = templates().get_template("page.html")
         left_out = f", {len(campaign.left_out)} left out" if campaign.left_out else ""
         self.document.template_variables.update(
-            name=campaign.name,
+            name=campaign.folder.name,
             style=Markup(page_frame() + style),
             vines=[(vine, follows_screen(colour)) for vine, colour in vine_colours(campaign)],
             tally=f"{len(campaign.trials)} trials, {len(campaign.conditions)} conditions{left_out}",
@@ -326,15 +253,17 @@ class Page:
     # ---- user input ------------------------------------------------------------------------------------------------
 
     def _ticked(self, effect: str, wanted: bool) -> None:
+        if wanted == (effect in self.choice):  # a tick that follows the choice
+            return
         self.choice = self.choice.with_effect(effect, wanted)
         self._mark_changed()
         self._begin_refit()
 
     def _size_moved(self, effect: str, number: str, value: float) -> None:
-        known = effect in self.choice
+        if math.isclose(value, self.choice.numbers[number]):  # a slider that follows the choice
+            return
         self.choice = self.choice.with_effect(effect).with_sizes({number: value})
-        if not known:
-            self.panel.show(self.choice, sliders=False)
+        self.panel.ticks[effect].active = True
         self._mark_changed()
 
     def _mark_changed(self) -> None:
@@ -351,66 +280,64 @@ class Page:
         """Return to the last fit, or to the model with which the page opened."""
         self.choice = self.background.initial if self.last is None else self.last.choice
         self._sizes_changed = False
-        self.panel.show(self.choice, self.last)
+        self.panel.show(self.choice, {} if self.last is None else self.last.numbers)
         self._soon(self._redraw, REDRAW_MS)
-
-    def _refit_or_stop(self) -> None:
-        if self._job is not None or self._refit_requested:
-            self._end_job("The fit was stopped.")
-            return
-        self._begin_refit()
-
-    def _begin_refit(self) -> None:
-        self._refit_requested = True
-        self._progress, self._message = FitProgress(time.monotonic()), ""
-        self.refit.label = "Stop"
-        self._background_changed()
 
     def _hold(self) -> None:
         """Hold the current model for comparison; pressed again, compare with the model in use."""
-        self.held = None if self.held is not None or self.shown is None else self._now
+        self.held = None if self.held is not None else self._now
         self.hold.label = "Hold to compare" if self.held is None else "Release"
         self._draw()
         self._update_text()
 
     @property
-    def last(self) -> Fitted | None:
+    def last(self) -> Evaluated | None:
         """The last fit."""
         return self.fits[-1] if self.fits else None
 
     @property
-    def _now(self) -> HeldModel:
-        return HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
+    def _now(self) -> Evaluated | None:
+        fit = None if self._sizes_changed or self.last is None else self.last.fit
+        return None if self.shown is None else Evaluated(self.choice, self.shown, fit)
 
     @property
-    def _reference(self) -> HeldModel:
-        """The model for comparison: the one that is held, else the model in use."""
-        if self.held is not None:
-            return self.held
-        return HeldModel(self.campaign.in_use, self.background.prediction, self.background.fitted)
+    def _reference(self) -> Prediction | None:
+        """Of the model for comparison: the one that is held, else the model in use."""
+        return self.background.prediction if self.held is None else self.held.prediction
 
     # ---- fits ----------------------------------------------------------------------------------------------------
+
+    def _refit_or_stop(self) -> None:
+        if self._job is not None:
+            self._end_job("The fit was stopped.")
+        else:
+            self._begin_refit()
+
+    def _begin_refit(self) -> None:
+        self._begun_s, self._step, self._message = time.monotonic(), None, ""
+        self.refit.label = "Stop"
+        last, choice = self.last, self.choice
+
+        def work(watch: Watch) -> Evaluated:
+            return fit_choice(self.campaign, (last or self.background.wait()).fit, choice, watch)
+
+        self._job = Job(work, self._on_step, self._fit_ended, self.document.add_next_tick_callback)
+        self._update_status()
 
     def _on_background_change(self) -> None:
         """Called from the background thread."""
         self.document.add_next_tick_callback(self._background_changed)
 
     def _background_changed(self) -> None:
-        background = self.background
+        background, fitted = self.background, self.background.fitted
         if self.shown is None and background.prediction is not None:
             self._show_first_prediction(background.prediction)
-        if self.last is None and background.fitted is not None:
-            self.fits = [background.fitted]
+        if not self.fits and fitted is not None:
+            self.fits = [fitted]
             if self.choice is background.initial:
-                self.choice = background.fitted.choice
-                self.panel.show(self.choice, background.fitted)
+                self.choice = fitted.choice
+                self.panel.show(self.choice, fitted.numbers)
             self._update_text()
-        if self._refit_requested and background.fitted is not None:
-            self._refit_requested, self._step = False, None
-            work = partial(fit_choice, self.campaign, (self.last or background.fitted).fit, self.choice)
-            self._job = Job(work, self._on_step, self._fit_ended, self.document.add_next_tick_callback)
-        elif self._refit_requested and not background.running and background.fitted is None:
-            self._end_job(background.failure)
         self._update_status()
 
     def _show_first_prediction(self, first: Prediction) -> None:
@@ -426,36 +353,30 @@ class Page:
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread. A page that cannot keep up draws only the newest step."""
-        is_idle = self._step is None
-        self._step = step
-        if is_idle:
+        was_drawn, self._step, self._step_is_drawn = self._step_is_drawn, step, False
+        if was_drawn:
             self.document.add_next_tick_callback(self._show_step)
 
     def _show_step(self) -> None:
-        step, self._step = self._step, None
-        if step is None or self._job is None:
+        self._step_is_drawn = True
+        if self._step is None or self._job is None:
             return
-        self._progress.update(step)
         self._update_status()
-        self._predict(self.choice.with_sizes(step.values))
+        self._predict(self.choice.with_sizes(self._step.values))
         self._soon(self._update_text, TEXT_MS)
 
-    def _fit_ended(self, fitted: Fitted | None, reason: str) -> None:
+    def _fit_ended(self, fitted: Evaluated | None, reason: str) -> None:
         if fitted is not None:
-            self._job = None
             self.fits.append(fitted)
-            self.choice, self._sizes_changed = fitted.choice, False
-            self.shown = fitted.prediction
-            self.panel.show(self.choice, fitted)
+            self.choice, self.shown, self._sizes_changed = fitted.choice, fitted.prediction, False
+            self.panel.show(self.choice, fitted.numbers)
             self._draw()
-            self._update_text()
         self._end_job(reason)
 
     def _end_job(self, reason: str) -> None:
         if self._job is not None:
             self._job.cancel()
-        self._job, self._refit_requested = None, False
-        self._message = reason
+        self._job, self._message = None, reason
         self.refit.label = "Refit"
         self._update_status()
         self._soon(self._update_text, TEXT_MS)
@@ -482,7 +403,8 @@ class Page:
     def _predict(self, choice: ModelChoice) -> None:
         """Predict and draw a choice; if that fails, show the error and keep the former prediction."""
         try:
-            self.shown = predict_choice(self.campaign, choice, None if self.shown is None else self.shown.floors_m)
+            floors_m = self.campaign.floors_m if self.shown is None else self.shown.floors_m
+            self.shown = predict_choice(self.campaign, choice, floors_m)
         except FitError as error:
             self._message = str(error)
             self._update_status()
@@ -496,13 +418,13 @@ class Page:
 
     def _update_text(self) -> None:
         """Update all text of the page."""
-        if self._job is None and not self._refit_requested:
+        if self._job is None:
             # The error at a step of a fit, or before a fit, says nothing about the effect.
             set_text(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
         if self.shown is not None:
-            self.film.set_predictions(self.shown, self._reference.prediction)
+            self.film.set_predictions(self.shown, self._reference)
         set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, self.held, self._now))
-        set_text(self.tied, tied_panel(self.campaign, self.diagnosis, self.last))
+        set_text(self.tied, tied_panel(self.campaign, self.diagnosis))
         set_text(self.next, next_panel(self.campaign, self.diagnosis))
         lines = self._commands()
         same = "<small>The same from the command line:</small>" + panel("commands", lines=lines)
@@ -512,10 +434,11 @@ class Page:
         """Update the status line."""
         self.proposal.show()
         background, text = self.background, ""
-        if self._job is not None or self._refit_requested:
-            task = "refitting" if self._job is not None else "fitting the model in use first"
-            other = background.step if self._refit_requested else None
-            text = progress_bar(*self._progress.state(time.monotonic(), task, other))
+        if self._job is not None:
+            # A fit starts from that of the model in use.
+            waits = background.running
+            task, step = ("fitting the model in use first", background.step) if waits else ("refitting", self._step)
+            text = fit_progress(task, step, time.monotonic() - self._begun_s)
         elif failure := self._message or background.failure:
             text = f'<span class="bad">{escape(failure)}</span>'
         elif background.running:
@@ -574,17 +497,15 @@ class Page:
 # Server of the page, on the loopback address only and without external resources.
 
 
-def start_server(background: BackgroundFit, port: int | None = None) -> Server:
-    """Return a server that is bound to the loopback address and refuses requests from other pages."""
+def start_server(background: BackgroundFit, port: int | None = None) -> PageServer[BokehTornado]:
+    """Return the server of the page, which answers once its loop runs."""
     shown = [background]
 
-    def serve(number: int) -> Server:
-        return Server(
-            {"/": Application(FunctionHandler(lambda document: Page(shown[-1], document, shown.append)))},
-            prefix=secret_path(),
-            address=LOOPBACK,
-            port=number,
-            allow_websocket_origin=["*"],  # checked below, with all else
+    def application(secret: str) -> BokehTornado:
+        return BokehTornado(
+            lambda document: Page(shown[-1], document, shown.append),
+            prefix=secret,
+            extra_websocket_origins=["*"],  # checked by the server, with all else
             # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
             keep_alive_milliseconds=20_000,
             check_unused_sessions_milliseconds=5_000,
@@ -592,26 +513,10 @@ def start_server(background: BackgroundFit, port: int | None = None) -> Server:
             use_index=False,
         )
 
-    server = serve_on_free_port(serve, port)
-    tornado = server._tornado
-    routed = tornado.find_handler
-
-    def find_handler(request: Any, **given: Any) -> Any:
-        """Answer 403 to other pages, on every route: bokeh checks only the origin of a web socket, which matches if a
-        foreign name resolves to this machine.
-        """
-        if is_from_page(request.headers, server.port):
-            return routed(request, **given)
-        return tornado.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
-
-    tornado.find_handler = find_handler
-    server.start()
+    server = PageServer(application, port)
+    server.application.initialize(server.loop)
+    server.application.start()
     return server
-
-
-def address(server: Server) -> str:
-    """Return the address of the page."""
-    return f"http://{LOOPBACK}:{server.port}{server.prefix}/"
 
 
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
@@ -626,13 +531,9 @@ def explore(
     """Serve the page of a results folder until Ctrl-C (or SIGTERM)."""
     with waiting(f"opening {folder}"):
         background = BackgroundFit(open_campaign(folder, experiment))
-    for name in ("bokeh", "tornado"):
-        logging.getLogger(name).setLevel(logging.ERROR)
     # A background fit would otherwise delay the page.
     sys.setswitchinterval(1e-3)  # Thread switch interval
     server = start_server(background, port)
     background.begin()
-    loop = server.io_loop
-    end = partial(loop.add_callback_from_signal, loop.stop)
-    serve_until_stopped("Explorer", address(server), loop.start, end, say, browser=browser)
-    server.stop()
+    server.run("Explorer", say, browser=browser)
+    server.application.stop(wait=False)

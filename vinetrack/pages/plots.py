@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 from bokeh.document import Document
 from bokeh.models import (
     Button,
@@ -21,7 +22,6 @@ from bokeh.models import (
     CustomJSTickFormatter,
     Div,
     HoverTool,
-    InlineStyleSheet,
     LinearColorMapper,
     Range1d,
     Row,
@@ -33,15 +33,16 @@ from bokeh.models import (
 )
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
+from bokeh.themes import Theme
 from jinja2 import Environment, FileSystemLoader
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
-from vinetrack.pages.campaign import Campaign, ExplorerTrial, Fitted, Job, Prediction, condition_labels, drawn_rows
+from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction, condition_labels, drawn_rows
 from vinetrack.pages.local_page import jpeg
-from vinetrack.pipeline.overlays_stage import shake_along
+from vinetrack.pipeline.overlays_stage import position_to_px, shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import axis_from_entry
@@ -51,13 +52,19 @@ from vinetrack.video.frames import RecordingError, inspect_recording, iterate_fr
 # Style shared with the report: colours, fonts, and the pieces of HTML of the page.
 
 TEMPLATES = Path(__file__).with_name("templates")
-SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
 
-THEME: dict[str, Any] = {
-    "attrs": {
+
+def theme() -> Theme:
+    """The look of widgets, whose insides the CSS of the page does not reach, and of figures."""
+    font = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
+    wide = {"sizing_mode": "stretch_width"}
+    looks: dict[str, dict[str, Any]] = {
+        "Widget": {"margin": 0, "stylesheets": [(TEMPLATES / "widgets.css").read_text(encoding="utf-8")]},
+        "Div": wide,
+        "Column": wide,
         "Plot": {"background_fill_color": None, "border_fill_color": None, "outline_line_color": None},
         "Axis": {
-            **dict.fromkeys(("axis_label_text_font", "major_label_text_font"), SANS),
+            **dict.fromkeys(("axis_label_text_font", "major_label_text_font"), font),
             **dict.fromkeys(("axis_label_text_color", "major_label_text_color"), INK),
             **dict.fromkeys(("axis_line_color", "major_tick_line_color"), INK),
             "axis_label_text_font_size": "13px",
@@ -68,7 +75,7 @@ THEME: dict[str, Any] = {
         },
         "Grid": {"grid_line_color": GRID, "grid_line_width": 0.8},
     }
-}
+    return Theme(json={"attrs": looks})
 
 
 def vine_colour() -> dict[str, Any]:
@@ -77,37 +84,22 @@ def vine_colour() -> dict[str, Any]:
     return {"field": "colour", "transform": CategoricalColorMapper(factors=colours, palette=colours)}
 
 
-def stylesheet(more: str = "") -> InlineStyleSheet:
-    """Return CSS inside a widget, which the CSS of the page does not reach."""
-    return InlineStyleSheet(css=(TEMPLATES / "widgets.css").read_text(encoding="utf-8") + more)
-
-
-def html_div(text: str = "", name: str | None = None, **keywords: Any) -> Div:
-    """Return a piece of HTML as a widget."""
-    return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[stylesheet()], margin=0, **keywords)
-
-
 def set_text(piece: Div, text: str) -> None:
     """Change a piece of HTML only if it differs, because whatever is sent is drawn again."""
     if piece.text != text:
         piece.text = text
 
 
-def button(label: str, name: str, does: Callable[[], None], *, margin: int = 0, **options: Any) -> Button:
+def button(label: str, name: str, does: Callable[[], None], **options: Any) -> Button:
     """Return a button that calls `does` when it is clicked."""
-    made = Button(label=label, name=name, stylesheets=[stylesheet()], margin=margin, **options)
+    made = Button(label=label, name=name, **options)
     made.on_click(does)
     return made
 
 
-def stacked(*parts: UIElement, margin: Any = 0, **keywords: Any) -> Column:
-    """Return parts below each other, as wide as their card."""
-    return Column(children=list(parts), sizing_mode="stretch_width", margin=margin, **keywords)
-
-
-def side_by_side(*parts: UIElement, css: str = ":host { gap: 6px; }", **keywords: Any) -> Row:
+def beside(*parts: UIElement, css: str = ":host { gap: 6px; }") -> Row:
     """Return parts beside each other."""
-    return Row(children=list(parts), margin=0, stylesheets=[stylesheet(css)], **keywords)
+    return Row(*parts, stylesheets=[css])
 
 
 def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
@@ -179,20 +171,6 @@ def round_up(value: float, steps: Sequence[float]) -> float:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
     return next(round(power * step, 12) for step in steps if power * step >= value or step == steps[-1])
-
-
-@dataclass(frozen=True)
-class HeldModel:
-    """A model for comparison: its effects, what it predicts, and its fit, if it was fitted."""
-
-    effects: tuple[str, ...]
-    prediction: Prediction | None
-    fitted: Fitted | None
-
-    @property
-    def errors_m(self) -> Mapping[str, float]:
-        """Errors by condition, m."""
-        return {} if self.prediction is None else self.prediction.errors_m
 
 
 class Plots:
@@ -343,7 +321,9 @@ class Plots:
         """Mark a time since release, or none."""
         self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
 
-    def draw(self, now: Prediction, reference: HeldModel, shown: Sequence[int], conditions: Sequence[str]) -> None:
+    def draw(
+        self, now: Prediction, reference: Prediction | None, shown: Sequence[int], conditions: Sequence[str]
+    ) -> None:
         """Draw the current model, and the one for comparison where it is another; errors of conditions that are not
         selected are faint. Only what has changed is sent: for lines already drawn their ordinates.
         """
@@ -360,11 +340,12 @@ class Plots:
             self._residuals.data["ys"] = residual["ys"]
         else:
             self._model.data, self._residuals.data = lines, residual
-        other = None if reference.prediction is now else reference.prediction
+        other = None if reference is now else reference
         if not same_trials or other is not self._other_drawn:
             self._reference.data = {"xs": [], "ys": []} if other is None else self._model_lines(other, shown)
         self._trials_drawn, self._other_drawn = tuple(shown), other
-        rows = self._error_bars(now.errors_m, reference.errors_m, now.floors_m, conditions)
+        before_m = {} if reference is None else reference.errors_m
+        rows = self._error_bars(now.errors_m, before_m, now.floors_m, conditions)
         known = [value for key in ("now", "before", "floor") for value in rows[key] if math.isfinite(value)]
         end = round_up(1.04 * max(known, default=1.0), (1, 1.5, 2, 3, 4, 5, 6, 8, 10))
         if end != self.errors.x_range.end:
@@ -386,32 +367,22 @@ EDGES = (("tracked", "#56B4E9", "solid"), ("comparison", "#E69F00", "dotted"), (
 
 @dataclass(frozen=True)
 class RecordingView:
-    """Mapping of positions along the growth axis to the picture of one recording, px of the recording. `edge_px`, shape
-    (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and `lead_position_m` are those of
-    the track.
+    """The picture of one recording: its axis and half the width of a line across the vine, px of the recording, its
+    track (`tracks/<trial>.csv`), and the shift of each frame along the axis.
     """
 
     path: Path
     axis: Axis
     half_width_px: float
-    time_s: Floats
-    edge_px: Floats
-    lead_position_m: Floats
+    track: pd.DataFrame
     shake_px: Floats
-    by_hand: NDArray[np.bool_]
 
     def along_px(self, lead_position_m: Floats) -> Floats:
-        """Return the pixels along the axis of positions of the track; linearly extrapolated beyond the track. NaN if
-        the track has fewer than two points.
-        """
-        known = np.flatnonzero(np.isfinite(self.edge_px) & np.isfinite(self.lead_position_m))
-        if known.size < 2:
+        """Return the pixels along the axis of positions of the track, as in a clip; NaN where too few are known."""
+        try:
+            return np.asarray(position_to_px(self.track)(lead_position_m))
+        except ResultsError:
             return np.full(np.shape(lead_position_m), np.nan)
-        known = known[np.argsort(self.lead_position_m[known], kind="stable")]
-        position, along = self.lead_position_m[known], self.edge_px[known]
-        scale, offset = np.polyfit(position, along, 1)
-        outside = (lead_position_m < position[0]) | (lead_position_m > position[-1])
-        return np.where(outside, offset + scale * lead_position_m, np.interp(lead_position_m, position, along))
 
     def across(self, along_px: float, frame: int) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return xs and ys of the ends of a line across the vine at a position along the axis, px of one picture."""
@@ -438,16 +409,8 @@ def recording_view(results: Results, trial: Trial) -> RecordingView | str:
         return f"The position of the axis of {trial.name} in its picture was not stored: run snakemake again."
     line = axis_from_entry(axis)
     width = axis.get("width_px")
-    return RecordingView(
-        path=trial.video,
-        axis=line,
-        half_width_px=0.75 * float(width) if width else 0.05 * line.length_px,
-        time_s=table["time_s"].to_numpy(dtype=float),
-        edge_px=table["edge_px"].to_numpy(dtype=float),
-        lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
-        shake_px=shake_along(axis, len(table)),
-        by_hand=hand_corrected(table["flag"]),
-    )
+    half_px = 0.75 * float(width) if width else 0.05 * line.length_px
+    return RecordingView(trial.video, line, half_px, table, shake_along(axis, len(table)))
 
 
 @dataclass(frozen=True)
@@ -492,25 +455,22 @@ class FilmPanel:
         self._reference: Prediction | None = None
         self._film: Film | None = None
         self._job: Job[tuple[int, float], Film] | None = None
-        self._view: RecordingView | None = None
-        self._no_view = ""
+        self._view: RecordingView | str = ""
         self._playing: Any = None
         names = [aligned.name for aligned in campaign.trials]
-        common: dict[str, Any] = {"stylesheets": [stylesheet()], "margin": 0}
-        self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial", **common)
+        self.trial_select = Select(options=names, value=names[0], width=220, title="trial", name="film_trial")
         self.play = button("▶ play", "film_play", self._toggle_play, width=84)
-        look = stylesheet(":host { padding: 0 10px 0 4px; min-width: 180px; flex: 1 1 180px; }")
-        numbers = {"start": 0, "end": 1, "value": 0, "step": 1, "margin": 0, "sizing_mode": "stretch_width"}
-        self.frame = Slider(**numbers, title="frame", name="film_frame", stylesheets=[look])
-        self.caption = html_div(name="film_caption")
+        numbers = {"start": 0, "end": 1, "value": 0, "step": 1, "sizing_mode": "stretch_width"}
+        self.frame = Slider(**numbers, title="frame", name="film_frame", css_classes=["frame"])
+        self.caption = Div(name="film_caption")
         self._picture = ColumnDataSource({"image": []}, name="film_picture")
         self._edges = ColumnDataSource({"xs": [], "ys": [], "colour": [], "dash": []}, name="film_edges")
         self.figure = self._draw()
         self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
-        self.frame.on_change("value", lambda _attr, _old, new: self._show_frame(int(new)))
+        self.frame.on_change("value", lambda _attr, _old, _new: self._show_frame())
         css = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
-        controls = side_by_side(self.trial_select, self.play, self.frame, css=css, sizing_mode="stretch_width")
-        self.root = stacked(controls, self.figure, self.caption, name="film")
+        controls = Row(self.trial_select, self.play, self.frame, stylesheets=[css], sizing_mode="stretch_width")
+        self.root = Column(controls, self.figure, self.caption, name="film")
 
     def _draw(self) -> Any:
         fig = figure(
@@ -537,9 +497,8 @@ class FilmPanel:
     def set_predictions(self, now: Prediction, reference: Prediction | None) -> None:
         """Set the predictions of the current model and of the model for comparison."""
         self._now, self._reference = now, reference
-        self._draw_edges()
         if self._job is None:
-            self._update_caption(int(self.frame.value))
+            self._show_edges()
 
     def show_trial(self, name: str) -> None:
         """Show another trial: decode its recording, or show why there is none."""
@@ -549,11 +508,10 @@ class FilmPanel:
             self.trial_select.value = name
             return
         self.figure.visible = False
-        view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
+        view = self._view = recording_view(Results(self.campaign.folder), self._shown.data.trial)
         if isinstance(view, str):
             self._show_track(view)
             return
-        self._view, self._no_view = view, ""
         self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
         soon = self._document.add_next_tick_callback
         decoding, decoded = partial(self._decoding, view), partial(self._decoded, view)
@@ -561,11 +519,10 @@ class FilmPanel:
 
     def _show_track(self, reason: str) -> None:
         """Show the positions alone, and why there is no recording."""
-        self._view, self._no_view = None, reason
+        self._view = reason
         data = self._shown.data
         last = max(data.time_s.size - 1, 1)
-        self.frame.update(start=0, end=last, value=(data.n_rest + last) // 2)
-        self._update_caption(int(self.frame.value))
+        self._show_from(last, (data.n_rest + last) // 2)
 
     def _decoding(self, view: RecordingView, count: int, share: float) -> None:
         if view is self._view and self._job is not None:
@@ -581,76 +538,69 @@ class FilmPanel:
         self.figure.y_range.update(start=height - 0.5, end=-0.5)
         self._image.glyph.update(dw=width, dh=height)
         self.figure.update(aspect_ratio=width / height, visible=True)
-        # The frame shown first is half-way along the motion.
-        known = np.flatnonzero(np.isfinite(view.edge_px))
+        known = np.flatnonzero(view.track["edge_px"].notna())
         last = len(film.frames) - 1
-        moving = int(min(known[known.size // 2], last)) if known.size else 0
-        self.frame.update(start=0, end=max(last, 1))
-        if self.frame.value != moving:
-            self.frame.value = moving
-        else:
-            self._show_frame(moving)
+        self._show_from(last, int(min(known[known.size // 2], last)) if known.size else 0)
 
-    def _show_frame(self, frame: int) -> None:
+    def _show_from(self, last: int, frame: int) -> None:
+        """Show the first frame of a trial that is shown: half-way along its motion."""
+        self.frame.update(start=0, end=max(last, 1))
+        if self.frame.value == frame:
+            self._show_frame()
+        self.frame.value = frame
+
+    def _show_frame(self) -> None:
+        frame = int(self.frame.value)
         if self._film is not None and frame < len(self._film.frames):
             self._picture.data = {"image": [self._film.picture(frame)]}
-            self._draw_edges()
-        self._update_caption(frame)
-
-    def _time_s(self, frame: int) -> float:
-        """Time of a frame on the clock of the track."""
-        times = self._shown.data.time_s if self._view is None else self._view.time_s
-        return float(times[min(frame, times.size - 1)])
+        self._show_edges()
 
     @property
     def _shown(self) -> ExplorerTrial:
         return self.campaign.trial(self.trial_select.value)
 
-    def _positions(self, frame: int) -> Floats:
-        """Position of each of `EDGES` in a frame, m; NaN if unknown. Shape (3,)."""
-        time_s, aligned = self._time_s(frame), self._shown
-        measured_m = aligned.data.lead_position_m if self._view is None else self._view.lead_position_m
+    def _show_edges(self) -> None:
+        """Draw each of `EDGES` that is known in the frame shown, and state their positions below."""
+        aligned, view, frame = self._shown, self._view, int(self.frame.value)
+        time_s, measured_m = aligned.data.time_s, aligned.data.lead_position_m
+        if isinstance(view, RecordingView):
+            time_s, measured_m = (view.track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
+        at_s = float(time_s[min(frame, time_s.size - 1)])
         positions_m = np.full(3, math.nan)
-        positions_m[0] = measured_m[frame] if frame < measured_m.size else math.nan
+        if frame < measured_m.size:
+            positions_m[0] = measured_m[frame]
         for k, prediction in enumerate((self._reference, self._now), 1):
             if prediction is not None:
                 # The model is defined between the first and the last frame of the fit.
                 predicted_m = prediction.trials[self.campaign.trials.index(aligned)].predicted_position_m
-                positions_m[k] = np.interp(time_s, aligned.data.time_s, predicted_m, math.nan, math.nan)
-        return positions_m
-
-    def _draw_edges(self) -> None:
-        view, film = self._view, self._film
-        if view is None or film is None:
-            return
-        frame = int(self.frame.value)
-        drawn = [
-            (view.across(float(px), frame), colour, dash)
-            for (name, colour, dash), px in zip(EDGES, view.along_px(self._positions(frame)), strict=True)
-            if math.isfinite(px) and not (name == "comparison" and self._reference is self._now)
-        ]
-        half = 0.5 * (1 - film.scale)
-        self._edges.data = {
-            "xs": [[film.scale * x - half for x in xs] for (xs, _), _, _ in drawn],
-            "ys": [[film.scale * y - half for y in ys] for (_, ys), _, _ in drawn],
-            "colour": [colour for _, colour, _ in drawn],
-            "dash": [dash for _, _, dash in drawn],
-        }
-
-    def _update_caption(self, frame: int) -> None:
-        aligned, view = self._shown, self._view
-        since_s = self._time_s(frame) - aligned.release_s
-        positions_text = [
+                positions_m[k] = np.interp(at_s, aligned.data.time_s, predicted_m, math.nan, math.nan)
+        said = [
             f'<span style="border-bottom:3px solid {colour}">{name} {1e3 * (m - aligned.origin_m):.1f} mm</span>'
-            for (name, colour, _), m in zip(EDGES, self._positions(frame), strict=True)
+            for (name, colour, _), m in zip(EDGES, positions_m, strict=True)
             if math.isfinite(m)
         ]
-        if view is not None and frame < view.by_hand.size and view.by_hand[frame]:
-            positions_text.append("corrected by hand")
-        notice = f"<p>{escape(self._no_view)}</p>" if self._no_view else ""
+        if isinstance(view, RecordingView) and frame < len(view.track):
+            if hand_corrected(view.track["flag"])[frame]:
+                said.append("corrected by hand")
+            along_px = view.along_px(positions_m)
+            along_px[0] = view.track["edge_px"].iloc[frame]
+            self._draw_lines(view, frame, along_px)
+        notice = f"<p>{escape(view)}</p>" if isinstance(view, str) else ""
+        since_s = at_s - aligned.release_s
         when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
-        self.caption.text = f"{notice}<p>{when} · {' · '.join(positions_text)}</p>"
+        self.caption.text = f"{notice}<p>{when} · {' · '.join(said)}</p>"
         self._instant(aligned.name, since_s)
+
+    def _draw_lines(self, view: RecordingView, frame: int, along_px: Floats) -> None:
+        """Draw a line across the vine for each of `EDGES`; the picture may be smaller than the recording."""
+        scale = 1.0 if self._film is None else self._film.scale
+        lines: Columns = {"xs": [], "ys": [], "colour": [], "dash": []}
+        for (name, colour, dash), px in zip(EDGES, along_px, strict=True):
+            if math.isfinite(px) and not (name == "comparison" and self._reference is self._now):
+                ends = [[scale * end - 0.5 * (1 - scale) for end in of_one] for of_one in view.across(float(px), frame)]
+                for key, value in zip(lines, (*ends, colour, dash), strict=True):
+                    lines[key].append(value)
+        self._edges.data = lines
 
     def _toggle_play(self) -> None:
         if self._playing is not None:
@@ -675,4 +625,4 @@ class FilmPanel:
         """Stop decoding, and let the recording go."""
         if self._job is not None:
             self._job.cancel()
-        self._job = self._film = self._view = None
+        self._job, self._film, self._view = None, None, ""

@@ -1,29 +1,29 @@
-"""HTTP server of the set-up page, on the loopback address only: files, requests, pictures of clips, saving."""
+"""The set-up page: what it asks of a folder of recordings, pictures of clips, saving, and its server."""
 
 from __future__ import annotations
 
 import base64
-import contextlib
 import json
 import logging
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, urlsplit
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tornado.ioloop import IOLoop
+from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError
 from vinetrack.core.records import Correction, Trial
-from vinetrack.core.tables import parse_yaml, read_table, safe_join, with_value
+from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join, with_value
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
 from vinetrack.experiment.folder import SETTINGS, check_experiment, read_corrections
 from vinetrack.experiment.schema import COLUMNS
@@ -36,6 +36,7 @@ from vinetrack.pages.draft_files import (
     column_of,
     draft_folder,
     files_stamp,
+    list_notes,
     list_pictures,
     list_tables,
     open_draft,
@@ -46,23 +47,16 @@ from vinetrack.pages.draft_files import (
     with_shared,
     write_draft,
 )
-from vinetrack.pages.local_page import (
-    LOOPBACK,
-    THREAD_PREFIX,
-    is_from_page,
-    jpeg,
-    secret_path,
-    serve_on_free_port,
-    serve_until_stopped,
-)
+from vinetrack.pages.local_page import THREAD_PREFIX, PageServer, jpeg
+from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
 from vinetrack.tracks.importers import TrackError, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import find_board
 from vinetrack.video.curved_axis import axis_entry, axis_through
-from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording, iterate_frames, read_frames
-from vinetrack.video.survey import given_axis, measure_recording, proposed_axis, size_problems, tracked_facts
-from vinetrack.video.track import Tracking, track_frames, track_recording
+from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
+from vinetrack.video.survey import Keep, measure_recording, proposed_axis, size_problems, tracked_facts
+from vinetrack.video.track import Tracking
 
 # ------------------------------------------------------------------------------
 # Views of a recording for the page: frames as JPEG, the proposed axis, and the result of tracking.
@@ -115,7 +109,7 @@ def axis_json(axis: Axis) -> dict[str, Any]:
     return {**entry, "width_px": _rounded(axis.width_px, 2)}
 
 
-def track_row(folder: Path, index: int) -> dict[str, Any]:
+def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
     """Track the recording of one row, which may be incomplete: strip, edge and notes. Without a scale positions are in
     pixels, without a rate times are in frames, see `scaled` and `timed`.
     """
@@ -129,15 +123,15 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
         rate = inspect_recording(trial.video).capture_fps
         timed = rate is not None
         trial = replace(trial, capture_fps=rate or 1.0, exposure_s=trial.exposure_s if timed else math.nan)
-    remarks: list[str] = []
-    growth_mm = m_per_px = math.nan
-    if scaled:
-        measurement = measure_recording(trial, settings, folder)
-        tracking, m_per_px, facts = measurement.tracking, measurement.m_per_px, tracked_facts(trial, measurement)
-        growth_mm, remarks = facts.growth_mm, [problem.reason for problem in size_problems(trial, facts)]
-    else:
-        # Widths are in millimetres: without a scale the axis has none.
-        tracking = track_recording(trial, given_axis(trial, settings, math.nan))
+    if not scaled:
+        # The unit of length is a pixel, in which no size is known; nor is the width of a given axis.
+        trial = replace(trial, m_per_px=1.0, diameter_m=math.nan, length_m=math.nan)
+        trial = replace(trial, axis=trial.axis and replace(trial.axis, width_m=math.nan))
+        shared = settings.axis and settings.axis.model_copy(update={"width_mm": None})
+        settings = settings.model_copy(update={"axis": shared})
+    measurement = measure_recording(trial, settings, folder, keep)
+    tracking, mm_per_px = measurement.tracking, 1e3 * measurement.m_per_px if scaled else math.nan
+    facts = tracked_facts(trial, measurement)
     track = tracking.track
     return {
         "strip": _strip_url(tracking),
@@ -146,32 +140,16 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
         "time_s": _numbers(track.time_s, 6),
         "edge_px": _numbers(track.edge_px, 2),
         "position_mm": _numbers(1e3 * track.lead_position_m, 3),
-        "tracked_px": _numbers(track.edge_px if track.tracked_px is None else track.tracked_px, 2),
         "flag": [str(flag) for flag in track.flag],
         "shake_px": _numbers(tracking.shake_px, 2),
-        "mm_per_px": _rounded(1e3 * m_per_px, 6),
-        "growth_mm": _rounded(growth_mm, 2),
-        "tube_width_mm": _rounded(1e3 * m_per_px * tracking.tube_width_px, 2),
+        "mm_per_px": _rounded(mm_per_px, 6),
+        "growth_mm": _rounded(facts.growth_mm, 2),
+        "tube_width_mm": _rounded(mm_per_px * tracking.tube_width_px, 2),
         "timed": timed,
         "scaled": scaled,
-        "notes": [*remarks, *track.notes],
+        "notes": [*(problem.reason for problem in size_problems(trial, facts) if scaled), *track.notes],
         "pressure": _pressure_json(trial),
     }
-
-
-def warm_up() -> None:
-    """Track a rendered bar, so that the tracker is compiled before the user needs it."""
-    rng = np.random.default_rng(1)
-    luma = rng.normal(60, 2, (30, 64, 240)).clip(0, 255).astype(np.uint8)
-    for i, frame in enumerate(luma):
-        frame[24:40, : 20 + max(0, i - 6) * 7] = 180
-    recording = Recording(Path("warm-up"), "container", 240, 64, 8, len(luma))
-    frames = Frames(recording, luma, np.arange(len(luma)), np.zeros(len(luma), dtype=bool))
-    try:
-        track_frames(frames, Trial(name="warm-up", capture_fps=1000.0), 1000.0)
-    except RecordingError:
-        # Only the compilation matters.
-        return
 
 
 def _strip_url(tracking: Tracking) -> str:
@@ -218,12 +196,13 @@ def page_state(folder: Path) -> dict[str, Any]:
     content = parse_yaml(draft.settings, SETTINGS).content
     sheet = draft.sheet
     # Columns that the page shows whether or not the sheet has them
-    optional = ["payload_g", "growth_angle_deg", "chamber_l", "exposure_us", "pressure_trace"]
+    optional = ["payload_g", "growth_angle_deg", "chamber_l", "inlet_mm", "exposure_us", "pressure_trace"]
     known = {}
     for name in [name for name in COLUMNS if name not in ("trial", "video")]:
         units = [split_unit(name)[1], *other_units(name).values()]
         known[name] = {key: getattr(COLUMNS[name], key) for key in ("kind", "meaning", "measured", "default", "shared")}
-        known[name] |= {"quantity": quantity(name), "units": units if len(units) > 1 else []}
+        known[name] |= {"base": name, "quantity": quantity(name), "units": units if len(units) > 1 else []}
+        known |= dict.fromkeys(other_units(name), known[name])
     return {
         "name": folder.resolve().name,
         "folder": str(folder),
@@ -243,6 +222,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         },
         "pictures": list_pictures(folder),
         "traces": list_tables(folder),
+        "notes": list_notes(folder),
     }
 
 
@@ -274,7 +254,8 @@ def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[s
         checked = check_folder(copy) if thorough else None
         problems = [*check_experiment(copy), *_scale_missing(draft)] if checked is None else checked.problems
     return {
-        "problems": [_problem_json(problem, draft.sheet.columns) for problem in problems],
+        # The unit of a column was chosen on the page.
+        "problems": [_problem_json(problem, draft.sheet.columns) for problem in problems if problem.code != "unit"],
         "notes": list(checked.notes) if checked else [],
         "understood": list(checked.recording_lines) if checked else [],
     }
@@ -311,23 +292,21 @@ log = logging.getLogger(__name__)
 TEMPLATES = Path(__file__).with_name("templates")
 
 
-class SetupServer(ThreadingHTTPServer):
-    """A server for one folder, bound to the loopback address."""
+class Desk:
+    """What the page asks of one folder, from several threads at a time."""
 
-    daemon_threads = True
-    allow_reuse_address = True
-
-    def __init__(self, folder: Path, port: int) -> None:
-        super().__init__((LOOPBACK, port), _Handler)
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.secret = secret_path()
-        self.tracking, self._decoding = threading.Lock(), threading.Lock()
+        self._tracking, self._decoding = threading.Lock(), threading.Lock()
         self._decoded = lru_cache(2)(decoded_clip)  # of the current and the previous recording
+        self._tracked: tuple[str, Tracking] | None = None  # the last that was tracked, in pixels
 
-    @property
-    def address(self) -> str:
-        """The address of the page."""
-        return f"http://{LOOPBACK}:{self.server_port}{self.secret}/"
+    def _keep(self, inputs: tuple[Any, ...], make: Callable[[], Tracking]) -> Tracking:
+        """Track again only for another recording, axis or choice of frames: not for a correction or a scale."""
+        key = repr((inputs[0].resolve(), identity(inputs[0]), inputs[1:]))
+        if self._tracked is None or self._tracked[0] != key:
+            self._tracked = key, make()
+        return self._tracked[1]
 
     def clip(self, recording: str) -> tuple[tuple[bytes, ...], dict[str, Any]]:
         """Return what `decoded_clip` returns of a recording as it is now."""
@@ -335,152 +314,128 @@ class SetupServer(ThreadingHTTPServer):
         with self._decoding:
             return self._decoded(path, path.stat().st_mtime_ns if path.exists() else 0)
 
-    def frame(self, recording: str, number: int) -> bytes:
+    def frame(self, recording: str, frame: str) -> bytes:
         """Return a frame as JPEG; beyond the last or before the first, that one."""
         frames, _ = self.clip(recording)
-        return frames[min(max(number, 0), len(frames) - 1)]
+        return frames[min(max(int(frame), 0), len(frames) - 1)]
 
     def picture(self, name: str, widest: int | None = None) -> bytes:
         """Return a single picture or the first frame of a film as JPEG, without decoding more."""
         return jpeg(first_frame(safe_join(self.folder, name)), widest)
 
-    def check(self, content: Mapping[str, Any]) -> dict[str, Any]:
+    def check(self, thorough: bool = False, **content: Any) -> dict[str, Any]:
         """Return the problems of a draft, and its files."""
         draft = draft_from_json(self.folder, content)
         texts = dict(zip(("sheet_text", "settings_text", "corrections_text"), draft.texts().values(), strict=True))
         if not draft.corrections:
             texts["corrections_text"] = ""
-        return draft_problems(self.folder, draft, thorough=bool(content.get("thorough"))) | texts
+        return draft_problems(self.folder, draft, thorough) | texts
 
-    def track(self, content: Mapping[str, Any]) -> dict[str, Any]:
+    def track(self, row: int, **content: Any) -> dict[str, Any]:
         """Track the recording of one row of a draft."""
-        draft = draft_from_json(self.folder, content)
-        with self.tracking, draft_folder(self.folder, draft) as copy:
-            return track_row(copy, int(content["row"]))
+        with self._tracking, draft_folder(self.folder, draft_from_json(self.folder, content)) as copy:
+            return track_row(copy, row, self._keep)
 
-    def save(self, content: Mapping[str, Any]) -> dict[str, Any]:
+    def paste(self, text: str = "", file: str = "", **table: Any) -> dict[str, Any]:
+        """Return which cells a pasted block, or a file of notes, would change, and what matches nothing."""
+        block = read_text(safe_join(self.folder, file)) if file else text
+        return dict(zip(("cells", "notes"), place_block(block, **table), strict=True))
+
+    def save(self, **content: Any) -> dict[str, Any]:
         """Write a draft."""
         written = write_draft(self.folder, draft_from_json(self.folder, content))
         return {"written": written, "stamp": files_stamp(self.folder)}
 
 
-# Answers by method and path, from the query or the JSON of a request: bytes are a JPEG, all else is JSON
-ANSWERS: dict[str, Callable[[SetupServer, Mapping[str, Any]], bytes | Mapping[str, Any] | None]] = {
-    "GET /api/state": lambda server, _: page_state(server.folder),
-    "GET /api/clip": lambda server, given: server.clip(given["recording"])[1],
-    "GET /api/frame": lambda server, given: server.frame(given["recording"], int(given["frame"])),
+# Answers by method and path, from the query or the JSON of a request: bytes are a JPEG, text is a style, all else JSON
+ANSWERS: dict[str, Callable[..., bytes | str | Mapping[str, Any] | None]] = {
+    "GET frame.css": lambda _: page_frame(),
+    "GET state": lambda desk: page_state(desk.folder),
+    "GET clip": lambda desk, recording: desk.clip(recording)[1],
+    "GET frame": Desk.frame,
     # 220: width of the pictures in the list; chosen: as wide as its column
-    "GET /api/thumbnail": lambda server, given: server.picture(given["recording"], 220),
-    "GET /api/picture": lambda server, given: server.picture(given["picture"]),
-    "GET /api/curve": lambda _, given: axis_json(axis_through([p.split(",") for p in given["points"].split(";")])),
-    "GET /api/board": lambda server, given: board_in(safe_join(server.folder, given["picture"]), given["picture"]),
-    "POST /api/check": SetupServer.check,
-    "POST /api/paste": lambda _, given: dict(zip(("cells", "notes"), place_block(**given), strict=True)),
-    "POST /api/track": SetupServer.track,
-    "POST /api/save": SetupServer.save,
+    "GET thumbnail": lambda desk, recording: desk.picture(recording, 220),
+    "GET picture": lambda desk, picture: desk.picture(picture),
+    "GET curve": lambda _, points: axis_json(axis_through([point.split(",") for point in points.split(";")])),
+    "GET board": lambda desk, picture: board_in(safe_join(desk.folder, picture), picture),
+    "POST check": Desk.check,
+    "POST paste": Desk.paste,
+    "POST track": Desk.track,
+    "POST save": Desk.save,
 }
+EXECUTOR = ThreadPoolExecutor(thread_name_prefix=THREAD_PREFIX)
 
 
-class _Handler(BaseHTTPRequestHandler):
-    """One request."""
+class _Quiet(RequestHandler):
+    """Whose answers are not kept, and ask nothing of another server."""
 
-    server: SetupServer
-    protocol_version = "HTTP/1.1"
+    def set_default_headers(self) -> None:
+        sources = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
+        self.set_header("Content-Security-Policy", sources)
+        self.set_header("Cache-Control", "no-store")
+        self.set_header("X-Content-Type-Options", "nosniff")
+        self.set_header("Referrer-Policy", "no-referrer")
 
-    def log_message(self, format: str, *args: Any) -> None:
-        log.info(format, *args)
 
-    def do_GET(self) -> None:
-        """Serve files of the page, frames and pictures."""
-        if not self._is_authorised():
-            return
-        url = urlsplit(self.path.removeprefix(self.server.secret))
-        name = "setup.html" if url.path == "/" else url.path.removeprefix("/")
-        kind = {"js": "text/javascript", "css": "text/css", "html": "text/html"}.get(name.rpartition(".")[2])
-        if kind and "/" not in name and (TEMPLATES / name).is_file():
-            frame = page_frame().encode() if name.endswith(".css") else b""
-            self._send(HTTPStatus.OK, frame + (TEMPLATES / name).read_bytes(), f"{kind}; charset=utf-8")
-        else:
-            self._answer(f"GET {url.path}", lambda: dict(parse_qsl(url.query)))
+class _File(_Quiet, StaticFileHandler):
+    """A file of the page."""
 
-    def do_POST(self) -> None:
-        """Check, track or save a draft."""
-        if not self._is_authorised():
-            return
-        length = int(self.headers.get("Content-Length") or 0)
-        # Header required for requests that change or compute something
-        # 20 MB: chosen: a sheet of ten thousand rows takes a few megabytes
-        if self.headers.get("X-Vinetrack") != "setup" or not 0 < length <= 20_000_000:
-            self._refuse()
-            return
-        body = self.rfile.read(length)
-        self._answer(f"POST {self.path.removeprefix(self.server.secret)}", lambda: json.loads(body))
 
-    def _is_authorised(self) -> bool:
-        """Whether the request comes from this server's page and has its secret."""
-        has_secret = self.path.startswith(f"{self.server.secret}/")
-        if has_secret and is_from_page(self.headers, self.server.server_port):
-            return True
-        self._refuse()
-        return False
+class _Answer(_Quiet):
+    """One of `ANSWERS`, computed in a thread; an error of the input is sent as a sentence."""
 
-    def _refuse(self) -> None:
-        self.close_connection = True
-        self._send(HTTPStatus.FORBIDDEN)
+    def initialize(self, desk: Desk) -> None:
+        self.desk = desk
 
-    def _answer(self, route: str, given: Callable[[], Mapping[str, Any]]) -> None:
-        """Send an answer; errors of the input are sent as a sentence."""
+    async def get(self, name: str) -> None:
+        """Answer a question by its query."""
+        given = {key: self.get_query_argument(key, strip=False) for key in self.request.query_arguments}
+        await self._answer(f"GET {name}", given)
+
+    async def post(self, name: str) -> None:
+        """Check, track or save the draft that is sent, with a header that a form of another page cannot have."""
+        if self.request.headers.get("X-Vinetrack") != "setup":
+            raise HTTPError(HTTPStatus.FORBIDDEN)
+        await self._answer(f"POST {name}", json.loads(self.request.body))
+
+    async def _answer(self, route: str, given: Mapping[str, Any]) -> None:
         if route not in ANSWERS:
-            self._send(HTTPStatus.NOT_FOUND)
-            return
-        status = HTTPStatus.UNPROCESSABLE_ENTITY
-        content: bytes | Mapping[str, Any] | None
+            raise HTTPError(HTTPStatus.NOT_FOUND)
+        self.set_status(HTTPStatus.UNPROCESSABLE_ENTITY)
+        content: bytes | str | Mapping[str, Any] | None
         try:
-            content, status = ANSWERS[route](self.server, given()), HTTPStatus.OK
+            content = await IOLoop.current().run_in_executor(EXECUTOR, partial(ANSWERS[route], self.desk, **given))
+            self.set_status(HTTPStatus.OK)
         except ExperimentError as error:
             content = {"problems": [_problem_json(problem) for problem in error.problems], "words": str(error)}
         except (UserError, RecordingError) as error:
             content = {"words": str(error)}
         except (KeyError, ValueError, TypeError, OSError) as error:
-            log.exception("%s", self.path)
-            content, status = {"words": f"{type(error).__name__}: {error}"}, HTTPStatus.BAD_REQUEST
-        if isinstance(content, bytes):
-            self._send(status, content, "image/jpeg")
-        else:
-            self._send(status, json.dumps(content, ensure_ascii=False).encode(), "application/json")
-
-    def _send(self, status: HTTPStatus, data: bytes = b"", kind: str = "text/plain; charset=utf-8") -> None:
-        sources = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
-        headers = {"Content-Type": kind, "Content-Length": str(len(data))}
-        # Nothing is kept, and nothing is asked of another server
-        headers |= {"Cache-Control": "no-store", "Content-Security-Policy": sources}
-        headers |= {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.send_response(status)
-            for name, value in headers.items():
-                self.send_header(name, value)
-            self.end_headers()
-            self.wfile.write(data)
+            log.exception("%s", self.request.path)
+            self.set_status(HTTPStatus.BAD_REQUEST)
+            content = {"words": f"{type(error).__name__}: {error}"}
+        kinds: dict[type, str] = {bytes: "image/jpeg", str: "text/css; charset=utf-8"}
+        self.set_header("Content-Type", kinds.get(type(content), "application/json"))
+        self.finish(content if isinstance(content, bytes | str) else json.dumps(content, ensure_ascii=False))
 
 
-def start_server(folder: Path, port: int | None = None) -> SetupServer:
+def start_server(desk: Desk, port: int | None = None) -> PageServer[Application]:
     """Return a server for a folder that does not answer requests yet."""
-    return serve_on_free_port(lambda number: SetupServer(folder, number), port)
+    page = {"path": TEMPLATES, "default_filename": "setup.html"}
+
+    def application(secret: str) -> Application:
+        return Application([(f"{secret}/api/(.+)", _Answer, {"desk": desk}), (f"{secret}/(.*)", _File, page)])
+
+    return PageServer(application, port)
 
 
 def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
     """Serve until Ctrl-C (or SIGTERM)."""
-    page_state(folder)
-    server = start_server(folder, port)
-    threading.Thread(target=warm_up, daemon=True, name=f"{THREAD_PREFIX}warm-up").start()
-    # A shutdown from the serving thread would wait for itself.
-    end = threading.Thread(target=server.shutdown, daemon=True).start
-    try:
-        serve_until_stopped(
-            "Set-up", server.address, lambda: server.serve_forever(poll_interval=0.2), end, say, browser=browser
-        )
-    finally:
-        server.server_close()
+    desk, state = Desk(folder), page_state(folder)
+    server = start_server(desk, port)
+    # The tracker is compiled before the user needs it.
+    EXECUTOR.submit(desk.track, 0, **state)
+    server.run("Set-up", say, browser=browser)
 
 
 # ------------------------------------------------------------------------------

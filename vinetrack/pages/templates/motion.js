@@ -1,29 +1,34 @@
 // The motion: strip along the axis with the tracked edge, position against time, and the measured pressure.
-import {$, ask, changed, content, decimals, el, listed, round, state} from "./state.js";
+import {$, ask, changed, content, decimals, el, listed, listeners, round, state} from "./state.js";
 import {placesOf, row, showFrame, shownFrame} from "./picture.js";
 
-let last = null;
+let [last, turn, corrected] = [null, 0, false];
 
 export function forget() {
-  last = null;
+  [last, turn, corrected] = [null, turn + 1, false];
   $("tracked").replaceChildren(el("p", {class: "hint"}, "Shows the strip along the axis with the leading edge, before anything is saved."));
 }
 
-export async function track() {
-  const chosen = state.chosen;
+// Again for what was corrected: what is shown stays until the answer is there.
+export async function track(again = false) {
+  const mine = ++turn;
   const name = row().trial;
+  corrected = false;
   $("track").disabled = true;
-  $("tracked").replaceChildren(el("p", {class: "busy"}, `Tracking ${name} …`));
+  if (!again) $("tracked").replaceChildren(el("p", {class: "busy"}, `Tracking ${name} …`));
   const begun = performance.now();
   try {
-    const made = await ask("api/track", content({row: chosen}));
-    if (state.chosen === chosen) show({...made, name, seconds: (performance.now() - begun) / 1000});
+    const made = await ask("api/track", content({row: state.chosen}));
+    if (mine === turn) show({...made, name, seconds: (performance.now() - begun) / 1000});
+    if (mine === turn && again) point(shownFrame());
   } catch (error) {
     const problems = error.content?.problems ?? [{severity: "error", text: error.message}];
-    if (state.chosen === chosen) $("tracked").replaceChildren(el("ul", {class: "problems"}, ...listed(problems)));
+    if (mine === turn) $("tracked").replaceChildren(el("ul", {class: "problems"}, ...listed(problems)));
   }
   $("track").disabled = false;
 }
+
+listeners.push(() => { if (corrected) track(true); });
 
 function show(made) {
   last = made;
@@ -35,8 +40,11 @@ function show(made) {
   if (!made.timed) notes.unshift("Times are in frames: fill in capture_fps.");
   if (!made.scaled) notes.unshift("Positions are in pixels: give a scale.");
   if (made.pressure?.words) notes.unshift(`pressure_trace ${made.pressure.words}`);
-  $("tracked").replaceChildren(el("p", {class: "fact"}, el("b", {}, made.name), `: ${facts.join("; ")}.`), strip(made), plot(made), el("p", {class: "readout", id: "readout"}, "Point at the strip or the curve to see the frame."), proofs(),
+  const held = document.activeElement?.id;
+  $("tracked").replaceChildren(el("p", {class: "fact"}, el("b", {}, made.name), `: ${facts.join("; ")}.`), strip(made),
+    el("p", {class: "readout", id: "readout"}, "Point at the strip to see the frame."), proofs(),
     el("ul", {class: "problems"}, ...listed(notes.map((text) => ({severity: "note", text})))));
+  if (held) $(held)?.focus();
 }
 
 // A line through points, broken where there is none.
@@ -45,19 +53,46 @@ function lineThrough(xs, ys) {
   return xs.map(place).join("");
 }
 
-const USABLE = /lost|rejected|duplicate|after_end|doubtful/;
+const UNUSABLE = /lost|rejected|duplicate|after_end|doubtful/;
 
+// A column of the strip is a frame: time runs to the right, growth upwards.
 function strip(made) {
-  const n = made.edge_px.length;
-  const height = made.length_px;
-  const over = el("svg", {viewBox: `0 0 ${n} ${height}`, preserveAspectRatio: "none", role: "img", "aria-label": "Strip along the growth axis, time to the right, growth upwards, with the leading edge"});
-  const [xs, ys] = [made.edge_px.map((_, i) => i + 0.5), made.edge_px.map((edge) => (edge === null ? null : height - edge))];
+  const [W, H, left, right, top, bottom] = [560, 330, 52, made.pressure?.time_s ? 50 : 12, 18, 38];
+  const [width, height, n] = [W - left - right, H - top - bottom, made.edge_px.length];
+  const [t0, t1, first] = [made.time_s[0], made.time_s.at(-1), Math.min(...made.edge_px.filter((value) => value !== null), made.length_px)];
+  const [per, scale] = [made.timed ? 1000 : 1, made.scaled ? made.mm_per_px : 1];
+  const x = (time) => left + ((((time - t0) / (t1 - t0 || 1)) * (n - 1) + 0.5) / n) * width;
+  const y = (px) => top + (1 - px / made.length_px) * height;
+  const svg = el("svg", {viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": "Strip along the growth axis with the leading edge: position against time"},
+    el("image", {href: made.strip, x: left, y: top, width, height, preserveAspectRatio: "none"}));
+  const text = (words, x, y, anchor, given = {}) => svg.append(el("text", {x, y, "text-anchor": anchor, ...given}, String(words)));
+  const tick = {class: "tick"};
+  for (const value of ticks(per * t0, per * t1, 5)) text(value, x(value / per), H - bottom + 16, "middle", tick);
+  for (const value of ticks(0, (made.length_px - first) * scale, 4)) text(value, left - 6, y(first + value / scale) + 4, "end", tick);
+  text(made.timed ? "time (ms)" : "frame", left + width / 2, H - 4, "middle");
+  text(made.scaled ? "position (mm)" : "position (px)", 4, 12, "start");
+  const [xs, ys] = [made.time_s.map(x), made.edge_px.map((edge) => (edge === null ? null : y(edge)))];
   const byHand = (i) => made.flag[i].includes("corrected");
   const dots = (wanted) => ys.map((y, i) => (y !== null && wanted(i) ? `M${xs[i]} ${y.toFixed(2)}h0` : "")).join("");
-  over.append(el("path", {class: "edge", d: lineThrough(xs, ys)}),
-    el("path", {class: "flagged", d: dots((i) => !byHand(i) && USABLE.test(made.flag[i]))}), el("path", {class: "by-hand", d: dots(byHand)}));
-  over.addEventListener("pointermove", (event) => { const box = over.getBoundingClientRect(); point(Math.floor(((event.clientX - box.left) / box.width) * n)); });
-  return el("div", {class: "strip"}, el("img", {src: made.strip, alt: ""}), over);
+  svg.append(el("path", {class: "edge", d: lineThrough(xs, ys)}),
+    el("path", {class: "flagged", d: dots((i) => !byHand(i) && UNUSABLE.test(made.flag[i]))}), el("path", {class: "by-hand", d: dots(byHand)}));
+  if (made.pressure?.time_s) {
+    const kPa = made.pressure.pressure_kPa;
+    const top_kPa = Math.max(...kPa, 1e-6) * 1.08;
+    const p = (value) => top + (1 - Math.max(value, 0) / top_kPa) * height;
+    const inside = made.pressure.time_s.map((t, i) => [t, kPa[i]]).filter(([t]) => t >= t0 && t <= t1);
+    svg.append(el("path", {class: "pressure", d: lineThrough(inside.map(([t]) => x(t)), inside.map(([, value]) => p(value)))}));
+    text("pressure (kPa)", W - 4, 12, "end");
+    for (const value of ticks(0, top_kPa, 4)) text(value, W - right + 6, p(value) + 4, "start", tick);
+  }
+  const cursor = el("path", {class: "cursor", d: ""});
+  svg.append(cursor);
+  made.cursor = (i) => cursor.setAttribute("d", `M${xs[i]} ${top}V${H - bottom}`);
+  svg.addEventListener("pointermove", (event) => {
+    const box = svg.getBoundingClientRect();
+    point(Math.floor((((event.clientX - box.left) / box.width) * W - left) / width * n));
+  });
+  return el("div", {class: "strip"}, svg);
 }
 
 function ticks(low, high, count) {
@@ -67,44 +102,6 @@ function ticks(low, high, count) {
   const out = [];
   for (let value = Math.ceil(low / step) * step; value <= high + 1e-9 * step; value += step) out.push(Number(value.toPrecision(10)));
   return out;
-}
-
-function plot(made) {
-  const [W, H, left, right, top, bottom] = [560, 250, 52, made.pressure?.time_s ? 50 : 12, 18, 38];
-  const per = made.timed ? 1000 : 1;
-  const time = made.time_s.map((value) => value * per);
-  const position = made.scaled ? made.position_mm : made.edge_px;
-  const known = position.filter((value) => value !== null);
-  if (!known.length) return el("p", {class: "hint"}, "There are no positions.");
-  const [t0, t1, first] = [Math.min(...time), Math.max(...time), Math.min(...known)];
-  const high = Math.max(Math.max(...known) - first, 1e-6) * 1.05;
-  const x = (value) => left + ((value - t0) / (t1 - t0 || 1)) * (W - left - right);
-  const y = (value) => H - bottom - (value / high) * (H - top - bottom);
-  const svg = el("svg", {class: "plot", viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": "Position against time"});
-  svg.append(el("path", {class: "frame-line", d: `M${left} ${top}V${H - bottom}H${W - right}`}));
-  const tick = (value, x, y, anchor) => svg.append(el("text", {class: "tick", x, y, "text-anchor": anchor}, String(value)));
-  for (const value of ticks(t0, t1, 5)) tick(value, x(value), H - bottom + 16, "middle");
-  for (const value of ticks(0, high, 4)) tick(value, left - 6, y(value) + 4, "end");
-  svg.append(el("text", {x: (left + W - right) / 2, y: H - 4, "text-anchor": "middle"}, made.timed ? "time (ms)" : "frame"), el("text", {x: 4, y: 12}, made.scaled ? "position (mm)" : "position (px)"));
-  svg.append(el("path", {class: "curve", d: lineThrough(time.map(x), position.map((value) => (value === null ? null : y(value - first))))}));
-  if (made.pressure?.time_s) {
-    const kPa = made.pressure.pressure_kPa;
-    const top_kPa = Math.max(...kPa, 1e-6) * 1.08;
-    const p = (value) => H - bottom - (Math.max(value, 0) / top_kPa) * (H - top - bottom);
-    const inside = made.pressure.time_s.map((t, i) => [t * per, kPa[i]]).filter(([t]) => t >= t0 && t <= t1);
-    const d = lineThrough(inside.map(([t]) => x(t)), inside.map(([, value]) => p(value)));
-    svg.append(el("path", {class: "pressure", d}), el("text", {x: W - 4, y: 12, "text-anchor": "end", class: "p-label"}, "pressure (kPa)"));
-    for (const value of ticks(0, top_kPa, 4)) tick(value, W - right + 6, p(value) + 4, "start");
-  }
-  const cursor = el("path", {class: "cursor", d: ""});
-  svg.append(cursor);
-  made.cursor = (i) => cursor.setAttribute("d", `M${x(time[i])} ${top}V${H - bottom}`);
-  svg.addEventListener("pointermove", (event) => {
-    const box = svg.getBoundingClientRect();
-    const at = t0 + ((((event.clientX - box.left) / box.width) * W - left) / (W - left - right)) * (t1 - t0);
-    point(time.reduce((best, t, i) => (Math.abs(t - at) < Math.abs(time[best] - at) ? i : best), 0));
-  });
-  return svg;
 }
 
 let pending = 0;
@@ -163,8 +160,6 @@ function nearestAlong(places, step, [x, y]) {
 
 // ---- corrections -------------------------------------------------------------------------------------------------
 
-const SETTLED = ["doubtful", "lost", "rejected", "after_end"];
-
 function proofs() {
   const act = (id, words) => el("button", {type: "button", id, onclick: () => correct(shownFrame(), id)}, words);
   const step = (by, name, words) => el("button", {type: "button", "aria-label": name, onclick: () => point(shownFrame() + by)}, words);
@@ -176,23 +171,16 @@ function proofs() {
 function correct(i, action, edge = null) {
   const made = last;
   if (action === "confirm" && made.edge_px[i] === null) { $("readout").textContent = `frame ${i} has no edge to be confirmed: drag it to where the edge is`; return; }
-  const {name} = made;
-  const others = (state.corrections[name] ?? []).filter((one) => one.frame !== i);
-  made.first ??= {flag: [...made.flag], edge_px: [...made.edge_px], position_mm: [...made.position_mm]};
-  const flags = made.first.flag[i].split(";").filter((flag) => flag && flag !== "corrected");
-  if (action !== "undo") others.push({frame: i, action, edge_px: edge});
-  made.edge_px[i] = action === "move" ? edge : action === "drop" ? null : made.tracked_px[i];
-  const settled = [...flags.filter((flag) => !SETTLED.includes(flag)), ...(action === "drop" ? ["rejected"] : []), "corrected"];
-  made.flag[i] = (action === "undo" ? flags : settled).join(";");
-  // Approximate, with a constant scale, until it is tracked again.
-  const known = made.first.edge_px.findIndex((value, j) => value !== null && made.first.position_mm[j] !== null);
-  const from_known = made.mm_per_px * (made.edge_px[i] - made.first.edge_px[known]);
-  made.position_mm[i] = made.edge_px[i] === null || !made.mm_per_px || known < 0 ? null : made.first.position_mm[known] + from_known;
-  state.corrections[name] = others;
-  if (!others.length) delete state.corrections[name];
+  const given = (state.corrections[made.name] ?? []).filter((one) => one.frame !== i);
+  if (action !== "undo") given.push({frame: i, action, edge_px: edge});
+  state.corrections[made.name] = given;
+  if (!given.length) delete state.corrections[made.name];
+  // Until it was tracked again
+  if (action === "move" || action === "drop") made.edge_px[i] = edge;
+  made.flag[i] = action === "undo" ? "" : "corrected";
+  corrected = true;
   changed();
   document.querySelector(".strip").replaceWith(strip(made));
-  document.querySelector(".plot")?.replaceWith(plot(made));
   point(i);
 }
 

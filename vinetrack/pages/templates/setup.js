@@ -16,7 +16,7 @@ function showWhole(extra = []) {
   $("whole").replaceChildren(...listed([...extra, ...state.problems.filter((problem) => problem.field === "whole")]));
 }
 
-function showState(notes = []) {
+function showState() {
   const errors = state.problems.filter((problem) => problem.severity === "error").length;
   const warnings = state.problems.length - errors;
   // Until the recordings were compared only the sheet was checked: whether they agree with it is not known yet.
@@ -25,7 +25,7 @@ function showState(notes = []) {
   $("headline").textContent = `${state.sheet.rows.length} trials, ${errors ? todo : ready}`;
   const words = [];
   if (warnings) words.push(`${warnings} ${warnings === 1 ? "warning" : "warnings"}`);
-  words.push(state.dirty ? "not saved" : "saved as shown", ...notes);
+  words.push(state.dirty ? "not saved" : "saved as shown");
   if (!errors && !state.dirty) words.push(`next: vinetrack run ${state.folder}`);
   $("status").textContent = words.join(" · ");
   $("save").disabled = !state.dirty;
@@ -43,10 +43,10 @@ async function check(thorough = false) {
     if (thorough) state.compared = true;
     for (const name of ["sheet", "settings", "corrections"]) $(`${name}-text`).textContent = found[`${name}_text`];
     $("corrections-shown").hidden = !found.corrections_text;
-    showWhole(markProblems());
+    showWhole([...markProblems(), ...found.notes.map((text) => ({severity: "note", text}))]);
     $("understood").hidden = !found.understood.length;
     $("understood").textContent = found.understood.join("\n");
-    showState(found.notes);
+    showState();
   } catch (error) {
     if (mine !== turn) return;
     state.problems = error.content?.problems ?? [];
@@ -90,7 +90,7 @@ async function begin() {
 
 $("save").onclick = save;
 $("check").onclick = () => check(true);
-$("track").onclick = track;
+$("track").onclick = () => track();
 addEventListener("keydown", (event) => {
   if ((event.ctrlKey || event.metaKey) && event.key === "s") { event.preventDefault(); save(); }
 });

@@ -1,13 +1,13 @@
 // State of the page, requests to the server, and creation of elements.
 export const state = {
   known: {}, units: {}, offered: [], sheet: {columns: [], rows: []}, kept: [], shared: {}, calibration: null, axis: null, corrections: {},
-  pictures: [], traces: [], stamp: "", chosen: 0, problems: [], dirty: false, compared: false, clip: null,
+  pictures: [], traces: [], notes: [], stamp: "", chosen: 0, problems: [], dirty: false, compared: false, clip: null,
 };
 
 export const $ = (id) => document.getElementById(id);
 
 export function el(tag, given = {}, ...children) {
-  const svg = ["svg", "line", "circle", "path", "text", "g", "polyline", "rect"].includes(tag);
+  const svg = ["svg", "image", "line", "circle", "path", "text", "polyline"].includes(tag);
   const made = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   for (const [key, value] of Object.entries(given)) {
     if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
@@ -35,17 +35,7 @@ export async function ask(path, body) {
 
 export const url = (path, given) => `${path}?${new URLSearchParams(given)}`;
 
-export function quantityOf(name) {
-  if (state.known[name]) return state.known[name].quantity;
-  const ending = Object.keys(state.units).filter((unit) => name.endsWith(`_${unit}`)).sort((a, b) => b.length - a.length)[0];
-  return ending ? name.slice(0, -ending.length - 1) : name;
-}
-
-export function baseOf(name) {
-  if (state.known[name]) return name;
-  const quantity = quantityOf(name);
-  return Object.keys(state.known).find((key) => state.known[key].quantity === quantity && state.known[key].units.length) ?? null;
-}
+export const quantityOf = (name) => state.known[name]?.quantity ?? name;
 
 // Columns shown: those of the sheet and those offered, each quantity once, in its unit in the sheet.
 export function shownColumns() {
@@ -56,13 +46,13 @@ export function shownColumns() {
     quantities.add(quantityOf(name));
     names.push(name);
   }
-  const order = (name) => { const i = state.offered.indexOf(baseOf(name)); return i < 0 ? 99 : i; };
+  const order = (name) => { const i = state.offered.findIndex((other) => quantityOf(other) === quantityOf(name)); return i < 0 ? 99 : i; };
   return names.map((name, i) => [order(name), i, name]).sort((a, b) => a[0] - b[0] || a[1] - b[1]).map((entry) => entry[2]);
 }
 
 // Display name of a column: without its unit if that can be chosen.
 export function labelOf(name) {
-  const known = state.known[baseOf(name)];
+  const known = state.known[name];
   return (known && known.units.length > 1 ? known.quantity : name).replaceAll("_", " ");
 }
 

@@ -1,5 +1,5 @@
 // The table: one row for all trials, one for each trial, with problems under the cell concerned.
-import {$, ask, baseOf, changed, el, labelOf, listed, quantityOf, sharedKey, sharedValue, shownColumns, state, url} from "./state.js";
+import {$, ask, changed, el, labelOf, listed, quantityOf, sharedKey, sharedValue, shownColumns, state, url} from "./state.js";
 
 export function drawTable(choose) {
   const columns = shownColumns();
@@ -7,6 +7,9 @@ export function drawTable(choose) {
   table.replaceChildren(head(columns), el("tbody", {}, sharedRow(columns), ...state.sheet.rows.map((row, i) => trialRow(row, i, columns, choose))));
   table.onpaste = paste;
   table.onkeydown = move;
+  $("notes").replaceChildren(el("option", {value: ""}, "…"), ...state.notes.map((name) => el("option", {value: name}, name)));
+  $("notes").parentElement.hidden = !state.notes.length;
+  $("notes").onchange = (event) => propose({file: event.target.value}, "trial", 0);
   $("traces").replaceChildren(...state.traces.map((name) => el("option", {value: name})));
   drawAdder(columns);
   markProblems();
@@ -14,7 +17,7 @@ export function drawTable(choose) {
 
 function head(columns) {
   const cells = columns.map((name) => {
-    const known = state.known[baseOf(name)];
+    const known = state.known[name];
     const title = known ? [known.meaning, known.measured, known.default && `Blank: ${known.default}.`].filter(Boolean).join(" ") : "Not a column of a trial sheet: kept, but ignored.";
     const unit = known && known.units.length > 1
       ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => setUnit(name, event.target.value)},
@@ -22,7 +25,7 @@ function head(columns) {
       : el("span", {class: "unit"});
     return el("th", {scope: "col"}, el("span", {title}, labelOf(name)), unit);
   });
-  return el("thead", {}, el("tr", {}, el("th"), el("th", {scope: "col"}, "trial", el("span", {class: "unit"}, "recording")), ...cells));
+  return el("thead", {}, el("tr", {}, el("td"), el("th", {scope: "col"}, "trial", el("span", {class: "unit"}, "recording")), ...cells));
 }
 
 const unitOf = (name) => name.slice(quantityOf(name).length + 1);
@@ -44,7 +47,7 @@ function redraw() { drawTable(chooser); }
 
 function sharedRow(columns) {
   const cells = columns.map((name) => {
-    const known = state.known[baseOf(name)];
+    const known = state.known[name];
     if (!known?.shared) return el("td");
     const key = sharedKey(name) ?? name;
     const blank = known.default.startsWith("required") ? "" : known.default.split(":")[0].slice(0, 12);
@@ -78,7 +81,7 @@ function setCell(row, column, value) {
 }
 
 function cell(column, row, value, placeholder, write) {
-  const known = state.known[baseOf(column)];
+  const known = state.known[column];
   const label = `${labelOf(column)}, ${row === "shared" ? "all trials" : state.sheet.rows[row].trial}`;
   const given = {"data-column": column, "data-row": row, "aria-label": label};
   const heard = (event) => { write(event.target.value.trim()); changed(); };
@@ -101,30 +104,46 @@ function move(event) {
   if (next) { next.focus(); next.select?.(); event.preventDefault(); }
 }
 
-// The server says which cells a pasted block changes; Ctrl-Z takes the whole block back.
-let before = null;
-async function paste(event) {
+function paste(event) {
   const text = event.clipboardData.getData("text");
   const {column, row} = event.target.dataset;
-  const isText = state.known[baseOf(column)] && state.known[baseOf(column)].kind !== "number";
+  const isText = state.known[column] && state.known[column].kind !== "number";
   if (!/[\t\n]/.test(text.trim()) && (isText || !/;|,\s*\S+[,\s]|,\s+\S/.test(text))) return;
   event.preventDefault();
-  const columns = shownColumns();
+  propose({text}, column, row);
+}
+
+// The server says which cells a block changes. They are shown first, and Ctrl-Z takes the whole block back.
+let before = null;
+async function propose(block, column, row) {
   const {rows, decimal} = state.sheet;
   const at_row = row === "shared" ? row : Number(row);
   let placed;
   try {
-    placed = await ask("api/paste", {text, columns, rows, at_row, at_column: column, decimal: decimal || "."});
+    placed = await ask("api/paste", {...block, columns: shownColumns(), rows, at_row, at_column: column, decimal: decimal || "."});
   } catch (error) {
     placed = {cells: [], notes: [error.message]};
   }
-  before = structuredClone({sheet: state.sheet, shared: state.shared});
-  for (const [at, name, value] of placed.cells) {
-    if (at === "shared") state.shared[sharedKey(name) ?? name] = value;
-    else setCell(state.sheet.rows[at], name, value);
-  }
-  refreshAt(column, row);
-  $("pasted").replaceChildren(...listed(placed.notes.map((text) => ({severity: "warning", text}))));
+  const notes = el("ul", {class: "problems"}, ...listed(placed.notes.map((text) => ({severity: "warning", text}))));
+  $("pasted").replaceChildren(notes);
+  if (!placed.cells.length) return;
+  const lines = placed.cells.map(([at, name, value]) => {
+    const now = (at === "shared" ? sharedValue(name) : rows[at][name]) || "blank";
+    return el("tr", {}, ...[at === "shared" ? "All trials" : rows[at].trial, name.replaceAll("_", " "), now, "→", value].map((text) => el("td", {}, text)));
+  });
+  const put = () => {
+    before = structuredClone({sheet: state.sheet, shared: state.shared});
+    for (const [at, name, value] of placed.cells) {
+      if (at === "shared") state.shared[sharedKey(name) ?? name] = value;
+      else setCell(state.sheet.rows[at], name, value);
+    }
+    $("pasted").replaceChildren(notes);
+    refreshAt(column, row);
+  };
+  const button = (id, words, onclick) => el("button", {type: "button", id, onclick}, words);
+  $("pasted").append(el("div", {class: "scroll preview", tabindex: 0, "aria-label": "What would change"}, el("table", {}, ...lines)),
+    el("div", {class: "row"}, button("put-in", `Fill in ${lines.length} cells`, put), button("leave", "Leave the table as it is", () => $("pasted").replaceChildren())));
+  $("put-in").focus();
 }
 
 function refreshAt(column, row) {
@@ -146,7 +165,7 @@ addEventListener("keydown", (event) => {
 
 function drawAdder(columns) {
   const shown = new Set(columns.map(quantityOf));
-  const left = Object.keys(state.known).filter((name) => !shown.has(state.known[name].quantity));
+  const left = Object.keys(state.known).filter((name) => state.known[name].base === name && !shown.has(quantityOf(name)));
   $("add-column").replaceChildren(el("option", {value: ""}, "…"), ...left.map((name) => el("option", {value: name, title: state.known[name].meaning}, name)));
   $("add-column").onchange = (event) => {
     state.offered.push(event.target.value);
