@@ -48,7 +48,7 @@ GAMMA = "size_reservoir_depletion.gamma"
 class Browser:
     """In place of a browser: a document whose callbacks are run by hand."""
 
-    def __init__(self, background: BackgroundFit, reopen: Callable[[BackgroundFit], None] | None = None) -> None:
+    def __init__(self, background: BackgroundFit, reopen: Callable[[BackgroundFit], None] = print) -> None:
         self.document = Document()
         self.page = Page(background, self.document, reopen)
         self.turn()

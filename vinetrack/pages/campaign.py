@@ -17,7 +17,6 @@ import numpy as np
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.diagnosis.replicates import align_replicates, first_that_counts
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
@@ -305,11 +304,6 @@ class SizeControl:
         """`effect.parameter`, with the vine in brackets if each has its own value."""
         return f"{self.key}[{self.vine}]" if self.vine else self.key
 
-    @property
-    def shown(self) -> tuple[str, float]:
-        """The displayed unit, and the factor from SI."""
-        return display_unit(self.parameter.unit, SLIDER_UNITS)
-
 
 @dataclass(frozen=True)
 class ModelChoice:
@@ -319,9 +313,6 @@ class ModelChoice:
 
     effects: tuple[str, ...]
     numbers: Mapping[str, float] = field(default_factory=dict)
-
-    def __contains__(self, effect: object) -> bool:
-        return effect in self.effects
 
     def with_effect(self, effect: str, wanted: bool = True) -> ModelChoice:
         """Return the choice with an effect added (at the end) or removed; its sizes are kept for when it returns."""
@@ -388,22 +379,16 @@ class Cancelled(Exception):  # noqa: N818 - nothing went wrong
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A choice with what it predicts, and the fit that its sizes are from, if they are from one."""
+    """A fit, the choice with its sizes, and what that predicts."""
 
     choice: ModelChoice
     prediction: Prediction
-    fitted: Fit | None = None
-
-    @property
-    def fit(self) -> Fit:
-        """The fit, of a choice known to have one."""
-        assert self.fitted is not None
-        return self.fitted
+    fit: Fit
 
     @property
     def numbers(self) -> dict[str, Number]:
         """The fitted numbers by name."""
-        return {} if self.fitted is None else {number.name: number for number in self.fitted.numbers}
+        return {number.name: number for number in self.fit.numbers}
 
 
 def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Evaluated:

@@ -21,6 +21,7 @@ from bokeh.models import (
     UIElement,
 )
 
+from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.effects import BASE_EFFECTS, load_effect
 from vinetrack.inference.fit_result import Number, number_row
@@ -48,12 +49,12 @@ class SizeSlider:
 
     def __init__(self, size: SizeControl, value: float, disabled: bool, moved: Callable[[str, float], None]) -> None:
         self.size = size
-        unit, factor = size.shown
+        unit, self._factor = display_unit(size.parameter.unit, SLIDER_UNITS)
         what = size.vine or size.parameter.meaning
         self._opened = slider_range(size.key, size.parameter, value)
         self.slider = Slider(
             **self._ends(value),
-            value=factor * value,
+            value=self._factor * value,
             title=f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol,
             format=PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
             sizing_mode="stretch_width",
@@ -63,19 +64,18 @@ class SizeSlider:
             margin=(2, 0, 6, 0),
         )
         self.fitted = Div(visible=False, name=f"found_{size.name}")
-        self.slider.on_change("value", lambda _attr, _old, new: moved(size.name, float(new) / factor))
+        self.slider.on_change("value", lambda _attr, _old, new: moved(size.name, float(new) / self._factor))
 
     def _ends(self, value: float) -> dict[str, float]:
         """Ends and step of a range that holds a value and the range of the beginning."""
-        factor = self.size.shown[1]
         low, high = slider_range(self.size.key, self.size.parameter, value)
-        low, high = factor * min(low, self._opened[0]), factor * max(high, self._opened[1])
+        low, high = self._factor * min(low, self._opened[0]), self._factor * max(high, self._opened[1])
         # 400: steps of a slider; chosen: about one per pixel
         return {"start": low, "end": high, "step": (high - low) / 400 or 1.0}
 
     def show(self, value: float, number: Number | None) -> None:
         """Move the slider to a value, and show the estimate of a fit below it, or none."""
-        self.slider.update(**self._ends(value), value=value * self.size.shown[1])
+        self.slider.update(**self._ends(value), value=value * self._factor)
         text = ""
         if number is not None:
             _, estimate, error, _, interval, unit = number_row(number)
@@ -112,7 +112,7 @@ class EffectPanel:
             unusable = campaign.unusable.get(name, "")
             self.ticks[name] = Checkbox(
                 label=spaced_name(name),
-                active=name in choice,
+                active=name in choice.effects,
                 disabled=bool(unusable) or name in BASE_EFFECTS,  # all others are added to these
                 name=f"tick_{name}",
                 css_classes=["tick"],
@@ -126,7 +126,7 @@ class EffectPanel:
             about = Div(text=f"<small>{escape(unusable or effect.formula)}</small>")
             parts = [part for one in self.sliders[name] for part in (one.slider, one.fitted)]
             rows[name] = Column(self.ticks[name], about, *parts, margin=(0, 0, 4, 0))
-        in_use = [name for name in rows if name in choice]
+        in_use = [name for name in rows if name in choice.effects]
         likely = [name for name in suspects if name in rows and name not in in_use][:6]
         others = [name for name in rows if name not in in_use and name not in likely]
         measured = [name for name in others if campaign.effects[name].kind == "measurement"]
@@ -146,9 +146,9 @@ class EffectPanel:
     def show(self, choice: ModelChoice, numbers: Mapping[str, Number]) -> None:
         """Set tick boxes and sliders to a choice, with the fitted numbers of its effects by name."""
         for name, tick in self.ticks.items():
-            tick.active = name in choice
+            tick.active = name in choice.effects
             for one in self.sliders[name]:
-                one.show(choice.numbers[one.size.name], numbers.get(one.size.name) if name in choice else None)
+                one.show(choice.numbers[one.size.name], numbers.get(one.size.name) if name in choice.effects else None)
 
 
 class TrialSelector:
@@ -220,7 +220,7 @@ def propose_and_read(
 class ProposalPanel:
     """Button, progress and outcome; visible if the verdict is `unexplained`."""
 
-    def __init__(self, page: Page, reopen: Reopen | None) -> None:
+    def __init__(self, page: Page, reopen: Reopen) -> None:
         self._page, self._reopen = page, reopen
         self._job: Job[str, tuple[WrittenProposal, Campaign, ModelChoice]] | None = None
         self._task, self._begun_s = "", 0.0
@@ -269,11 +269,11 @@ class ProposalPanel:
         self._job, self.button.label = None, PROPOSE
         if outcome is not None and outcome[0].files:
             self._proposed = outcome[1:]
-            self.button.visible, self.open.visible = False, self._reopen is not None
+            self.button.visible, self.open.visible = False, True
         lines = [reason] if outcome is None else outcome[0].lines
         set_text(self.text, "".join(f"<p>{escape(line)}</p>" for line in lines))
 
     def _open(self) -> None:
-        if self._proposed is not None and self._reopen is not None:
+        if self._proposed is not None:
             self._reopen(BackgroundFit(*self._proposed).begin())
             self._reload.data = {"times": [1]}

@@ -239,11 +239,8 @@ def open_draft(folder: Path) -> Draft:
 
 def files_stamp(folder: Path) -> str:
     """Return a fingerprint of the present files."""
-    digest = hashlib.sha256()
-    for name in FILES:
-        path = folder / name
-        digest.update(path.read_bytes() if path.is_file() else b"\0absent\0")
-    return digest.hexdigest()
+    paths = [folder / name for name in FILES]
+    return hashlib.sha256(repr([path.is_file() and path.read_bytes() for path in paths]).encode()).hexdigest()
 
 
 def write_draft(folder: Path, draft: Draft) -> list[str]:

@@ -9,24 +9,24 @@ import signal
 import threading
 import webbrowser
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
-    import tornado.web
     from numpy.typing import NDArray
+    from tornado.web import Application
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 pages on one machine, then any free port
 
+TEMPLATES = Path(__file__).with_name("templates")
+
 THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
 
 
-Application = TypeVar("Application", bound="tornado.web.Application")
-
-
-class PageServer(Generic[Application]):
+class PageServer:
     """A server of the application that `make` returns for the first part of its paths, which is random, so that only
     who was told the address has access. It has a port, but answers nothing until its loop runs.
     """
@@ -47,7 +47,7 @@ class PageServer(Generic[Application]):
             raise UserError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
         self.secret, self.port = f"/{secrets.token_urlsafe(16)}", int(sockets[0].getsockname()[1])
         self.address = f"http://{LOOPBACK}:{self.port}{self.secret}/"
-        self.application = application = make(self.secret)
+        application = make(self.secret)
         hosts = (f"{LOOPBACK}:{self.port}", f"localhost:{self.port}")
 
         class OwnPageOnly(Router):

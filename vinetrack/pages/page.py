@@ -6,7 +6,7 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from html import escape
 from pathlib import Path
@@ -15,6 +15,7 @@ from bokeh.document import Document
 from bokeh.models import Column, CustomJS, Div
 from bokeh.server.tornado import BokehTornado
 from markupsafe import Markup
+from tornado.ioloop import IOLoop
 
 from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.core.tables import TableError
@@ -23,9 +24,9 @@ from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.folder import save_model
 from vinetrack.figures.style import TOKENS, follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit, number_row, numbers_text
+from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
-from vinetrack.narrative.verdict_text import quantity_text, spaced_name
+from vinetrack.narrative.verdict_text import quantity_text
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
@@ -41,9 +42,8 @@ from vinetrack.pages.campaign import (
     read_campaign,
 )
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, TrialSelector
-from vinetrack.pages.local_page import PageServer
+from vinetrack.pages.local_page import TEMPLATES, PageServer
 from vinetrack.pages.plots import (
-    TEMPLATES,
     FilmPanel,
     Plots,
     beside,
@@ -88,11 +88,16 @@ def _in_mm(value_m: float) -> str:
     return f"{1e3 * value_m:.3g} mm" if math.isfinite(value_m) else ""
 
 
+def described(choice: ModelChoice, prediction: Prediction, numbers: Iterable[Number]) -> dict[str, str]:
+    """Return effects, error and fitted parameters of a model in words."""
+    words = {"effects": model_text(choice.effects), "rms of position": _in_mm(overall_m(prediction.errors_m))}
+    return words | {number.title: quantity_text(number) for number in numbers}
+
+
 def numbers_panel(
-    campaign: Campaign, fits: Sequence[Evaluated], sizes_changed: bool, held: Evaluated | None, now: Evaluated | None
+    campaign: Campaign, fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequence[tuple[str, str, str]]
 ) -> str:
-    """Return the held model beside the current one, the last fit of this page as it is printed, and all its fits."""
-    compared = [] if held is None or now is None else _compared((held, now))
+    """Return two models compared, the last fit of this page as it is printed, and all its fits."""
     if not fits:
         return panel("numbers", compared=compared)
     fit = fits[-1].fit
@@ -120,38 +125,6 @@ def likelihood_change_text(before: Fit, after: Fit) -> str:
     count = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
     change = f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f}"
     return f"{change} for {count}." if more else f"{change} with the same number of parameters."
-
-
-def _compared(models: Sequence[Evaluated]) -> list[tuple[str, ...]]:
-    """Error and every fitted parameter of either of two models."""
-    rows = [
-        ("effects", *(model_text(model.choice.effects) for model in models)),
-        ("rms of position", *(_in_mm(overall_m(model.prediction.errors_m)) for model in models)),
-    ]
-    fits = [model.numbers for model in models]
-    for name in dict.fromkeys(name for numbers in fits for name in numbers):
-        title = next(numbers[name].title for numbers in fits if name in numbers)
-        rows.append((title, *(quantity_text(n[name]) if name in n else "–" for n in fits)))
-    return rows
-
-
-def tied_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
-    """Return which effects the data cannot separate, as in the report."""
-    tied = () if diagnosis is None or len(diagnosis.answer_set) < 2 else diagnosis.answer_set
-    return panel(
-        "tied",
-        diagnosis=diagnosis,
-        diagnose=f"vinetrack diagnose {campaign.folder.as_posix()}",
-        names=[spaced_name(name) for name in tied],
-        pairs=tied_pairs(diagnosis.rounds[0]) if diagnosis is not None and diagnosis.rounds else (),
-    )
-
-
-def next_panel(campaign: Campaign, diagnosis: Diagnosis | None) -> str:
-    """Return the next experiment of the diagnosis, as in the report."""
-    advice = None if diagnosis is None else next_experiment(diagnosis.next_experiment)
-    diagnose = f"vinetrack diagnose {campaign.folder.as_posix()}"
-    return panel("next", diagnosed=diagnosis is not None, advice=advice, diagnose=diagnose)
 
 
 def suspects(diagnosis: Diagnosis | None) -> tuple[str, ...]:
@@ -185,12 +158,12 @@ TEXT_MS = 150
 class Page:
     """Controller of one document. `_on_background_change` and `_on_step` are called from other threads."""
 
-    def __init__(self, background: BackgroundFit, document: Document, reopen: Reopen | None = None) -> None:
+    def __init__(self, background: BackgroundFit, document: Document, reopen: Reopen) -> None:
         self.background, self.campaign, self.document = background, background.campaign, document
         self.choice: ModelChoice = background.opening_choice
         self.shown: Prediction | None = None
         self.fits: list[Evaluated] = []
-        self.held: Evaluated | None = None
+        self.held: tuple[Prediction, dict[str, str]] | None = None
         self.diagnosis: Diagnosis | None = None
         self._diagnosed_at = 0.0
         self._read_diagnosis()
@@ -210,14 +183,14 @@ class Page:
 
     # ---- layout ----------------------------------------------------------------------------------------------------
 
-    def _build(self, reopen: Reopen | None) -> None:
+    def _build(self, reopen: Reopen) -> None:
         campaign = self.campaign
         self.headline, self.status = Div(name="headline"), Div(name="status")
         self.numbers, self.tied, self.next = Div(name="numbers"), Div(name="tied"), Div(name="next")
         self.selector = TrialSelector(campaign, self._selection_changed)
         self.plots = Plots(campaign, self.selector.toggle)
         self.panel = EffectPanel(campaign, self.choice, suspects(self.diagnosis), self._ticked, self._size_moved)
-        self.film = FilmPanel(campaign, self.document, self._instant)
+        self.film = FilmPanel(campaign, self.document, self.plots.set_instant)
         self.saved = Div(name="saved")
         save = beside(button("Save the model to experiment.yaml", "save", self._save))
         self.proposal = ProposalPanel(self, reopen)
@@ -253,7 +226,7 @@ class Page:
     # ---- user input ------------------------------------------------------------------------------------------------
 
     def _ticked(self, effect: str, wanted: bool) -> None:
-        if wanted == (effect in self.choice):  # a tick that follows the choice
+        if wanted == (effect in self.choice.effects):  # a tick that follows the choice
             return
         self.choice = self.choice.with_effect(effect, wanted)
         self._mark_changed()
@@ -285,10 +258,14 @@ class Page:
 
     def _hold(self) -> None:
         """Hold the current model for comparison; pressed again, compare with the model in use."""
-        self.held = None if self.held is not None else self._now
+        self.held = None if self.held is not None or self.shown is None else (self.shown, self._described(self.shown))
         self.hold.label = "Hold to compare" if self.held is None else "Release"
         self._draw()
         self._update_text()
+
+    def _described(self, shown: Prediction) -> dict[str, str]:
+        fit = None if self._sizes_changed or self.last is None else self.last.fit
+        return described(self.choice, shown, () if fit is None else fit.numbers)
 
     @property
     def last(self) -> Evaluated | None:
@@ -296,14 +273,9 @@ class Page:
         return self.fits[-1] if self.fits else None
 
     @property
-    def _now(self) -> Evaluated | None:
-        fit = None if self._sizes_changed or self.last is None else self.last.fit
-        return None if self.shown is None else Evaluated(self.choice, self.shown, fit)
-
-    @property
     def _reference(self) -> Prediction | None:
         """Of the model for comparison: the one that is held, else the model in use."""
-        return self.background.prediction if self.held is None else self.held.prediction
+        return self.background.prediction if self.held is None else self.held[0]
 
     # ---- fits ----------------------------------------------------------------------------------------------------
 
@@ -346,10 +318,8 @@ class Page:
         self._update_text()
         worst = max(first.errors_m, key=lambda name: first.errors_m[name])
         self.film.show_trial(self.campaign.trials[self.campaign.indices_of_condition(worst)[0]].name)
-        as_fitted = self.last is not None and self.choice is self.last.choice
-        if self.choice is not self.background.initial and not as_fitted:
-            self._sizes_changed = True
-            self._soon(self._redraw, REDRAW_MS)
+        if self.choice is not self.background.initial:
+            self._mark_changed()
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread. A page that cannot keep up draws only the newest step."""
@@ -421,11 +391,20 @@ class Page:
         if self._job is None:
             # The error at a step of a fit, or before a fit, says nothing about the effect.
             set_text(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
+        compared = []
         if self.shown is not None:
             self.film.set_predictions(self.shown, self._reference)
-        set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, self.held, self._now))
-        set_text(self.tied, tied_panel(self.campaign, self.diagnosis))
-        set_text(self.next, next_panel(self.campaign, self.diagnosis))
+            if self.held is not None:
+                held, now = self.held[1], self._described(self.shown)
+                compared = [(title, held.get(title, "–"), now.get(title, "–")) for title in held | now]
+        set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, compared))
+        diagnosis, pairs, advice = self.diagnosis, list[str](), None
+        if diagnosis is not None:
+            advice = next_experiment(diagnosis.next_experiment)
+            pairs = tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else pairs
+        command = f"vinetrack diagnose {self.campaign.folder.as_posix()}"
+        set_text(self.tied, panel("tied", diagnosis=diagnosis, diagnose=command, pairs=pairs))
+        set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
         lines = self._commands()
         same = "<small>The same from the command line:</small>" + panel("commands", lines=lines)
         set_text(self.command_text, same if lines else "")
@@ -445,11 +424,6 @@ class Page:
             fitting = "fitting the model in use, in the background"
             text = f"<small>{'preparing the model' if background.prediction is None else fitting} …</small>"
         set_text(self.status, text)
-
-    def _instant(self, trial: str, since_s: float) -> None:
-        """Mark in the figure the time of the frame shown."""
-        shown = {self.campaign.trials[i].name for i in self.selector.shown}
-        self.plots.set_instant(since_s if trial in shown else None)
 
     def _read_diagnosis(self) -> bool:
         """Read the diagnosis of the results, None if there is none or it cannot be read; whether it has changed."""
@@ -497,26 +471,22 @@ class Page:
 # Server of the page, on the loopback address only and without external resources.
 
 
-def start_server(background: BackgroundFit, port: int | None = None) -> PageServer[BokehTornado]:
+def start_server(background: BackgroundFit, port: int | None = None) -> PageServer:
     """Return the server of the page, which answers once its loop runs."""
     shown = [background]
 
     def application(secret: str) -> BokehTornado:
-        return BokehTornado(
+        made = BokehTornado(
             lambda document: Page(shown[-1], document, shown.append),
             prefix=secret,
             extra_websocket_origins=["*"],  # checked by the server, with all else
-            # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
-            keep_alive_milliseconds=20_000,
-            check_unused_sessions_milliseconds=5_000,
-            unused_session_lifetime_milliseconds=10_000,
             use_index=False,
         )
+        made.initialize(IOLoop.current())
+        made.start()
+        return made
 
-    server = PageServer(application, port)
-    server.application.initialize(server.loop)
-    server.application.start()
-    return server
+    return PageServer(application, port)
 
 
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
@@ -536,4 +506,3 @@ def explore(
     server = start_server(background, port)
     background.begin()
     server.run("Explorer", say, browser=browser)
-    server.application.stop(wait=False)

@@ -40,8 +40,9 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
+from vinetrack.inference.fit_result import TrialFit
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction, condition_labels, drawn_rows
-from vinetrack.pages.local_page import jpeg
+from vinetrack.pages.local_page import TEMPLATES, jpeg
 from vinetrack.pipeline.overlays_stage import position_to_px, shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 from vinetrack.video.axis import Axis
@@ -50,8 +51,6 @@ from vinetrack.video.frames import RecordingError, inspect_recording, iterate_fr
 
 # ------------------------------------------------------------------------------
 # Style shared with the report: colours, fonts, and the pieces of HTML of the page.
-
-TEMPLATES = Path(__file__).with_name("templates")
 
 
 def theme() -> Theme:
@@ -62,7 +61,11 @@ def theme() -> Theme:
         "Widget": {"margin": 0, "stylesheets": [(TEMPLATES / "widgets.css").read_text(encoding="utf-8")]},
         "Div": wide,
         "Column": wide,
-        "Plot": {"background_fill_color": None, "border_fill_color": None, "outline_line_color": None},
+        "Plot": {
+            **dict.fromkeys(("background_fill_color", "border_fill_color", "outline_line_color"), None),
+            "toolbar_inner": True,
+        },
+        "Toolbar": {"autohide": True, "logo": None},
         "Axis": {
             **dict.fromkeys(("axis_label_text_font", "major_label_text_font"), font),
             **dict.fromkeys(("axis_label_text_color", "major_label_text_color"), INK),
@@ -104,7 +107,7 @@ def beside(*parts: UIElement, css: str = ":host { gap: 6px; }") -> Row:
 
 def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
     """Return an empty figure as wide as its card."""
-    fig = figure(
+    return figure(
         height=height,
         sizing_mode="stretch_width",
         tools="box_zoom,pan,reset",
@@ -117,10 +120,6 @@ def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
         margin=0,
         **keywords,
     )
-    fig.toolbar.autohide = True
-    fig.toolbar_inner = True
-    fig.toolbar.logo = None
-    return fig
 
 
 @cache
@@ -156,15 +155,6 @@ def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
     return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
 
 
-def axis_range(lines: Sequence[Floats]) -> dict[str, float]:
-    """Return the ends of an axis that holds lines with a margin."""
-    if not lines:
-        return {"start": 0.0, "end": 1.0}
-    low, high = (float(of(np.concatenate(lines))) for of in (np.nanmin, np.nanmax))
-    margin = 0.05 * ((high - low) or 1.0)
-    return {"start": low - margin, "end": high + margin}
-
-
 def round_up(value: float, steps: Sequence[float]) -> float:
     """Return the next of these steps times a power of ten, so that an axis rarely changes; 1 for nothing."""
     if not value > 0:
@@ -181,8 +171,6 @@ class Plots:
         styles = vine_styles(campaign.vines)
         # The colour of each condition is that of its vine, as in every figure.
         self._colour = {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
-        self._trials_drawn: tuple[int, ...] | None = None
-        self._other_drawn: Prediction | None = None
         self._band = ColumnDataSource(self._replicate_bands(()))
         self._measured = ColumnDataSource(self._lines(()))
         self._reference = ColumnDataSource({"xs": [], "ys": []})
@@ -193,30 +181,27 @@ class Plots:
         self.errors = self._draw_errors()
 
     def _draw_motion(self) -> Any:
-        fig = plot(360, "since release (ms)", "growth (mm)", name="motion", x_range=Range1d(), y_range=Range1d())
+        fig = plot(360, "since release (ms)", "growth (mm)", name="motion")
         fig.patches("xs", "ys", source=self._band, fill_color=vine_colour(), fill_alpha=0.2, line_color=None)
         look = {"line_color": vine_colour(), "line_width": 1.6, "line_alpha": 0.9}
         lines = fig.multi_line("xs", "ys", source=self._measured, **look)
+        for of_axis in (fig.x_range, fig.y_range):
+            of_axis.update(renderers=[lines], range_padding=0.05)
         ghost = {"line_color": MUTED, "line_width": 1.5, "line_dash": [2, 3]}
         fig.multi_line("xs", "ys", source=self._reference, **ghost)
         model = fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
         values = [("since release", "$x{0.0} ms"), ("growth", "$y{0.0} mm")]
-        tips = [("trial", "@trial"), ("", "@condition"), *values]
-        fig.add_tools(
-            HoverTool(renderers=[lines], tooltips=tips, line_policy="interp"),
-            HoverTool(renderers=[model], tooltips=[("", "model"), *values], line_policy="interp"),
-        )
+        for drawn, tips in ((lines, [("trial", "@trial"), ("", "@condition")]), (model, [("", "model")])):
+            fig.add_tools(HoverTool(renderers=[drawn], tooltips=[*tips, *values], line_policy="interp"))
         self.instant = Span(dimension="height", line_color=INK, line_width=1, line_alpha=0.5, visible=False)
         fig.add_layout(self.instant)
         return fig
 
     def _draw_residual(self) -> Any:
-        ranges = {"x_range": Range1d(), "y_range": Range1d(-1, 1)}
-        fig = plot(230, "growth (mm)", "measured − model (mm)", name="residual", **ranges)
+        fig = plot(230, "growth (mm)", "measured − model (mm)", name="residual", y_range=Range1d(-1, 1))
         fig.add_layout(Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
         lines = fig.multi_line("xs", "ys", source=self._residuals, line_color=vine_colour(), line_width=1.4)
-        values = [("growth", "$x{0.0} mm"), ("measured − model", "$y{0.00} mm")]
-        tips = [("trial", "@trial"), ("", "@condition"), *values]
+        tips = [("trial", "@trial"), ("", "@condition"), ("growth", "$x{0.0} mm"), ("measured − model", "$y{0.00} mm")]
         fig.add_tools(HoverTool(renderers=[lines], tooltips=tips, line_policy="interp"))
         return fig
 
@@ -282,12 +267,10 @@ class Plots:
 
     def _model_lines(self, prediction: Prediction, shown: Sequence[int]) -> Columns:
         """One line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
-        trials = self.campaign.trials
-        longest: dict[str, int] = {}
-        for i in sorted(shown, key=lambda i: trials[i].time_s[-1], reverse=True):
-            longest.setdefault(trials[i].condition, i)
-        conditions = [name for name in self.campaign.conditions if name in longest]
-        drawn = [(trials[longest[name]], prediction.trials[longest[name]]) for name in conditions]
+        longest: dict[str, tuple[ExplorerTrial, TrialFit]] = {}
+        for i in sorted(shown, key=lambda i: self.campaign.trials[i].time_s[-1]):
+            longest[self.campaign.trials[i].condition] = self.campaign.trials[i], prediction.trials[i]
+        drawn = [longest[name] for name in self.campaign.conditions if name in longest]
         return {
             "xs": [1e3 * trial.time_s[trial.rows] for trial, _ in drawn],
             "ys": [1e3 * (model.predicted_position_m - trial.origin_m)[trial.rows] for trial, model in drawn],
@@ -308,51 +291,34 @@ class Plots:
     def set_shown(self, shown: Sequence[int]) -> None:
         """Select the trials to draw."""
         trials = [self.campaign.trials[i] for i in shown]
-        lines = self._lines((aligned, aligned.time_s, aligned.growth_m) for aligned in trials)
-        self.motion.x_range.update(**axis_range(lines["xs"]))
-        self.motion.y_range.update(**axis_range(lines["ys"]))
-        self.residual.x_range.update(**axis_range(lines["ys"]))
-        self._measured.data = lines
+        self._measured.data = self._lines((aligned, aligned.time_s, aligned.growth_m) for aligned in trials)
         conditions = [name for name in self.campaign.conditions if name in {one.condition for one in trials}]
         # Chosen: bands of more than four conditions overlap and hide the curves
         self._band.data = self._replicate_bands(conditions if len(conditions) <= 4 else [])
 
-    def set_instant(self, since_s: float | None) -> None:
-        """Mark a time since release, or none."""
-        self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
+    def set_instant(self, since_s: float) -> None:
+        """Mark a time since release."""
+        self.instant.update(visible=True, location=1e3 * since_s)
 
     def draw(
         self, now: Prediction, reference: Prediction | None, shown: Sequence[int], conditions: Sequence[str]
     ) -> None:
         """Draw the current model, and the one for comparison where it is another; errors of conditions that are not
-        selected are faint. Only what has changed is sent: for lines already drawn their ordinates.
+        selected are faint.
         """
         trials = self.campaign.trials
-        lines = self._model_lines(now, shown)
         residual = self._lines((trials[i], trials[i].growth_m, now.trials[i].residual_m) for i in shown)
         largest_mm = max((float(np.nanmax(np.abs(part))) for part in residual["ys"]), default=0.0)
         reach = round_up(1.05 * max(largest_mm, 0.1), (1.2, 2, 3, 5, 7, 10))
-        if reach != self.residual.y_range.end:
-            self.residual.y_range.update(start=-reach, end=reach)
-        same_trials = tuple(shown) == self._trials_drawn
-        if same_trials:
-            self._model.data["ys"] = lines["ys"]
-            self._residuals.data["ys"] = residual["ys"]
-        else:
-            self._model.data, self._residuals.data = lines, residual
+        self.residual.y_range.update(start=-reach, end=reach)
+        self._model.data, self._residuals.data = self._model_lines(now, shown), residual
         other = None if reference is now else reference
-        if not same_trials or other is not self._other_drawn:
-            self._reference.data = {"xs": [], "ys": []} if other is None else self._model_lines(other, shown)
-        self._trials_drawn, self._other_drawn = tuple(shown), other
+        self._reference.data = {"xs": [], "ys": []} if other is None else self._model_lines(other, shown)
         before_m = {} if reference is None else reference.errors_m
         rows = self._error_bars(now.errors_m, before_m, now.floors_m, conditions)
         known = [value for key in ("now", "before", "floor") for value in rows[key] if math.isfinite(value)]
-        end = round_up(1.04 * max(known, default=1.0), (1, 1.5, 2, 3, 4, 5, 6, 8, 10))
-        if end != self.errors.x_range.end:
-            self.errors.x_range.end = end
-        for key, values in rows.items():
-            if values != self._bars.data[key]:
-                self._bars.data[key] = values
+        self.errors.x_range.end = round_up(1.04 * max(known, default=1.0), (1, 1.5, 2, 3, 4, 5, 6, 8, 10))
+        self._bars.data = rows
 
 
 # ------------------------------------------------------------------------------
@@ -449,7 +415,7 @@ def decode(path: Path, watch: Callable[[tuple[int, float]], None]) -> Film:
 class FilmPanel:
     """Shows one trial at a time; calls `instant` with the time of the frame, s since release."""
 
-    def __init__(self, campaign: Campaign, document: Document, instant: Callable[[str, float], None]) -> None:
+    def __init__(self, campaign: Campaign, document: Document, instant: Callable[[float], None]) -> None:
         self.campaign, self._document, self._instant = campaign, document, instant
         self._now: Prediction | None = None
         self._reference: Prediction | None = None
@@ -544,10 +510,8 @@ class FilmPanel:
 
     def _show_from(self, last: int, frame: int) -> None:
         """Show the first frame of a trial that is shown: half-way along its motion."""
-        self.frame.update(start=0, end=max(last, 1))
-        if self.frame.value == frame:
-            self._show_frame()
-        self.frame.value = frame
+        self.frame.update(start=0, end=max(last, 1), value=frame)
+        self._show_frame()
 
     def _show_frame(self) -> None:
         frame = int(self.frame.value)
@@ -589,7 +553,7 @@ class FilmPanel:
         since_s = at_s - aligned.release_s
         when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
         self.caption.text = f"{notice}<p>{when} · {' · '.join(said)}</p>"
-        self._instant(aligned.name, since_s)
+        self._instant(since_s)
 
     def _draw_lines(self, view: RecordingView, frame: int, along_px: Floats) -> None:
         """Draw a line across the vine for each of `EDGES`; the picture may be smaller than the recording."""

@@ -25,7 +25,7 @@ from vinetrack.core.problems import ExperimentError, Problem, UserError
 from vinetrack.core.records import Correction, Trial
 from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join, with_value
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
-from vinetrack.experiment.folder import SETTINGS, check_experiment, read_corrections
+from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, check_experiment, read_corrections
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import in_sheet_units, read_experiment_settings
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read_row
@@ -47,7 +47,7 @@ from vinetrack.pages.draft_files import (
     with_shared,
     write_draft,
 )
-from vinetrack.pages.local_page import THREAD_PREFIX, PageServer, jpeg
+from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, PageServer, jpeg
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
 from vinetrack.tracks.importers import TrackError, read_pressure_trace
@@ -248,7 +248,7 @@ def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
 
 def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[str, Any]:
     """Return the messages of `vinetrack check` for a draft, of JSON types: `problems`, each with the field concerned,
-    `notes`, and what was `understood` of each recording.
+    `notes`, what was `understood` of each recording, and the text of each file.
     """
     with draft_folder(folder, draft) as copy:
         checked = check_folder(copy) if thorough else None
@@ -258,6 +258,7 @@ def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[s
         "problems": [_problem_json(problem, draft.sheet.columns) for problem in problems if problem.code != "unit"],
         "notes": list(checked.notes) if checked else [],
         "understood": list(checked.recording_lines) if checked else [],
+        "texts": draft.texts() | ({} if draft.corrections else {CORRECTIONS_FILE: ""}),
     }
 
 
@@ -289,8 +290,6 @@ def _problem_json(problem: Problem, columns: Sequence[str] = ()) -> dict[str, An
 
 log = logging.getLogger(__name__)
 
-TEMPLATES = Path(__file__).with_name("templates")
-
 
 class Desk:
     """What the page asks of one folder, from several threads at a time."""
@@ -314,22 +313,13 @@ class Desk:
         with self._decoding:
             return self._decoded(path, path.stat().st_mtime_ns if path.exists() else 0)
 
-    def frame(self, recording: str, frame: str) -> bytes:
-        """Return a frame as JPEG; beyond the last or before the first, that one."""
-        frames, _ = self.clip(recording)
-        return frames[min(max(int(frame), 0), len(frames) - 1)]
-
     def picture(self, name: str, widest: int | None = None) -> bytes:
         """Return a single picture or the first frame of a film as JPEG, without decoding more."""
         return jpeg(first_frame(safe_join(self.folder, name)), widest)
 
     def check(self, thorough: bool = False, **content: Any) -> dict[str, Any]:
         """Return the problems of a draft, and its files."""
-        draft = draft_from_json(self.folder, content)
-        texts = dict(zip(("sheet_text", "settings_text", "corrections_text"), draft.texts().values(), strict=True))
-        if not draft.corrections:
-            texts["corrections_text"] = ""
-        return draft_problems(self.folder, draft, thorough) | texts
+        return draft_problems(self.folder, draft_from_json(self.folder, content), thorough)
 
     def track(self, row: int, **content: Any) -> dict[str, Any]:
         """Track the recording of one row of a draft."""
@@ -352,7 +342,7 @@ ANSWERS: dict[str, Callable[..., bytes | str | Mapping[str, Any] | None]] = {
     "GET frame.css": lambda _: page_frame(),
     "GET state": lambda desk: page_state(desk.folder),
     "GET clip": lambda desk, recording: desk.clip(recording)[1],
-    "GET frame": Desk.frame,
+    "GET frame": lambda desk, recording, frame: desk.clip(recording)[0][int(frame)],
     # 220: width of the pictures in the list; chosen: as wide as its column
     "GET thumbnail": lambda desk, recording: desk.picture(recording, 220),
     "GET picture": lambda desk, picture: desk.picture(picture),
@@ -419,7 +409,7 @@ class _Answer(_Quiet):
         self.finish(content if isinstance(content, bytes | str) else json.dumps(content, ensure_ascii=False))
 
 
-def start_server(desk: Desk, port: int | None = None) -> PageServer[Application]:
+def start_server(desk: Desk, port: int | None = None) -> PageServer:
     """Return a server for a folder that does not answer requests yet."""
     page = {"path": TEMPLATES, "default_filename": "setup.html"}
 

@@ -41,8 +41,10 @@ async function check(thorough = false) {
     if (mine !== turn) return;
     state.problems = found.problems;
     if (thorough) state.compared = true;
-    for (const name of ["sheet", "settings", "corrections"]) $(`${name}-text`).textContent = found[`${name}_text`];
-    $("corrections-shown").hidden = !found.corrections_text;
+    for (const [name, text] of Object.entries(found.texts)) {
+      $(name).textContent = text;
+      $(name).parentElement.hidden = !text;
+    }
     showWhole([...markProblems(), ...found.notes.map((text) => ({severity: "note", text}))]);
     $("understood").hidden = !found.understood.length;
     $("understood").textContent = found.understood.join("\n");
