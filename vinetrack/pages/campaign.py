@@ -492,7 +492,7 @@ class BackgroundFit:
     def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
         self.campaign = campaign
         self.initial = choice_in_use(campaign)
-        self.opening_choice = self.initial if choice in (None, self.initial) else choice
+        self.opening_choice = choice or self.initial
         self.prediction: Prediction | None = None
         self.fitted: Evaluated | None = None
         self.step: Step | None = None

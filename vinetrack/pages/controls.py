@@ -38,7 +38,7 @@ from vinetrack.pages.campaign import (
     slider_range,
 )
 from vinetrack.pages.plots import beside, button, panel, progress_bar, set_text
-from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect
+from vinetrack.pipeline.effects_stage import propose_effect
 
 if TYPE_CHECKING:
     from vinetrack.pages.page import Page
@@ -205,16 +205,17 @@ PROPOSE = "Propose an effect"
 
 def propose_and_read(
     campaign: Campaign, on_progress: Callable[[str], None]
-) -> tuple[WrittenProposal, Campaign, ModelChoice]:
-    """Propose an effect, write it to the experiment's folder, and read the campaign with it; in the model chosen is the
-    first of the effects (the law, if there is one).
+) -> tuple[Sequence[str], BackgroundFit | None]:
+    """Propose an effect and write it to the experiment's folder; return what is said of it, and the campaign read anew
+    with the first of its files (the law, if there is one) in the model, if there are files.
     """
     written = propose_effect(campaign.experiment, campaign.folder, None, on_progress)
     proposed = {effect.name: effect for effect in map(load_effect, written.files)}
+    if not proposed:
+        return written.lines, None
     known = {name: effect for name, effect in campaign.effects.items() if name not in proposed}
     read = read_campaign(campaign.folder, campaign.experiment, known | proposed)
-    choice = choice_in_use(read)
-    return written, read, choice.with_effect(next(iter(proposed))) if proposed else choice
+    return written.lines, BackgroundFit(read, choice_in_use(read).with_effect(next(iter(proposed))))
 
 
 class ProposalPanel:
@@ -222,9 +223,9 @@ class ProposalPanel:
 
     def __init__(self, page: Page, reopen: Reopen) -> None:
         self._page, self._reopen = page, reopen
-        self._job: Job[str, tuple[WrittenProposal, Campaign, ModelChoice]] | None = None
+        self._job: Job[str, tuple[Sequence[str], BackgroundFit | None]] | None = None
         self._task, self._begun_s = "", 0.0
-        self._proposed: tuple[Campaign, ModelChoice] | None = None
+        self._proposed: BackgroundFit | None = None
         self.button = button(PROPOSE, "propose", self._propose_or_stop, width=150)
         self.open = button("Open the page with it", "open_proposed", self._open, width=170, visible=False)
         command = f"vinetrack propose {page.campaign.folder.as_posix()}"
@@ -265,15 +266,14 @@ class ProposalPanel:
         """Called from the job's thread; the status line shows it."""
         self._task = task
 
-    def _done(self, outcome: tuple[WrittenProposal, Campaign, ModelChoice] | None, reason: str) -> None:
+    def _done(self, outcome: tuple[Sequence[str], BackgroundFit | None] | None, reason: str) -> None:
         self._job, self.button.label = None, PROPOSE
-        if outcome is not None and outcome[0].files:
-            self._proposed = outcome[1:]
-            self.button.visible, self.open.visible = False, True
-        lines = [reason] if outcome is None else outcome[0].lines
+        lines, self._proposed = outcome or ([reason], None)
+        self.open.visible = self._proposed is not None
+        self.button.visible = not self.open.visible
         set_text(self.text, "".join(f"<p>{escape(line)}</p>" for line in lines))
 
     def _open(self) -> None:
         if self._proposed is not None:
-            self._reopen(BackgroundFit(*self._proposed).begin())
+            self._reopen(self._proposed.begin())
             self._reload.data = {"times": [1]}
