@@ -26,7 +26,7 @@ from vinetrack.figures.style import TOKENS, follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
-from vinetrack.narrative.verdict_text import quantity_text
+from vinetrack.narrative.verdict_text import Row, quantity_text, verdict_table
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
@@ -398,12 +398,13 @@ class Page:
                 held, now = self.held[1], self._described(self.shown)
                 compared = [(title, held.get(title, "–"), now.get(title, "–")) for title in held | now]
         set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, compared))
-        diagnosis, pairs, advice = self.diagnosis, list[str](), None
+        diagnosis, rows, pairs, advice = self.diagnosis, list[Row](), list[str](), None
         if diagnosis is not None:
+            rows = verdict_table(diagnosis)
             advice = next_experiment(diagnosis.next_experiment)
             pairs = tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else pairs
         command = f"vinetrack diagnose {self.campaign.folder.as_posix()}"
-        set_text(self.tied, panel("tied", diagnosis=diagnosis, diagnose=command, pairs=pairs))
+        set_text(self.tied, panel("tied", diagnosis=diagnosis, diagnose=command, rows=rows, pairs=pairs))
         set_text(self.next, panel("next", diagnosed=diagnosis is not None, diagnose=command, advice=advice))
         lines = self._commands()
         same = "<small>The same from the command line:</small>" + panel("commands", lines=lines)
