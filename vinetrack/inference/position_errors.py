@@ -87,14 +87,9 @@ class Precision:
 
     def first(self, count: int) -> Precision:
         """The same of the first `count` parameters, the others integrated out."""
+        arrays = {name: getattr(self, name)[:count] for name in ("degrees", "insensitive", "collinear")}
         shared = {name: variance[:count] for name, variance in self.shared.items()}
-        return Precision(
-            self.covariance[:count, :count],
-            self.degrees[:count],
-            self.insensitive[:count],
-            self.collinear[:count],
-            shared,
-        )
+        return Precision(self.covariance[:count, :count], shared=shared, **arrays)
 
 
 def precision(solution: Solution) -> Precision:

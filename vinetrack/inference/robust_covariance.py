@@ -18,17 +18,10 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_result import TrialFit
-from vinetrack.inference.marginal_likelihood import (
-    MixedProblem,
-    by_parameter,
-    inverse_of_block,
-    matrix_root,
-    sum_matrix_blocks,
-    trial_effects_eliminated,
-)
+from vinetrack.inference.marginal_likelihood import MixedProblem, by_parameter, inverse_of_block, matrix_root
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information, with_shapes
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor, position_change
+from vinetrack.inference.sensitivity import PRESSURE, Predictor, position_change
 
 # ------------------------------------------------------------------------------
 # Systematic errors of a campaign: payloads, set pressures, film mass, position errors of the camera, gauge noise.
@@ -385,22 +378,16 @@ def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics)
     one standard deviation of each systematic error, to first order, shape (n_free, count). Parameters at a bound are
     fixed there.
     """
-    problem, state = solution.problem, solution.state
-    cross_products = solution.cross_products
-    p, size = cross_products.shape[-1] - N_TRIAL_EFFECTS - 1, problem.prior_mean.size
-    if systematics.n_columns:
-        both = zip(solution.columns, systematics.columns, strict=True)
-        cross_products = predictor.products([np.column_stack(columns) for columns in both])
-    blocks = trial_effects_eliminated(cross_products, p, problem, state)
-    square = sum_matrix_blocks(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
-    inside = (state.theta > problem.lower) & (state.theta < problem.upper)
+    problem, theta = solution.problem, solution.state.theta
+    information, scores = trial_information(solution)
+    size, trials = len(theta), len(scores)
+    square = information.sum(axis=0) + np.diag(problem.prior_precision)
+    inside = (theta > problem.lower) & (theta < problem.upper)
     estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
     plain = inverse_of_block(square, estimated)
-    scores = by_parameter(blocks[:, :p, p], problem)
     # Scores of a parameter add up to the pull of its prior, in equal parts from each trial that depends on it.
-    depend = by_parameter(np.ones((len(blocks), p)), problem) > 0
+    depend = by_parameter(np.ones(problem.index.shape), problem) > 0
     scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
-    trials = len(blocks)
     # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
     prior = np.diag(problem.prior_precision)
     meat = scores.T @ scores * trials / max(trials - estimated.size, 1) + prior
@@ -409,10 +396,11 @@ def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics)
     if len(set(groups)) < trials:
         by_group = plain @ (group_scatter(scores, groups, estimated.size) + prior) @ plain
         np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
-    # Parameters and errors that a trial does not depend on are collected in a last row and column, and dropped.
-    cross = np.zeros((size + 1, systematics.count + 1))
-    np.add.at(cross, (problem.index[:, :, None], systematics.places[:, None, :]), blocks[:, :p, p + 1 :])
-    return plain, robust, plain @ cross[:size, : systematics.count]
+    if not systematics.n_columns:
+        return plain, robust, np.zeros((size, 0))
+    columns, widened = systematics.added_to(solution.columns, problem)
+    both = replace(solution, problem=widened, cross_products=predictor.products(columns))
+    return plain, robust, plain @ trial_information(both)[0].sum(axis=0)[:size, size:]
 
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
