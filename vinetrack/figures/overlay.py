@@ -1,4 +1,4 @@
-"""The recording with its edges: the distribution of edges within a pixel, the strip of a recording, frames of a clip.
+"""The recording with its edges: the strip of a recording, frames of a clip.
 
 In a clip the tracked edge crosses the tube and the predicted ones are drawn on both sides of it, that of the earlier
 model farther out, so that all remain visible where they agree. A bar above, clear of the controls of video players,
@@ -8,7 +8,6 @@ names the edges and states the error of each model, the time, and the factor of 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -17,12 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import FLAGS, UNUSABLE_FLAGS, Floats, hand_corrected, with_flag
-from vinetrack.core.units import number
 from vinetrack.figures import style as st
-from vinetrack.figures.registry import figure
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from PIL.ImageDraw import ImageDraw
@@ -30,57 +26,6 @@ if TYPE_CHECKING:
 
     from vinetrack.video.axis import Axis
     from vinetrack.video.track import Tracking
-
-
-# ------------------------------------------------------------------------------
-# Distribution of edges within a pixel, which shows pixel locking: a bias of the estimate towards whole or half pixels.
-#
-# Without a bias the edges of many frames are distributed uniformly within a pixel. A periodic error ε = −A sin 2πy at
-# the position y makes their density 1 + 2πA cos 2πy, so that the mean of exp 2πiy has the modulus πA.
-
-
-def subpixel_positions(tracks: Mapping[str, pd.DataFrame]) -> Floats:
-    """Return the positions of the edges of all unflagged frames within their pixel. Shape (n_edges,)."""
-    parts = [np.zeros(0)]
-    for track in tracks.values():
-        sound = (track["flag"].isna() | track["flag"].eq("")) & track["edge_px"].notna()
-        parts.append(np.mod(track.loc[sound, "edge_px"].to_numpy(dtype=float), 1.0))
-    return np.concatenate(parts)
-
-
-def periodic_error(subpixel_px: Floats) -> tuple[float, float]:
-    """Estimate the error that is periodic with one pixel. Returns amplitude, px, and its 5 % critical value under
-    uniformity (Rayleigh test: √(ln 20 / n) / π). Shapes: subpixel_px (n_edges,).
-    """
-    length = abs(np.mean(np.exp(2j * np.pi * subpixel_px)))
-    return float(length) / math.pi, math.sqrt(math.log(20) / len(subpixel_px)) / math.pi
-
-
-@figure("pixel_places", "damping", "Positions of edges within a pixel")
-def draw_pixel_places(subpixel_px: Floats) -> Figure | None:
-    """Histogram of the edges of all unflagged moving frames within a pixel along their axes. Band: two standard
-    deviations around a uniform distribution. Peaks would indicate pixel locking, a bias of edges towards whole or
-    half pixels.
-    """
-    count, bins = len(subpixel_px), 10
-    if count < 100:
-        return None
-    even = count / bins
-    half_width = 2 * math.sqrt(even * (1 - 1 / bins))
-    amplitude, chance = periodic_error(subpixel_px)
-    comparison = "more than chance" if amplitude > chance else "no more than chance"
-    fig = st.new_figure(6.6, 3.6)
-    ax = fig.subplots()
-    ax.hist(subpixel_px, bins=bins, range=(0, 1), color=st.VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
-    ax.axhspan(even - half_width, even + half_width, color=st.MUTED, alpha=0.25, lw=0)
-    ax.axhline(even, color=st.MUTED, ls=st.DASHED)
-    ax.set(xlabel="position within a pixel (px)", ylabel="edges", xlim=(0, 1), title=f"N = {count} frames")
-    st.note_below(
-        fig,
-        f"The error that is periodic with one pixel has an amplitude of {number(amplitude, 2)} px, {comparison}: "
-        f"{number(chance, 2)} px are exceeded by chance in 5 % of cases.",
-    )
-    return fig
 
 
 # ------------------------------------------------------------------------------

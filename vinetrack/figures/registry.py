@@ -78,7 +78,6 @@ def all_figures() -> dict[str, RegisteredFigure]:
         damping_figures,
         diagnosis_figures,
         motion_figures,
-        overlay,
     )
 
     return dict(_registered)
@@ -157,13 +156,6 @@ class FigureTables:
     @property
     def _names(self) -> list[str]:
         return self.trials.loc[self.trials["status"] != "left_out", "trial"].tolist()
-
-    @property
-    def subpixel_px(self) -> np.ndarray:
-        """Positions of all edges within a pixel."""
-        from vinetrack.figures.overlay import subpixel_positions
-
-        return subpixel_positions({name: read_result(self.results.track(name)) for name in self._names})
 
     @cached_property
     def comparison(self) -> pd.DataFrame:
