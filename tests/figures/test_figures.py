@@ -14,7 +14,7 @@ from vinetrack.core.records import Track
 from vinetrack.dynamics.simulate import effect_motion
 from vinetrack.effects import catalogue
 from vinetrack.figures import damping_figures, motion_figures, overlay
-from vinetrack.figures.damping_figures import draw_damping_law, draw_exponents, draw_scaling
+from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, draw_strip
 from vinetrack.figures.prediction_figures import draw_effect
 from vinetrack.figures.style import BLUE, RULE_COLOURS, look, render
@@ -117,13 +117,11 @@ def test_the_same_figure_gives_the_same_bytes():
 def test_nothing_of_the_law_its_exponents_and_sizes_is_cut_off():
     for n_vines in (4, 20):
         assert_nothing_is_cut_off(draw_damping_law(points(n_vines), damping(n_vines)))
-    assert_nothing_is_cut_off(draw_exponents(damping(4)))
     assert_nothing_is_cut_off(draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"}))
 
 
 def test_without_content_there_is_no_figure():
     assert draw_damping_law(points().iloc[:0], REFUSED) is None
-    assert draw_exponents(REFUSED) is None
     assert draw_scaling({"isometric": [], "thickness": []}) is None
     assert motion_figures.draw_overview(campaign(1, 1)[0], {}) is None
     assert motion_figures.draw_model_comparison(comparison(1)[0].iloc[:0], {}) is None

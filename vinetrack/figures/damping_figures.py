@@ -122,59 +122,6 @@ def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styl
     fig.legend(handles=handles, loc="outside right upper", fontsize=9, labelspacing=0.8, borderaxespad=0.8)
 
 
-@figure("exponents", "damping", "The exponent and the coefficients, by both methods", data="damping.json")
-def draw_exponents(damping: dict[str, Any]) -> Figure | None:
-    """The exponent n, one for all vines, and the coefficient B of each, by both methods, with 95 % intervals. Thick
-    bars come from a bootstrap of whole trials, or from Student's t if they are too few; thin ones add the stated
-    error of the yield pressure.
-    """
-    fits = {name: fit for name in METHOD_NAMES if (fit := damping.get(name) or {}).get("vines")}
-    if not fits:
-        return None
-    best = {vine: law for fit in fits.values() for vine, law in fit["vines"].items()}
-    # At half an inch per vine, 40 make a figure of 22 in, the longest that a page shows whole.
-    vines = sorted(best, key=lambda vine: (best[vine]["diameter_mm"], best[vine]["thickness_um"], vine))[:40]
-    fig = st.new_figure(9.4, 1.9 + max(0.5 * len(vines), 1.2))
-    left, right = fig.subplots(1, 2, width_ratios=(1, 1.35))
-    for method, fit in fits.items():
-        label = f"{METHOD_NAMES[method]}: n = {with_interval(fit['n'], fit.get('n_95'))}"
-        _draw_estimate(left, method, 0, fit["n"], fit.get("n_95"), fit.get("n_95_total"), label)
-        for i, vine in enumerate(vines):
-            if law := fit["vines"].get(vine):
-                per_cent = (_deviation(law.get(key), best[vine]["B"]) for key in ("B", "B_95", "B_95_total"))
-                _draw_estimate(right, method, i, *per_cent)
-    left.set(ylim=(0.75, -0.75), yticks=[], xlabel="exponent n")
-    left.spines["left"].set_visible(False)
-    left.locator_params(axis="x", nbins=5)
-    st.legend_above(left)
-    right.set(ylim=(len(vines) - 0.45, -0.55), xlabel="B, deviation from the value at the left (%)")
-    B = {vine: with_interval(best[vine]["B"], best[vine].get("B_95"), shown=False) for vine in vines}
-    labels = [f"{vine}\nB = {B[vine]}, N = {best[vine]['n_trials']}" for vine in vines]
-    st.names_on_axis(right, "y", labels, fontsize=9)
-    st.small_title(
-        right, "thick: 95 %, from the scatter of trials; thin: with\nthe yield pressure's stated error; B in N·(s/m)ⁿ"
-    )
-    return fig
-
-
-def _deviation(value: Any, best_B: float) -> Any:
-    """B, or its interval, as deviation from the best estimate in per cent; None remains None."""
-    if isinstance(value, list | tuple):
-        return [_deviation(bound, best_B) for bound in value]
-    return None if value is None else 100 * (value / best_B - 1)
-
-
-def _draw_estimate(
-    ax: Axes, method: str, row: float, value: float, resampled: Any, total: Any, label: str | None = None
-) -> None:
-    offset, colour, marker = {"log_log": (-0.17, st.VERMILLION, "s"), "both_axes": (0.17, st.BLUE, "o")}[method]
-    y = row + offset
-    for bounds, width in ((total, 1.3), (resampled, 4.0)):
-        if bounds is not None and None not in bounds:
-            ax.plot(bounds, (y, y), color=colour, lw=width, solid_capstyle="butt", alpha=0.75)
-    ax.plot([value], [y], marker, color=colour, ms=7, mec="white", mew=0.9, label=label)
-
-
 # ------------------------------------------------------------------------------
 # Damping, steady speed and efficiency against the size of the vine.
 
