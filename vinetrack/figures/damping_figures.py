@@ -1,5 +1,5 @@
-"""The damping law: points with both fits of F = B·x_ssⁿ, the parameters with all their intervals, what depends on the
-size of the vine; and the paper's figures and Table II redrawn, with the consequences of terms neglected in Eq. (2).
+"""The damping law: points with both fits of F = B·x_ssⁿ, and what depends on the size of the vine; and the paper's
+figures and Table II redrawn, with the consequences of terms neglected in Eq. (2).
 
 On logarithmic axes the law is a straight line of slope n, the same for all vines. Against sizes both straight lines and
 power laws are drawn, because neither is known to be right.
@@ -39,27 +39,23 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | 
     if drawable.empty:
         return None
     styles = st.vine_styles(points["vine"])
-    fig = st.new_figure(8.6, 5.6)
-    ax = fig.add_subplot()
-    ax.set(xscale="log", yscale="log", xlabel="steady tail speed x_ss (m/s)", ylabel="force F = B·x_ssⁿ (N)")
+    fig, ax = st.one_panel(8.6, 5.6, xscale="log", yscale="log")
+    ax.set(xlabel="steady tail speed x_ss (m/s)", ylabel="force F = B·x_ssⁿ (N)")
     for vine, group in drawable.groupby("vine", sort=False):
         for used, part in group.groupby("used"):
             _draw_points(ax, part, styles[str(vine)], bool(used))
-    for method in METHOD_NAMES:
-        fit = damping.get(method) or {}
+    fits = {method: damping.get(method) or {} for method in METHOD_NAMES}
+    for method, fit in fits.items():
         for vine, law in (fit.get("vines") or {}).items():
             used = drawable[(drawable["vine"] == vine) & drawable["used"]]
             if len(used):
-                colour, x_ss_m_s = styles[vine].colour, used["x_ss_m_s"].to_numpy()
-                _draw_law(ax, fit, vine, law["B"], x_ss_m_s, colour, _METHOD_LINES[method])
+                _draw_law(ax, fit, vine, law["B"], st.column(used, "x_ss_m_s"), styles[vine].colour, method)
     st.plain_log_ticks(ax)
-    fit = damping.get("both_axes") or {}
+    fit = fits["both_axes"]
     refused = fit.get("n") is None or fit.get("refused")
-    n = "" if refused else with_interval(fit["n"], fit.get("n_95"))
-    ax.set_title(
-        "Steady force and speed (no fit: see the report)" if refused else f"One exponent for all vines: n = {n}"
-    )
-    _law_legend(fig, drawable, damping, styles)
+    law = "" if refused else f"One exponent for all vines: n = {with_interval(fit['n'], fit.get('n_95'))}"
+    ax.set_title(law or "Steady force and speed (no fit: see the report)")
+    _law_legend(fig, drawable, fits, styles)
     return fig
 
 
@@ -67,20 +63,22 @@ def _draw_points(ax: Axes, points: pd.DataFrame, style: st.VineStyle, used: bool
     """Points with bars of one standard error; the lower one ends above zero, which logarithmic axes cannot show."""
     x, y = st.column(points, "x_ss_m_s"), st.column(points, "force_N")
     x_sigma, y_sigma = (np.nan_to_num(st.column(points, name)) for name in ("x_ss_sigma_m_s", "force_sigma_N"))
-    errors: dict[str, Any] = {"xerr": [np.minimum(x_sigma, 0.9 * x), x_sigma]}
-    errors["yerr"] = [np.minimum(y_sigma, 0.9 * y), y_sigma]
-    look: dict[str, Any] = {"fmt": style.marker, "color": style.colour, "mfc": style.colour if used else st.PAPER}
-    ax.errorbar(x, y, **errors, **look, ms=5, mew=1.1, elinewidth=0.8, alpha=0.85 if used else 0.6, zorder=3)
+    ax.errorbar(
+        x, y, xerr=[np.minimum(x_sigma, 0.9 * x), x_sigma], yerr=[np.minimum(y_sigma, 0.9 * y), y_sigma],
+        fmt=style.marker, color=style.colour, mfc=style.colour if used else st.PAPER, ms=5, mew=1.1, elinewidth=0.8,
+        alpha=0.85 if used else 0.6, zorder=3,
+    )  # fmt: skip
 
 
-def _draw_law(ax: Axes, fit: dict[str, Any], vine: str, B: float, x_ss_m_s: np.ndarray, colour: str, line: Any) -> None:
+def _draw_law(
+    ax: Axes, fit: dict[str, Any], vine: str, B: float, x_ss_m_s: np.ndarray, colour: str, method: str
+) -> None:
     low, high = math.log(x_ss_m_s.min()), math.log(x_ss_m_s.max())
     margin = max(0.06 * (high - low), 0.05)
     x = np.exp(np.linspace(low - margin, high + margin, 60))
     force_N = B * x ** fit["n"]
-    ax.plot(x, force_N, color=colour, ls=line, lw=1.5, zorder=2)
-    sigma = log_force_sigma(fit, vine, x)
-    if sigma is not None:
+    ax.plot(x, force_N, color=colour, ls=_METHOD_LINES[method], lw=1.5, zorder=2)
+    if (sigma := log_force_sigma(fit, vine, x)) is not None:
         factor = np.exp(1.96 * sigma)
         st.band(ax, x, force_N / factor, force_N * factor, colour, 0.16)
 
@@ -89,41 +87,44 @@ def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.
     """Return the standard error of ln F = ln B + n·ln x_ss along the law of one vine. With the covariance C of (ln B,
     n): var ln F = C_BB + 2·ln x_ss·C_Bn + (ln x_ss)²·C_nn. Shapes: x_ss_m_s (n_points,) → (n_points,).
     """
-    covariance = fit.get("covariance") or {}
-    names, matrix = covariance.get("parameters"), covariance.get("matrix")
-    if not names or matrix is None or f"ln B {vine}" not in names:
+    covariance = fit.get("covariance") or {"parameters": []}
+    if f"ln B {vine}" not in covariance["parameters"]:
         return None
-    i, j = names.index("n"), names.index(f"ln B {vine}")
-    cov = np.asarray(matrix, dtype=float)
-    slope = np.log(x_ss_m_s)
+    i, j = (covariance["parameters"].index(name) for name in ("n", f"ln B {vine}"))
+    cov, slope = np.asarray(covariance["matrix"], dtype=float), np.log(x_ss_m_s)
     variance = cov[j, j] + 2 * slope * cov[i, j] + slope**2 * cov[i, i]
     return np.sqrt(np.maximum(variance, 0.0)) if np.isfinite(variance).all() else None
 
 
-def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styles: dict[str, st.VineStyle]) -> None:
+def _law_legend(fig: Figure, points: pd.DataFrame, fits: dict[str, Any], styles: dict[str, st.VineStyle]) -> None:
     """Vines with B and N, the first 14 of them, which with the methods fill the height of the figure."""
-    laws = (damping.get("both_axes") or {}).get("vines") or {}
+    laws = fits["both_axes"].get("vines") or {}
+    counts = {str(vine): int(used.sum()) for vine, used in points.groupby("vine", sort=False)["used"]}
+    breaks = "\n" if len(counts) <= 6 else ", "
     handles = []
-    vines = list(dict.fromkeys(points["vine"]))
-    breaks = "\n" if len(vines) <= 6 else ", "
-    for vine in vines[:14]:
-        n_used = int(points.loc[points["vine"] == vine, "used"].sum())
-        B = f"{breaks}B = {number(laws[vine]['B'])}" if vine in laws else ""
-        label = f"{vine}{B}{', ' if B else breaks}N = {n_used}"
-        handles.append(st.line_key(label, color=styles[vine].colour, marker=styles[vine].marker, ls="none", ms=6))
-    if len(vines) > 14:
-        handles.append(st.line_key(f"and {len(vines) - 14} more vines", ls="none"))
-    if n_left := int((~points["used"].astype(bool)).sum()):
+    for vine, n_used in list(counts.items())[:14]:
+        B = f"{breaks}B = {number(laws[vine]['B'])}, " if vine in laws else breaks
+        style = styles[vine]
+        handles.append(st.line_key(f"{vine}{B}N = {n_used}", color=style.colour, marker=style.marker, ls="none", ms=6))
+    if len(counts) > 14:
+        handles.append(st.line_key(f"and {len(counts) - 14} more vines", ls="none"))
+    if n_left := len(points) - sum(counts.values()):
         words = f"not in the fit, N = {n_left}"
         handles.append(st.line_key(words, color=st.MUTED, marker="o", mfc=st.PAPER, ls="none", ms=6))
     for method, name in METHOD_NAMES.items():
-        if (damping.get(method) or {}).get("vines"):
+        if fits[method].get("vines"):
             handles.append(st.line_key(f"{name}\nand its 95 % band", color=st.INK, ls=_METHOD_LINES[method]))
     fig.legend(handles=handles, loc="outside right upper", fontsize=9, labelspacing=0.8, borderaxespad=0.8)
 
 
 # ------------------------------------------------------------------------------
 # Damping, steady speed and efficiency against the size of the vine.
+
+# Label of the axis, name and unit of each size
+_SIZES = {
+    "thickness_um": ("wall thickness (µm)", "wall", "µm"),
+    "diameter_mm": ("diameter (mm)", "diameter", "mm"),
+}
 
 
 @figure("scaling", "damping", "Damping against size", data="scaling.json")
@@ -138,8 +139,7 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
     fig = st.new_figure(6.6 if len(kinds) == 1 else 11.0, 5.2)
     for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
         families = scaling[kind][:4]  # four families have twelve lines of legend above the axes
-        along = {"diameter_mm": "diameter (mm)", "thickness_um": "wall thickness (µm)"}[families[0]["along"]]
-        ax.set(xscale="log", yscale="log", xlabel=along, ylabel="B (N·(s/m)ⁿ)")
+        ax.set(xscale="log", yscale="log", xlabel=_SIZES[families[0]["along"]][0], ylabel="B (N·(s/m)ⁿ)")
         for i, family in enumerate(families):
             _draw_B_family(ax, family, i)
         pairs = [pair for family in families for pair in zip(family["vines"], family["sizes"], strict=True)]
@@ -160,13 +160,12 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
 
 
 def _draw_B_family(ax: Axes, family: dict[str, Any], index: int) -> None:
-    colour = st.VINE_COLOURS[index]
-    sizes, B = np.array(family["sizes"], dtype=float), np.array(family["B"], dtype=float)
-    low, high = np.array(family["B_95"], dtype=float).T
+    sizes, B, B_95 = (np.array(family[name], dtype=float) for name in ("sizes", "B", "B_95"))
     refused = f"\nno line: {family['refused']}" if family.get("refused") else ""
+    bars = np.clip([B - B_95[:, 0], B_95[:, 1] - B], 0, None)
     label = f"B with 95 % interval, N = {B.size} vines{refused}"
-    st.error_points(ax, sizes, B, np.clip([B - low, high - B], 0, None), index, label, elinewidth=1.3, zorder=3)
-    span = np.geomspace(sizes.min() / 1.15, sizes.max() * 1.15, 100)
+    st.error_points(ax, sizes, B, bars, index, label, elinewidth=1.3, zorder=3)
+    colour, span = st.VINE_COLOURS[index], np.geomspace(sizes.min() / 1.15, sizes.max() * 1.15, 100)
     if power := family["power"]:
         label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}), R² {number(power['R2'])}"
         ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.5, label=label)
@@ -200,38 +199,27 @@ def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure | None
         ax.set(xlabel="diameter (mm)", ylabel=label)
         st.up_from_zero(ax, x=True)
         st.legend_above(ax, title=title + more, alignment="left", fontsize=9)
-    single = any(count == 1 for family in families for count in family["n_steady"])
-    of_single = "The error bar of a single trial does not include replicate scatter." if single else ""
-    st.note_below(fig, " ".join(filter(None, [note, of_single])))
+    if any(count == 1 for family in families for count in family["n_steady"]):
+        note = f"{note} The error bar of a single trial does not include replicate scatter.".strip()
+    st.note_below(fig, note)
     return fig
 
 
 def _draw_speed_family(ax: Axes, family: dict[str, Any], key: str, lines: dict[str, Any], index: int) -> None:
-    colour = st.VINE_COLOURS[index]
-    sizes, values, errors = (
-        np.array(family[name], dtype=float) for name in ("sizes", key.format(""), key.format("_sigma"))
-    )
-    line, power = lines["line"], lines["power"]
-    if lines["refused"]:
-        trend = f"no trend: {lines['refused']}"
-    else:
+    names = "sizes", key.format(""), key.format("_sigma")
+    sizes, values, errors = (np.array(family[name], dtype=float) for name in names)
+    line, power, trend = lines["line"], lines["power"], f"no trend: {lines['refused']}"
+    if not lines["refused"]:
         slope = f"{number(power['slope'], 2)} ({interval(power['slope_95'])}), p = {number(power['p'], 2)}"
         trend = f"power (dashed) {slope}\nline (full): R² {number(line['R2'])}, p = {number(line['p'], 2)}"
-    n = f"{st.counted([sizes.size], 'vine')} of {st.counted([int(count) for count in family['n_steady']], 'trial')}"
+    n = f"{st.counted([sizes.size], 'vine')} of {st.counted(family['n_steady'], 'trial')}"
     label = f"{family['pressure_kPa']:.4g} kPa, N = {n}\n{trend}"
     st.error_points(ax, sizes, values, errors, index, label, elinewidth=1.3)
-    span = np.linspace(0.8 * sizes.min(), 1.1 * sizes.max(), 100)
+    colour, span = st.VINE_COLOURS[index], np.linspace(0.8 * sizes.min(), 1.1 * sizes.max(), 100)
     if line:
         ax.plot(span, line["intercept"] + line["slope"] * span, color=colour, lw=1.5)
     if power:
         ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.3, ls=st.DASHED)
-
-
-# Sizes that the efficiency is drawn against: label of the axis, name and unit
-_SIZES = {
-    "thickness_um": ("wall thickness (µm)", "wall", "µm"),
-    "diameter_mm": ("diameter (mm)", "diameter", "mm"),
-}
 
 
 @figure("efficiency", "damping", "Energy efficiency", data="conditions.csv")
@@ -261,15 +249,11 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure | None:
         row[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0, fontsize=9)
     for ax, key in zip(axes[0], shown, strict=True):
         ax.set_title(definitions[key], fontsize=10.5)
-    counts = [int(count) for count in family["n_efficiency"]]
+    counts = family["n_efficiency"]
     load = f" with {family['payload_g']:.4g} g" if family["payload_g"] else " without payload"
-    error = ", ± standard error" if max(counts) > 1 else ""
     more = f"; {n_left} more {'family' if n_left == 1 else 'families'} in scaling.json" if n_left else ""
-    title = (
-        f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
-        f"N = {st.counted(counts, 'trial')} per point{error}{more}"
-    )
-    fig.suptitle(title, fontsize=11, x=0.01, ha="left")
+    title = f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
+    fig.suptitle(f"{title}{st.per_point(counts)}{more}", fontsize=11, x=0.01, ha="left")
     st.note_below(fig, note)
     return fig
 
@@ -283,8 +267,7 @@ def _draw_efficiency(ax: Axes, family: dict[str, Any], key: str, x: str) -> None
         label = f"{size:.4g} {_SIZES[other][2]}"
         st.error_points(ax, sizes[chosen], 100 * values[chosen], 100 * errors[chosen], i, label, ls="-", ms=5.5, lw=1.2)
     ax.set(xlabel=_SIZES[x][0], xlim=(0, 1.12 * sizes.max()))
-    trend = family["trend"][key]
-    words = ""
+    trend, words = family["trend"][key], ""
     if trend.get("refused"):
         words = f"no trend: {textwrap.fill(str(trend['refused']), 30)}"
     elif x in trend:
@@ -342,7 +325,7 @@ def _draw_force_panel(ax: Axes, points: pd.DataFrame, x: str, y: str, law: Mappi
         part = points[points["scale"] == scale]
         if not len(part):
             continue
-        colour = st.VINE_COLOURS[i % len(st.VINE_COLOURS)]
+        colour = st.VINE_COLOURS[i]
         fitted = (law.get("vines") or {}).get(str(part["vine"].iloc[0])) or {}
         label = f"R = {scale}: B {number(fitted.get('B'))}, printed {B:g}; N = {len(part)}"
         ax.plot(part[x], part[y], st.VINE_MARKERS[i], mfc=st.PAPER, mec=colour, ms=5, mew=1.1, ls="none", label=label)
@@ -368,21 +351,25 @@ def draw_paper_position(
     fig = st.new_figure(12.0, 5.2)
     axes = fig.subplots(1, len(pressures), squeeze=False, sharey=True)[0]
     for ax, pressure_kPa in zip(axes, pressures, strict=True):
-        at_pressure = paper_motions[paper_motions["pressure_kPa"] == pressure_kPa]
-        curves = {str(name): part for name, part in at_pressure.groupby("departure", sort=False)}
+        motions, mean, errors = (
+            table[table["pressure_kPa"] == pressure_kPa] for table in (paper_motions, paper_means, paper_positions)
+        )
+        curves = _by_departure(motions)
         _draw_departures(ax, curves)
-        mean = paper_means[paper_means["pressure_kPa"] == pressure_kPa]
         if len(mean):
             _draw_mean(ax, mean)
         # Slower motions are cut off.
         ax.set(xlabel="time since release (s)", xlim=(0, 1.9 * float(curves["eq2"]["time_s"].iloc[-1])))
-        rms_m = paper_positions.loc[paper_positions["pressure_kPa"] == pressure_kPa, "rms_mean_m"]
-        ours = f"ours {100 * float(rms_m.iloc[0]):.2f} cm" if len(rms_m) else "not among the trials"
+        ours = f"ours {100 * errors['rms_mean_m'].iloc[0]:.2f} cm" if len(errors) else "not among the trials"
         printed_cm = published.POSITION_RMS_CM[round(pressure_kPa)]
         ax.set_title(f"{pressure_kPa:g} kPa\nrms: printed {printed_cm:.2f} cm, {ours}", fontsize=10.5)
     axes[0].set_ylabel("growth of the leading edge (cm)")
     _legend_below(fig, axes[-1])
     return fig
+
+
+def _by_departure(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    return {str(name): part for name, part in table.groupby("departure", sort=False)}
 
 
 def _legend_below(fig: Figure, ax: Axes) -> None:
@@ -404,11 +391,12 @@ def _draw_departures(ax: Axes, curves: Mapping[str, pd.DataFrame]) -> None:
     for slack, colour, label in (("", st.ORANGE, refilled), ("_slack", st.PURPLE, "both")):
         slow, fast = (time_at(curves[f"depletion_{pace}{slack}"]) for pace in ("slow", "fast"))
         ax.fill_betweenx(position_cm, slow, fast, color=colour, alpha=0.3, lw=0, label=label)
-    for name, style, label in (
-        ("slack", {"color": st.GREEN, "lw": 1.6, "ls": st.DASHED}, "tail that\ncannot push"),
-        ("eq2", {"color": st.INK, "lw": 1.8}, "Eq. (2) with the\nprinted numbers"),
+    for name, colour, width, line, label in (
+        ("slack", st.GREEN, 1.6, st.DASHED, "tail that\ncannot push"),
+        ("eq2", st.INK, 1.8, "-", "Eq. (2) with the\nprinted numbers"),
     ):
-        ax.plot(curves[name]["time_s"], 100 * curves[name]["lead_position_m"], label=label, **style)
+        at = curves[name]["time_s"], 100 * curves[name]["lead_position_m"]
+        ax.plot(*at, color=colour, lw=width, ls=line, label=label)
 
 
 def _draw_mean(ax: Axes, mean: pd.DataFrame) -> None:
@@ -426,13 +414,12 @@ def draw_paper_reservoir(paper_pressures: pd.DataFrame) -> Figure:
     applies to absolute pressure, so that a change of volume by 3.4 % reduces the gauge pressure by 15 to 71 %, not
     by 3.4 %. The refill rate of the regulator is not published.
     """
-    fig = st.new_figure(8.2, 4.8)
-    ax = fig.add_subplot()
-    for i, (pressure_kPa, at_pressure) in enumerate(paper_pressures.groupby("pressure_kPa")):
-        by_name = {str(name): part for name, part in at_pressure.groupby("departure")}
+    fig, ax = st.one_panel(8.2, 4.8)
+    for i, pressure_kPa in enumerate(sorted(paper_pressures["pressure_kPa"].unique())):
+        by_name = _by_departure(paper_pressures[paper_pressures["pressure_kPa"] == pressure_kPa])
         low, high = (st.column(by_name[f"depletion_{pace}"], "gauge_left", 100) for pace in ("fast", "slow"))
         growth_mm = st.column(by_name["depletion_slow"], "lead_position_m", 1e3)
-        label = f"{float(str(pressure_kPa)):g} kPa: −{100 - high[-1]:.0f} to −{100 - low[-1]:.0f} %"
+        label = f"{pressure_kPa:g} kPa: −{100 - high[-1]:.0f} to −{100 - low[-1]:.0f} %"
         st.band(ax, growth_mm, low, high, st.VINE_COLOURS[i], 0.35, label=label)
         ax.plot(growth_mm, high, color=st.VINE_COLOURS[i], lw=1.4)
     allowed = 100 * (1 - published.CHAMBER_ALLOWED)
@@ -456,30 +443,32 @@ def draw_paper_rms(paper: pd.DataFrame, paper_departures: pd.DataFrame) -> Figur
     pressure is not drawn there.
     """
     fig = st.new_figure(11.0, 4.9)
-    left, right = fig.subplots(1, 2)
+    axes = fig.subplots(1, 2)
     ours = paper.drop_duplicates("row").set_index("row")["ours"]
-    of_figure = dict(iter(paper_departures.groupby("figure")))
-    left.set(ylabel="rms of position (cm)", title="Fig. 4 and Table II")
-    position_cm = of_figure["Fig. 4"].assign(size=lambda table: 100 * table["rms_position_m"])
-    _draw_rms_panel(left, published.POSITION_RMS_CM, ours, "position_rms_{:g}kPa", position_cm)
-    right.set(ylabel="rms of speed at 12 cm (m/s)", title="Fig. 5 and Table II")
-    speed_m_s = of_figure["Fig. 5"].assign(size=lambda table: table["rms_final_lead_velocity_m_s"])
-    _draw_rms_panel(right, published.FINAL_SPEED_RMS_M_S, ours, "final_speed_rms_{:g}kPa", speed_m_s)
-    _legend_below(fig, left)
+    panels = (
+        ("Fig. 4", "rms of position (cm)", published.POSITION_RMS_CM, "position_rms", "rms_position_m", 100),
+        ("Fig. 5", "rms of speed at 12 cm (m/s)", published.FINAL_SPEED_RMS_M_S, "final_speed_rms",
+         "rms_final_lead_velocity_m_s", 1),
+    )  # fmt: skip
+    for ax, (name, label, printed, row, column, factor) in zip(axes, panels, strict=True):
+        ax.set(ylabel=label, title=f"{name} and Table II")
+        found = [float(ours.get(f"{row}_{kPa:g}kPa", np.nan)) for kPa in printed]
+        departures = paper_departures[paper_departures["figure"] == name]
+        _draw_rms_panel(ax, printed, found, departures.assign(size=factor * departures[column]))
+    _legend_below(fig, axes[0])
     return fig
 
 
-def _draw_rms_panel(ax: Axes, printed: dict[int, float], ours: pd.Series, row: str, departures: pd.DataFrame) -> None:
+def _draw_rms_panel(ax: Axes, printed: dict[int, float], ours: list[float], departures: pd.DataFrame) -> None:
     least = 0.01  # 0.1 mm and 1 cm/s, a hundredth of the printed errors
     places = np.arange(len(printed), dtype=float)
     ax.set_yscale("log")
     ax.plot(places - 0.3, list(printed.values()), "D", color=st.INK, ms=8, label="published")
-    found = [float(ours.get(row.format(kPa), np.nan)) for kPa in printed]
-    ax.plot(places - 0.15, found, "o", mfc="none", mec=st.BLUE, mew=1.8, ms=8, label="ours")
+    ax.plot(places - 0.15, ours, "o", mfc="none", mec=st.BLUE, mew=1.8, ms=8, label="ours")
+    by_name = _by_departure(departures)
 
     def sizes(name: str) -> np.ndarray:
-        of_name = departures[departures["departure"] == name]
-        near = [of_name.loc[np.isclose(of_name["pressure_kPa"], kPa), "size"] for kPa in printed]
+        near = [by_name[name].loc[np.isclose(by_name[name]["pressure_kPa"], kPa), "size"] for kPa in printed]
         return np.array([float(size.iloc[0]) if len(size) else np.nan for size in near])
 
     for k, ((label, names), colour) in enumerate(zip(CAUSES.items(), (st.ORANGE, st.GREEN, st.PURPLE), strict=True)):
@@ -505,22 +494,19 @@ def draw_paper_speeds(paper_speeds: pd.DataFrame, paper_speed_curves: pd.DataFra
     reached = reached[reached.groupby("pressure_kPa")["payload_g"].transform("nunique") > 1]
     if not len(reached):
         return None
-    fig = st.new_figure(6.6, 4.8)
-    ax = fig.add_subplot()
-    for i, (pressure_kPa, group) in enumerate(reached.groupby("pressure_kPa")):
+    fig, ax = st.one_panel(6.6, 4.8, xlabel="payload (g)", ylabel="speed of the leading edge (m/s)")
+    for i, pressure_kPa in enumerate(sorted(reached["pressure_kPa"].unique())):
+        group = reached[reached["pressure_kPa"] == pressure_kPa]
         speed, sigma = (group[f"final_lead_velocity{part}_m_s"] for part in ("", "_sigma"))
-        st.error_points(ax, group["payload_g"], speed, sigma, i, f"{float(str(pressure_kPa)):.4g} kPa")
-        near = np.isclose(paper_speed_curves["pressure_kPa"], float(str(pressure_kPa)))
+        st.error_points(ax, group["payload_g"], speed, sigma, i, f"{pressure_kPa:.4g} kPa")
+        near = np.isclose(paper_speed_curves["pressure_kPa"], pressure_kPa)
         curve = paper_speed_curves[near].sort_values("payload_g")
         label = "Eq. (2), B proportional to the wall" if i == 0 else None
-        style: dict[str, Any] = {"color": st.VINE_COLOURS[i % len(st.VINE_COLOURS)], "lw": 1.5, "label": label}
-        ax.plot(curve["payload_g"], curve["final_lead_velocity_m_s"], **style)
-    counts = reached["n_final"].astype(int).tolist()
-    ax.set(xlabel="payload (g)", ylabel="speed of the leading edge (m/s)")
+        colour = st.VINE_COLOURS[i % len(st.VINE_COLOURS)]
+        ax.plot(curve["payload_g"], curve["final_lead_velocity_m_s"], color=colour, lw=1.5, label=label)
     st.up_from_zero(ax)
-    error = ", ± standard error" if max(counts) > 1 else ""
-    title = f"{reached['vine'].iloc[0]}, after {reached['final_at_mm'].iloc[0]:.4g} mm\n"
-    title += f"N = {st.counted(counts, 'trial')} per point{error}"
+    counts = reached["n_final"].astype(int).tolist()
+    title = f"{reached['vine'].iloc[0]}, after {reached['final_at_mm'].iloc[0]:.4g} mm\n{st.per_point(counts)}"
     st.legend_above(ax, 2, title=title, alignment="left", fontsize=9)
     note = (
         "B of this vine and the payloads other than 35.6 g are not printed; the paper shows its points only in a plot"

@@ -53,25 +53,22 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     """
     if not len(ladder):
         return None
-    errors_mm = {key: st.column(ladder, key, 1e3) for key in _ERRORS}
-    floor_mm = st.column(ladder, "floor_m", 1e3)
-    fig = st.new_figure(max(5.2, 2.4 + 1.55 * len(ladder)), 3.9)  # names of effects are wrapped at 18 letters
-    ax = fig.add_subplot()
+    fig, ax = st.one_panel(max(5.2, 2.4 + 1.55 * len(ladder)), 3.9)  # names of effects are wrapped at 18 letters
     ax.set(yscale="log", ylabel="error of position, rms (mm)", xlim=(-0.5, len(ladder) - 0.5))
     for key, (name, colour, marker, line) in _ERRORS.items():
-        if np.isfinite(errors_mm[key]).any():
-            values = " → ".join(number(value) if np.isfinite(value) else "–" for value in errors_mm[key])
-            ax.plot(errors_mm[key], marker=marker, color=colour, ls=line, ms=7, zorder=3, label=f"{name}: {values} mm")
-    known_floor_mm = floor_mm[np.isfinite(floor_mm) & (floor_mm > 0)]
-    if known_floor_mm.size:
-        floor = float(known_floor_mm[-1])
+        errors_mm = st.column(ladder, key, 1e3)
+        if np.isfinite(errors_mm).any():
+            label = f"{name}: {' → '.join(map(number, errors_mm))} mm"
+            ax.plot(errors_mm, marker=marker, color=colour, ls=line, ms=7, zorder=3, label=label)
+    floors_mm = [floor for floor in st.column(ladder, "floor_m", 1e3) if floor > 0]
+    for floor in floors_mm[-1:]:
         ax.axhline(floor, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
         frame = (("axes fraction", "data"), "offset points")
         words = f"replicate scatter: {number(floor)} mm"
         ax.annotate(words, (0.015, floor), (0, -4), *frame, color=st.MUTED, va="top", fontsize=9)
     ax.margins(y=0.15)
     st.plain_log_ticks(ax, "y")
-    if known_floor_mm.size:  # an error in the shaded range says nothing about the model
+    for floor in floors_mm[-1:]:  # an error in the shaded range says nothing about the model
         low, high = ax.get_ylim()
         ax.axhspan(low, floor, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
         ax.set_ylim(low, high)
@@ -99,25 +96,23 @@ def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Fig
         models["model_after_m"] = (AFTER, "-", f"with {added}" if added else "after")
     fig = st.new_figure(5.2, 4.3)  # two such figures fit side by side on a page of 11 in
     growth, misfit = fig.subplots(2, 1, sharex=True, height_ratios=(2.1, 1))
-    parts = []
-    for _, part in before_after.groupby("trial", sort=False):
-        begins_s = -0.06 * float(part["time_s"].iloc[-1])
-        parts.append(st.thinned(part[part["time_s"] >= begins_s], 160))
-        time_ms, measured_mm = st.column(parts[-1], "time_s", 1e3), st.column(parts[-1], "lead_position_m", 1e3)
+    trials = before_after.groupby("trial", sort=False)
+    for _, part in trials:
+        shown = st.thinned(part[part["time_s"] >= -0.06 * part["time_s"].iloc[-1]], 160)
+        time_ms, measured_mm = st.column(shown, "time_s", 1e3), st.column(shown, "lead_position_m", 1e3)
         growth.plot(time_ms, measured_mm, ".", color=st.MUTED, ms=4.5, mew=0)
         for model, (colour, line, _) in models.items():
-            misfit.plot(time_ms, measured_mm - st.column(parts[-1], model, 1e3), color=colour, lw=1.3, ls=line)
-    for part in parts:
-        for model, (colour, line, _) in models.items():
-            growth.plot(st.column(part, "time_s", 1e3), st.column(part, model, 1e3), color=colour, lw=1.6, ls=line)
+            predicted_mm = st.column(shown, model, 1e3)
+            growth.plot(time_ms, predicted_mm, color=colour, lw=1.6, ls=line, zorder=2.1)  # over the dots of all trials
+            misfit.plot(time_ms, measured_mm - predicted_mm, color=colour, lw=1.3, ls=line)
     misfit.axhline(0, color=st.INK, lw=0.8)
-    growth.set_ylabel("growth (mm)")
-    misfit.set(xlabel="time since release (ms)", ylabel="misfit (mm)")
+    growth.set(ylabel="growth (mm)")
     growth.set_title(worst, fontsize=10)
-    handles = [st.line_key(f"measured, N = {len(parts)}", color=st.MUTED, marker=".", ls="none", ms=8)]
+    misfit.set(xlabel="time since release (ms)", ylabel="misfit (mm)")
+    handles = [st.line_key(f"measured, N = {len(trials)}", color=st.MUTED, marker=".", ls="none", ms=8)]
     for model, (colour, line, words) in models.items():
-        words += f": {number(1e3 * rms_m(before_after, model), 2)} mm rms"
-        handles.append(st.line_key(words, color=colour, ls=line))
+        error_mm = number(1e3 * rms_m(before_after, model), 2)
+        handles.append(st.line_key(f"{words}: {error_mm} mm rms", color=colour, ls=line))
     growth.legend(handles=handles, loc="lower right", fontsize=9, borderaxespad=0.2, labelspacing=0.3)
     return fig
 
@@ -148,8 +143,6 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
     hypotheses in the answer set, which the data cannot exclude. Hollow: predicted from the sensitivities, not
     fitted. One panel per round; the next round tests the model with all effects added so far.
     """
-    from matplotlib.patches import Patch
-
     drawn = [(title, table) for title, ranked in rounds if len(table := _drawable(ranked))]
     if not drawn:
         return None
@@ -157,24 +150,33 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
     fig = st.new_figure(8.6, sum(heights_in) + 0.35)
     axes = fig.subplots(len(drawn), 1, squeeze=False, height_ratios=heights_in)[:, 0]
     for ax, (title, table) in zip(axes, drawn, strict=True):
-        _draw_round(ax, title, table)
+        longest = max(float(table["height"].max()), 1.0)
+        for i, row in enumerate(st.rows(table)):
+            colour, alpha = _ROLES[row.role][1], None if row.in_answer_set else 0.75
+            fill = colour if row.status == "refitted" else "none"
+            ax.barh(i, row.height, height=0.62, color=fill, edgecolor=colour, lw=1.2, alpha=alpha)
+            if words := f"{row.size}{'' if row.plausible else ' (not plausible)'}".strip():
+                style = {"va": "center", "fontsize": 9, "color": st.INK if row.in_answer_set else st.MUTED}
+                words = textwrap.shorten(words, 62, placeholder="…")
+                ax.annotate(words, (row.height, i), (5, 0), textcoords="offset points", **style)
+        st.names_on_axis(ax, "y", [str(name).replace("_", " ") for name in table["effect"]])
+        for label, chosen in zip(ax.get_yticklabels(), table["in_answer_set"], strict=True):
+            label.set_fontweight("bold" if chosen else "normal")
+        ax.set(ylim=(len(table) - 0.4, -0.6), xlim=(0, 1.75 * longest))
+        ax.set_title(title, fontsize=10)
+        ax.set_xticks([tick for tick in ax.get_xticks() if tick <= 1.08 * longest])
     axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
-    present = {row.role for _, table in drawn for row in st.rows(table)}
-    handles = [
-        Patch(facecolor=colour, alpha=alpha, label=words)
-        for role, (words, colour, alpha) in _ROLES.items()
-        if role in present
-    ]
+    present = {role for _, table in drawn for role in table["role"]}
+    handles = [st.patch_key(words, colour, alpha) for role, (words, colour, alpha) in _ROLES.items() if role in present]
     if any((table["status"] == "screened").any() for _, table in drawn):
-        handles.append(Patch(facecolor="none", edgecolor=st.MUTED, label="predicted, not fitted"))
+        handles.append(st.patch_key("predicted, not fitted", "none", edgecolor=st.MUTED))
     st.page_legend(fig, handles, len(handles), handlelength=1.3)
     return fig
 
 
 def _drawable(table: pd.DataFrame) -> pd.DataFrame:
     """Rows with a finite gain or score and their roles: the answer set first, then by bar length; twelve at most."""
-    gain = np.sqrt(np.maximum(st.column(table, "delta_chi2"), 0.0))
-    score = np.abs(st.column(table, "sigma"))
+    gain, score = np.sqrt(np.maximum(st.column(table, "delta_chi2"), 0.0)), np.abs(st.column(table, "sigma"))
     # A predicted gain may have the wrong sign of the parameter or too small a noise; the score accounts for both.
     fitted = (table["status"] == "refitted").to_numpy() & np.isfinite(gain)
     height = np.where(fitted | ~np.isfinite(score), gain, score)
@@ -182,26 +184,6 @@ def _drawable(table: pd.DataFrame) -> pd.DataFrame:
     role = np.where(answer, "answer", np.where(table["kind"] == "measurement", "measurement", "physical"))
     known = table.assign(height=height, in_answer_set=answer, role=role)[np.isfinite(height)]
     return known.sort_values(["in_answer_set", "height"], ascending=False, kind="stable").head(12)
-
-
-def _draw_round(ax: Axes, title: str, table: pd.DataFrame) -> None:
-    longest = max(float(table["height"].max()), 1.0)
-    for i, row in enumerate(st.rows(table)):
-        colour = _ROLES[row.role][1]
-        fill = colour if row.status == "refitted" else "none"
-        alpha = None if row.in_answer_set else 0.75
-        ax.barh(i, row.height, height=0.62, color=fill, edgecolor=colour, lw=1.2, alpha=alpha)
-        words = " ".join(part for part in (row.size, "" if row.plausible else "(not plausible)") if part)
-        if words:
-            style: dict[str, Any] = {"va": "center", "fontsize": 9, "color": st.INK if row.in_answer_set else st.MUTED}
-            words = textwrap.shorten(words, 62, placeholder="…")
-            ax.annotate(words, (row.height, i), (5, 0), textcoords="offset points", **style)
-    st.names_on_axis(ax, "y", [str(name).replace("_", " ") for name in table["effect"]])
-    for label, chosen in zip(ax.get_yticklabels(), table["in_answer_set"], strict=True):
-        label.set_fontweight("bold" if chosen else "normal")
-    ax.set(ylim=(len(table) - 0.4, -0.6), xlim=(0, 1.75 * longest))
-    ax.set_title(title, fontsize=10)
-    ax.set_xticks([tick for tick in ax.get_xticks() if tick <= 1.08 * longest])
 
 
 @figure("cosines", "tied", "Candidates that these trials cannot tell apart", data="cosines")
@@ -215,15 +197,12 @@ def draw_cosines(cosines: pd.DataFrame) -> Figure | None:
         return None
     # 22 cells of 0.36 in, which hold two digits of 7.5 pt, make a square of 8 in.
     effects = list(dict.fromkeys([*cosines["other"], *cosines["effect"]]))[:22]
-    place, n = {name: i for i, name in enumerate(effects)}, len(effects)
-    fig = st.new_figure(0.36 * n + 2.3, 0.36 * n + 2.0)
-    ax = fig.add_subplot()
-    for effect, other, value in cosines.itertuples(index=False):
-        if effect not in place or other not in place or not math.isfinite(value):
-            continue
-        i, j = place[effect], place[other]
-        colour, tied = st.BLUE if value > 0 else st.VERMILLION, abs(value) >= TIED_COSINE
-        alpha = min(abs(value), 1.0) ** 2 * 0.8
+    n = len(effects)
+    fig, ax = st.one_panel(0.36 * n + 2.3, 0.36 * n + 2.0)
+    known = cosines[cosines["effect"].isin(effects) & cosines["other"].isin(effects) & np.isfinite(cosines["cosine"])]
+    for effect, other, value in known.itertuples(index=False):
+        i, j, tied = effects.index(effect), effects.index(other), abs(value) >= TIED_COSINE
+        colour, alpha = st.BLUE if value > 0 else st.VERMILLION, min(abs(value), 1.0) ** 2 * 0.8
         ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=colour, alpha=alpha, lw=0))
         if tied:
             ax.add_patch(Rectangle((j - 0.45, i - 0.45), 0.9, 0.9, facecolor="none", edgecolor=st.INK, lw=1.4))
@@ -308,8 +287,6 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     are written where the misfit exceeds twice its standard error from replicate scatter. A pattern common to all
     conditions, or growing towards one pressure, is systematic; isolated patches are chance.
     """
-    from matplotlib.patches import Patch
-
     names = {"misfit_before_m": "before", "misfit_after_m": f"after: with {added}" if added else "after"}
     shown = [c for c in names if len(where) and np.isfinite(st.column(where, c)).any()]
     if not shown:
@@ -331,13 +308,13 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     axes[0].set_yticks(range(len(labels)), [f"{label}, N = {int(counts[label])}" for label in labels], fontsize=9)
     words = f"full colour: {full_mm:.2g} mm{'; numbers in mm, where beyond scatter' if numbered else ''}"
     handles = [
-        Patch(facecolor=AHEAD, alpha=0.85, label="measured is ahead of the model"),
-        Patch(facecolor=BEHIND, alpha=0.85, label="measured is behind"),
-        Patch(facecolor=st.MUTED, alpha=0.2, label=words),
+        st.patch_key("measured is ahead of the model", AHEAD, 0.85),
+        st.patch_key("measured is behind", BEHIND, 0.85),
+        st.patch_key(words, st.MUTED, 0.2),
     ]
     if len(counts) > len(labels):
         words = f"the {len(labels)} of {len(counts)} conditions with the largest misfit"
-        handles.append(Patch(alpha=0.0, label=words))
+        handles.append(st.patch_key(words, "none"))
     st.page_legend(fig, handles, 3 if len(shown) > 1 else 2, handlelength=1.3)
     return fig
 
@@ -392,8 +369,8 @@ def draw_missing_force(missing_force: pd.DataFrame) -> Figure | None:
         for _, curve in single.groupby("condition", sort=False):
             ax.plot(factor * curve["value"], curve["force_N"], color=st.MUTED, lw=0.9, alpha=0.8)
         if len(mean):
-            style: dict[str, Any] = {"color": st.BLUE, "marker": "o", "ms": 4, "lw": 1.5, "elinewidth": 1}
-            ax.errorbar(factor * mean["value"], mean["force_N"], np.nan_to_num(st.column(mean, "sigma_N")), **style)
+            at, sigma = factor * mean["value"], np.nan_to_num(st.column(mean, "sigma_N"))
+            ax.errorbar(at, mean["force_N"], sigma, color=st.BLUE, marker="o", ms=4, lw=1.5, elinewidth=1)
         ax.axhline(0, color=st.INK, lw=0.8)
         ax.set_xlabel(words)
         if len(single):
@@ -403,12 +380,9 @@ def draw_missing_force(missing_force: pd.DataFrame) -> Figure | None:
 
 
 @figure(
-    "learned_force",
-    "where",
-    "The missing force, learned inside the fit",
-    data="learned_force",
+    "learned_force", "where", "The missing force, learned inside the fit", data="learned_force",
     if_refuted=SHOWS_REFUTED,
-)
+)  # fmt: skip
 def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     """The missing force, learned within the fit as a smooth function of the variables on which it most likely
     depends: for one variable a curve with its 95 % band, for two a map next to its standard error, both only in the
@@ -421,8 +395,8 @@ def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
     on_grid = learned_force["condition"].fillna("") == ""
     grid, along = learned_force[on_grid], learned_force[~on_grid]
     if len(variables) == 1:
-        fig = st.new_figure(6.4, 3.6)
-        _draw_curve(fig.subplots(), grid, along, variables[0])
+        fig, ax = st.one_panel(6.4, 3.6)
+        _draw_curve(ax, grid, along, variables[0])
         st.page_legend(fig, None, 3)
         return fig
     fig = st.new_figure(9.6, 4.4)
@@ -483,20 +457,24 @@ def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list
 CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
+def _nothing() -> pd.DataFrame:
+    return empty_table(())
+
+
 @dataclass(frozen=True)
 class DiagnosisTables:
     """Data of the figures; a table is empty if there is nothing to draw. `rounds` are (heading, ranking) pairs, `worst`
     is the label of the condition that `before_after` shows, `added` the added effects in words.
     """
 
-    ladder: pd.DataFrame = field(default_factory=lambda: empty_table(()))
-    trials: pd.DataFrame = field(default_factory=lambda: empty_table(()))
-    before_after: pd.DataFrame = field(default_factory=lambda: empty_table(()))
-    where: pd.DataFrame = field(default_factory=lambda: empty_table(()))
-    cosines: pd.DataFrame = field(default_factory=lambda: empty_table(()))
-    drift: pd.DataFrame = field(default_factory=lambda: empty_table(()))
-    missing_force: pd.DataFrame = field(default_factory=lambda: empty_table(()))
-    learned_force: pd.DataFrame = field(default_factory=lambda: empty_table(()))
+    ladder: pd.DataFrame = field(default_factory=_nothing)
+    trials: pd.DataFrame = field(default_factory=_nothing)
+    before_after: pd.DataFrame = field(default_factory=_nothing)
+    where: pd.DataFrame = field(default_factory=_nothing)
+    cosines: pd.DataFrame = field(default_factory=_nothing)
+    drift: pd.DataFrame = field(default_factory=_nothing)
+    missing_force: pd.DataFrame = field(default_factory=_nothing)
+    learned_force: pd.DataFrame = field(default_factory=_nothing)
     rounds: Sequence[tuple[str, pd.DataFrame]] = ()
     worst: str = ""
     added: str = ""

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
     from numpy.typing import ArrayLike
 
 
@@ -91,6 +92,14 @@ def new_figure(width_in: float, height_in: float, layout: Any = "constrained") -
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), layout=layout)
+
+
+def one_panel(width_in: float, height_in: float, **properties: Any) -> tuple[Figure, Axes]:
+    """Return an empty figure with one panel, and that panel, with properties such as its labels."""
+    fig = new_figure(width_in, height_in)
+    ax = fig.add_subplot()
+    ax.set(**properties)
+    return fig, ax
 
 
 @look()
@@ -231,6 +240,13 @@ def line_key(label: str, **style: Any) -> Line2D:
     return Line2D([], [], label=label, **style)
 
 
+def patch_key(label: str, colour: str, alpha: float | None = None, **style: Any) -> Patch:
+    """Return a legend entry with a filled rectangle."""
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor=colour, alpha=alpha, label=label, **style)
+
+
 def error_points(ax: Axes, x: ArrayLike, y: ArrayLike, sigma: ArrayLike, index: int, label: str, **style: Any) -> None:
     """Draw points with error bars, colour and marker by group. Shapes: x, y, sigma (n_points,)."""
     properties: dict[str, Any] = {"ms": 6, "capsize": 3, **style}
@@ -276,8 +292,13 @@ def up_from_zero(ax: Axes, *, x: bool = False) -> None:
 
 def counted(counts: Sequence[int], noun: str) -> str:
     """Return a count with its noun, or the range of several counts."""
-    low, high = min(counts), max(counts)
+    low, high = int(min(counts)), int(max(counts))
     return f"{low}–{high} {noun}s" if low != high else f"{low} {noun}" + ("" if low == 1 else "s")
+
+
+def per_point(counts: Sequence[int]) -> str:
+    """Return the number of trials in each point, whose bars are standard errors."""
+    return f"N = {counted(counts, 'trial')} per point{', ± standard error' if max(counts) > 1 else ''}"
 
 
 def with_minus(value: float, form: str) -> str:
