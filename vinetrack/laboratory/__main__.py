@@ -20,9 +20,9 @@ from pathlib import Path
 
 import yaml
 
-from vinetrack.experiment.folder import Experiment, read_experiment
-from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target, recording_experiment
-from vinetrack.laboratory.tracks import VirtualTrial, grow, read_ground_truth, write_tracks
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.laboratory.filming import film, make_filming, picture_target, recording_experiment
+from vinetrack.laboratory.tracks import grow, read_ground_truth, write_tracks
 
 DEMO = Path(__file__).with_name("demo.yaml")
 
@@ -57,23 +57,18 @@ def main(arguments: list[str] | None = None) -> None:
             write_tracks([trial], trial.stated.track.parent)
     if filmed:
         n_frames = sum(trial.track.time_s.size for trial in filmed)
-        where = f"{len(filmed)} trials in the virtual laboratory, {n_frames} frames"
-        print(f"Filming {where}. The first takes longest.", flush=True)
-        _film(experiment, filmed, filming, truth.seed, given.processes)
+        told = f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest."
+        print(told, flush=True)
+        image = getattr(experiment.settings.calibration, "image", None)
+        if image is not None:
+            picture_target(filming, experiment.folder / image, truth.seed)
+        paths = [trial.stated.video for trial in filmed]
+        with ProcessPoolExecutor(given.processes) as pool:
+            truths = pool.map(film, filmed, repeat(filming), paths, count(truth.seed))
+            for i, (trial, seen) in enumerate(zip(filmed, truths, strict=True), 1):
+                print(f"filmed {i} of {len(filmed)}: {trial.stated.name}, {seen.time_s.size} frames", flush=True)
     n_frames = sum(trial.track.time_s.size for trial in grown)
     print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
-
-
-def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, seed: int, processes: int) -> None:
-    """Film every trial in parallel processes, and print a line for each finished one."""
-    image = getattr(experiment.settings.calibration, "image", None)
-    if image is not None:
-        picture_target(filming, experiment.folder / image, seed)
-    paths = [trial.stated.video for trial in grown]
-    with ProcessPoolExecutor(processes) as pool:
-        truths = pool.map(film, grown, repeat(filming), paths, count(seed))
-        for i, (trial, truth) in enumerate(zip(grown, truths, strict=True), 1):
-            print(f"filmed {i} of {len(grown)}: {trial.stated.name}, {truth.time_s.size} frames", flush=True)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from vinetrack.core.tables import replacing, write_bytes, write_csv, write_text
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.laboratory.render import FrameRenderer, Motion, Truth, lay_target, plane_seen
-from vinetrack.laboratory.scene import Camera, Scene, Target, Tube, preset
+from vinetrack.laboratory.render import FrameRenderer, Motion, Truth, paint_board
+from vinetrack.laboratory.scene import PATTERN_PX, Camera, Scene, Target, Tube, preset
 from vinetrack.laboratory.tracks import VirtualTrial
 
 Frame = NDArray[np.uint8 | np.uint16]
@@ -33,17 +33,10 @@ def render_recording(
     scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, out_path: Path, seed: int = 0
 ) -> Truth:
     """Film `motion` in `scene` and write the recording to `out_path`, completely or not at all."""
-    renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
-    with replacing(out_path) as draft:
-        _write_video(renderer, draft)
-    return renderer.truth(np.arange(n_frames))
-
-
-def _write_video(renderer: FrameRenderer, path: Path) -> None:
     import av
 
-    scene = renderer.scene
-    encoding, depth = scene.encoding, scene.sensor.bit_depth
+    renderer = FrameRenderer(scene, motion, n_frames=n_frames, capture_fps=capture_fps, seed=seed)
+    camera, encoding, depth = scene.camera, scene.encoding, scene.sensor.bit_depth
     is_h264 = encoding.codec == "h264"
     of_grey = {8: "gray", 12: "gray12le", 16: "gray16le"}
     pixel_format = ("yuv420p" if depth == 8 else None) if is_h264 else of_grey.get(depth)
@@ -51,28 +44,28 @@ def _write_video(renderer: FrameRenderer, path: Path) -> None:
         raise ValueError(f"{encoding.codec} here does not hold {depth} bits.")
     levels = {"low": 16.0, "span": 219.0} if is_h264 else {}
     chroma = _chroma(scene)
-    options = {"movflags": "+faststart"} if path.suffix.lower() in (".mp4", ".mov") else {}
-    with av.open(str(path), "w", options=options) as container:
+    options = {"movflags": "+faststart"} if out_path.suffix.lower() in (".mp4", ".mov") else {}
+    with replacing(out_path) as draft, av.open(str(draft), "w", options=options) as container:
         # 60: frames per second that a file of a high-speed camera claims (chosen)
         stream: Any = container.add_stream("libx264" if is_h264 else encoding.codec, rate=Fraction(60))
-        stream.width, stream.height, stream.pix_fmt = scene.camera.width_px, scene.camera.height_px, pixel_format
+        stream.width, stream.height, stream.pix_fmt = camera.width_px, camera.height_px, pixel_format
         stream.codec_context.thread_count = 1
         if is_h264:
             rate = {"crf": str(encoding.crf)}
             if encoding.bitrate_Mbit_s is not None:
-                per_s = f"{encoding.bitrate_Mbit_s * 1000:.0f}k"
-                rate = {"b": per_s, "maxrate": per_s, "bufsize": per_s}
+                rate = dict.fromkeys(("b", "maxrate", "bufsize"), f"{encoding.bitrate_Mbit_s * 1000:.0f}k")
             stream.options = {"preset": "superfast", "bf": "0", "sc_threshold": "0", **rate}
             stream.gop_size = encoding.gop
             stream.codec_context.color_range = 1  # levels of 16…235
-        for index in range(renderer.n_frames):
-            picture: Any = av.VideoFrame(scene.camera.width_px, scene.camera.height_px, pixel_format)
+        for index in range(n_frames):
+            picture: Any = av.VideoFrame(camera.width_px, camera.height_px, pixel_format)
             for plane, values in zip(picture.planes, (renderer.frame(index, **levels), *chroma), strict=False):
                 rows = np.frombuffer(plane, values.dtype).reshape(-1, plane.line_size // values.itemsize)
                 rows[: values.shape[0], : values.shape[1]] = values
             picture.pts = index
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
+    return renderer.truth(np.arange(n_frames))
 
 
 def _chroma(scene: Scene) -> tuple[Frame, Frame]:
@@ -88,15 +81,25 @@ def _chroma(scene: Scene) -> tuple[Frame, Frame]:
 
 
 def render_target(target: Target, scene: Scene, *, seed: int = 0) -> Frame:
-    """Render one picture of a target through the camera of a scene, with its noise. The truth is `scene.camera`:
-    `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by a quarter
-    across the picture. Shape (height, width).
+    """Render one picture of a target through the camera of a scene, blurred by its optics, with its noise. The truth is
+    `scene.camera`: `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by
+    a quarter across the picture. Shape (height, width).
     """
-    bare = replace(scene, backdrop=replace(scene.backdrop, launcher=False, ruler=False, clutter=False), door=None)
-    empty = FrameRenderer(bare, np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3, seed=seed)
-    light = lay_target(empty.still, target, plane_seen(scene.camera), scene.psf_px)
-    slope = 1 + 0.25 * (np.linspace(0, 1, light.shape[1], dtype=np.float32)[None, :] - 0.5)
-    return empty.expose(np.asarray(light * slope, dtype=np.float32), 0)
+    import cv2
+
+    bare, camera = replace(scene.backdrop, launcher=False, ruler=False, clutter=False), scene.camera
+    scene = replace(scene, backdrop=bare, door=None)
+    empty = FrameRenderer(scene, np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3, seed=seed)
+    board = target.board_squares((camera.plane_from_picture(camera.pixels()) - camera.centre_px) * camera.m_per_px)
+    per_square = PATTERN_PX if target.kind == "charuco" else 1
+    painted, share = np.zeros_like(empty.still), np.zeros_like(empty.still)
+    paint_board(
+        board, np.gradient(board, axis=1), np.gradient(board, axis=0), target.pattern(), per_square, target.margin,
+        target.black, target.white, painted, share,
+    )  # fmt: skip
+    painted, share = (np.asarray(cv2.GaussianBlur(part, (0, 0), scene.psf_px), np.float32) for part in (painted, share))
+    slope = 1 + 0.25 * (np.linspace(0, 1, camera.width_px, dtype=np.float32)[None, :] - 0.5)
+    return empty.expose((empty.still * (1 - share) + painted) * slope, 0)
 
 
 # ------------------------------------------------------------------------------
@@ -115,10 +118,8 @@ class Filming:
 
 def make_filming(content: dict[str, Any]) -> Filming:
     """Read how trials are filmed from a YAML mapping."""
-    target = dict(content.get("target", {}))
-    if "squares" in target:
-        target["squares"] = tuple(target["squares"])
-    return Filming(**{**content, "camera": Camera(**content.get("camera", {})), "target": Target(**target)})
+    parts = {"camera": Camera(**content.get("camera", {})), "target": Target(**content.get("target", {}))}
+    return Filming(**(content | parts))
 
 
 def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -> Truth:
@@ -153,24 +154,10 @@ def recording_experiment(experiment: Experiment, trials: Sequence[str], filming:
         raise ValueError(f"{experiment.folder} is an experiment of recordings already")
     if folder.exists() and folder.samefile(experiment.folder):
         raise ValueError(f"{folder} is the experiment itself: name another folder")
-    sheet = pd.read_csv(experiment.folder / SHEET, dtype=str, keep_default_na=False)
-    sheet = sheet[sheet["trial"].isin(list(trials))].rename(columns={"track": "video"})
-    sheet["video"] = [f"videos/{trial}.mp4" for trial in sheet["trial"]]
-    write_csv(folder / SHEET, sheet)
-    path = experiment.folder / "experiment.yaml"
-    shared = path.read_text(encoding="utf-8") if path.exists() else ""
-    write_text(folder / "experiment.yaml", shared + _camera_settings(experiment, filming))
-    return read_experiment(folder, strict=True)
-
-
-def _camera_settings(experiment: Experiment, filming: Filming) -> str:
-    """The lines of `experiment.yaml` about exposure and calibration."""
-    target = filming.target
-    if target.kind != "charuco":
-        raise ValueError(f"the target is a {target.kind}; a recording needs a charuco board")
     exposures_us = {round(1e6 * filming.exposure_fraction / trial.capture_fps, 3) for trial in experiment.trials}
     if len(exposures_us) != 1:
         raise ValueError("trials have several frame rates, so that no single exposure can be stated")
+    target = filming.target
     board = {
         "kind": target.kind,
         "image": "calibration/board.png",
@@ -179,4 +166,12 @@ def _camera_settings(experiment: Experiment, filming: Filming) -> str:
         "marker_mm": round(1e3 * target.marker_m, 6),
         "dictionary": target.dictionary,
     }
-    return yaml.safe_dump({"exposure_us": exposures_us.pop(), "calibration": board}, sort_keys=False)
+    camera = yaml.safe_dump({"exposure_us": exposures_us.pop(), "calibration": board}, sort_keys=False)
+    sheet = pd.read_csv(experiment.folder / SHEET, dtype=str, keep_default_na=False)
+    sheet = sheet[sheet["trial"].isin(list(trials))].rename(columns={"track": "video"})
+    sheet["video"] = [f"videos/{trial}.mp4" for trial in sheet["trial"]]
+    write_csv(folder / SHEET, sheet)
+    path = experiment.folder / "experiment.yaml"
+    shared = path.read_text(encoding="utf-8") if path.exists() else ""
+    write_text(folder / "experiment.yaml", shared + camera)
+    return read_experiment(folder, strict=True)

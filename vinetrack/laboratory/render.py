@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import njit
-from vinetrack.laboratory.scene import PATTERN_PX, Ball, Camera, Door, Scene, Target, Tube
+from vinetrack.laboratory.scene import Ball, Door, Scene, Tube
 
 Image = NDArray[np.float32]
 
@@ -39,20 +39,6 @@ def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: flo
     white[0, 0] = 0
     field = np.fft.irfft2(white, s=shape)
     return (field / field.std()).astype(np.float32)
-
-
-def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
-    """The wall in the background: a gradient along the path, a pool of light, soft blotches and grain."""
-    look = scene.backdrop
-    shape = (along.shape[0], along.shape[1])
-    span = max(float(along.max()), 1.0)
-    ramp = look.brightness + look.gradient * (np.clip(along / span, 0, 1) - 0.5)
-    blotches = 0.6 * _smooth_noise(rng, shape, 45, 45) + 0.45 * _smooth_noise(rng, shape, 9, 14)
-    grain = 0.35 * _smooth_noise(rng, shape, 1.2, 1.2) + 0.25 * _smooth_noise(rng, shape, 0.8, 6)
-    yy, xx = np.mgrid[: shape[0], : shape[1]]
-    lit = np.exp(-(((xx / shape[1] - 0.45) / 0.65) ** 2) - ((yy / shape[0] - 0.35) / 0.9) ** 2)
-    pool = 1 + 2.5 * look.texture * (lit - 0.6)
-    return (ramp * pool * (1 + look.texture * (blotches + grain))).astype(np.float32)
 
 
 def _paste(
@@ -94,11 +80,11 @@ def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random
     return (fine * brushed * glare).astype(np.float32)
 
 
-def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -> Image:
+def _launcher_patch(radius_px: float, rng: np.random.Generator) -> Image:
     """Paint the block from which the tube grows: dark anodised aluminium with a knurled clamp ring and screws."""
     import cv2
 
-    height, width = int(2.9 * radius_px), reach_px
+    height, width = int(2.9 * radius_px), 400
     across = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
     patch = 0.10 + 0.10 * np.exp(-(((across + 0.6) / 0.16) ** 2)) + np.zeros((1, width), dtype=np.float32)
     patch *= 1 + 0.06 * _smooth_noise(rng, (height, width), 0.7, 25)
@@ -124,9 +110,8 @@ def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
     level = scene.backdrop.brightness
     things = canvas.copy()
     post = int(rng.uniform(0.55, 0.8) * width)
-    cv2.rectangle(things, (post, -5), (post + 30, height + 5), 1.5 * level, -1)
-    cv2.rectangle(things, (post + 4, -5), (post + 7, height + 5), 1.9 * level, -1)
-    cv2.rectangle(things, (post + 12, -5), (post + 19, height + 5), 0.4 * level, -1)
+    for left, right, factor in ((0, 30, 1.5), (4, 7, 1.9), (12, 19, 0.4)):
+        cv2.rectangle(things, (post + left, -5), (post + right, height + 5), factor * level, -1)
     turns = np.linspace(-0.05, 1.05, 90)
     start, end = rng.uniform(-0.1, 0.25) * width, rng.uniform(0.35, 0.6) * width
     hose_x = start + (end - start) * turns
@@ -149,15 +134,23 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
     yy, xx = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     dx, dy = xx + corner[0] - scene.origin[0], yy + corner[1] - scene.origin[1]
     along = (dx * scene.direction[0] + dy * scene.direction[1]).astype(np.float32)
-    canvas = _wall_paper(scene, rng, along)
-    if scene.backdrop.clutter:
+    # The wall: a gradient along the path, a pool of light, soft blotches and grain
+    look = scene.backdrop
+    ramp = look.brightness + look.gradient * (np.clip(along / max(float(along.max()), 1.0), 0, 1) - 0.5)
+    blotches = 0.6 * _smooth_noise(rng, shape, 45, 45) + 0.45 * _smooth_noise(rng, shape, 9, 14)
+    grain = 0.35 * _smooth_noise(rng, shape, 1.2, 1.2) + 0.25 * _smooth_noise(rng, shape, 0.8, 6)
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    lit = np.exp(-(((columns / shape[1] - 0.45) / 0.65) ** 2) - ((rows / shape[0] - 0.35) / 0.9) ** 2)
+    pool = 1 + 2.5 * look.texture * (lit - 0.6)
+    canvas = (ramp * pool * (1 + look.texture * (blotches + grain))).astype(np.float32)
+    if look.clutter:
         canvas = _clutter(canvas, scene, rng)
     radius = scene.subject.diameter_m / scene.camera.m_per_px / 2
-    if scene.backdrop.ruler:
+    if look.ruler:
         patch = _ruler_patch(int(along.max()) + 40, 34, 1e-3 / scene.camera.m_per_px, rng)
         canvas = _paste(canvas, patch, scene, corner, 0.0, round(1.9 * radius + 14))
-    if scene.backdrop.launcher:
-        patch = _launcher_patch(radius, rng, 400)
+    if look.launcher:
+        patch = _launcher_patch(radius, rng)
         canvas = _paste(canvas, patch, scene, corner, -399.0, -patch.shape[0] / 2)
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), scene.psf_px), dtype=np.float32).clip(0, 1.5)
 
@@ -206,14 +199,6 @@ def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px:
     return transmission.astype(np.float32), glow.astype(np.float32)
 
 
-def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
-    """Return the relative stretch of distances from the axis along the everted wall, whose sides ripple. Shape
-    (length_px,).
-    """
-    ripple = 0.7 * _smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length_px), 1, 40)[0]
-    return (1 + 0.08 * tube.texture * ripple).astype(np.float32)
-
-
 def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px: int) -> Image:
     """Return running sums along the tail's texture, which is periodic with mean 0; shape (rows, period_px + 1). The
     mean over any stretch, as in motion blur, is then the difference of two entries over the length.
@@ -231,14 +216,13 @@ def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Imag
     """Paint a sphere lit from the upper left, with texture and two highlights; square of side 2·(ceil(radius)+4)+1."""
     half = math.ceil(radius_px) + 4
     grid = np.arange(-half, half + 1) / radius_px
-    r2 = np.clip(grid[:, None] ** 2 + grid[None, :] ** 2, 0, 1)
-    facing = np.clip(0.55 * np.sqrt(1 - r2) - 0.35 * grid[:, None] - 0.25 * grid[None, :], 0, None)
+    y, x = grid[:, None], grid[None, :]
+    r2 = np.clip(y**2 + x**2, 0, 1)
+    facing = np.clip(0.55 * np.sqrt(1 - r2) - 0.35 * y - 0.25 * x, 0, None)
     marks = _smooth_noise(rng, r2.shape, 2.2, 2.2) + 0.5 * _smooth_noise(rng, r2.shape, 6, 6)
     surface = ball.brightness * (0.45 + 0.9 * facing) * (1 + ball.texture * marks)
     for gy, gx, width in ((-0.25, 0.05, 0.07), (-0.2, -0.12, 0.05)):
-        surface = surface + ball.specular * np.exp(
-            -((grid[:, None] - gy) ** 2 + (grid[None, :] - gx) ** 2) / (2 * width**2)
-        )
+        surface = surface + ball.specular * np.exp(-((y - gy) ** 2 + (x - gx) ** 2) / (2 * width**2))
     return surface.clip(0, 2).astype(np.float32)
 
 
@@ -252,7 +236,7 @@ POINTS, LATTICE = 89, 55  # Points in a pixel, on a Fibonacci lattice (derived)
 
 
 @njit()
-def _paint_board(
+def paint_board(
     board: Floats, step_x: Floats, step_y: Floats, pattern: NDArray[np.uint8], per_square: int, margin: float,
     black: float, white: float, light: Image, share: Image,
 ) -> None:  # fmt: skip
@@ -280,29 +264,6 @@ def _paint_board(
                     seen += white
             light[y, x] = seen / POINTS
             share[y, x] = on / POINTS
-
-
-def plane_seen(camera: Camera) -> Floats:
-    """Return the point of the plane that each pixel sees, from the optical axis, m. Shape (height, width, 2)."""
-    grid = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1).astype(float)
-    return np.asarray((camera.plane_from_picture(grid) - np.array(camera.centre_px)) * camera.m_per_px)
-
-
-def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> Image:
-    """Lay a target over a picture where pixels see it, blurred by the optics. Shapes: light (height, width); plane_m
-    (height, width, 2) → (height, width).
-    """
-    import cv2
-
-    painted, share = np.zeros(light.shape, np.float32), np.zeros(light.shape, np.float32)
-    board = target.board_squares(plane_m)
-    step_y, step_x = np.gradient(board, axis=0), np.gradient(board, axis=1)
-    per_square = PATTERN_PX if target.kind == "charuco" else 1
-    _paint_board(
-        board, step_x, step_y, target.pattern(), per_square, target.margin, target.black, target.white, painted, share
-    )
-    painted, share = (np.asarray(cv2.GaussianBlur(part, (0, 0), psf_px), np.float32) for part in (painted, share))
-    return np.asarray(light * (1 - share) + painted, dtype=np.float32)
 
 
 # ------------------------------------------------------------------------------
@@ -384,10 +345,13 @@ def shade_tube(
     period = tail.shape[1] - 1
     columns = transmission.shape[1]
     n = table.shape[1]
+    widest = reach / girth.min() + 2.25 * abs(sway) + (ghost_across if ghost > 0 else 0.0)
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
-            u = along[y, x] - shift_along
             v = across[y, x] - shift_across
+            if abs(v) > widest:
+                continue
+            u = along[y, x] - shift_along
             grown = min(max(u / sway_length, 0.0), 1.5)
             v -= sway * grown * grown
             if ghost > 0 and abs(v - ghost_across) < reach:
@@ -528,13 +492,19 @@ class SceneMotion:
     def __init__(
         self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float, seed: int
     ) -> None:
-        self.scene, self.capture_fps, self.exposure_s = scene, capture_fps, exposure_s
-        self._position_m = motion
+        self.scene, self.capture_fps, self.exposure_s, self._position_m = scene, capture_fps, exposure_s, motion
         grid_s = np.arange(0, (n_frames + 1) * 10) / (10 * capture_fps)
         lead_m = np.asarray(self._position_m(grid_s), dtype=float)
         moving = np.flatnonzero(lead_m > lead_m[0] + 1e-5)
         self.release_s = float(grid_s[moving[0]]) if moving.size else math.inf
-        self._exit_s, self._exit_px_s = self._find_exit(grid_s, lead_m)
+        # When the end of the tail leaves the tip, and its speed there (px/s), twice that of the tip
+        self._exit_s, self._exit_px_s, scale = math.inf, 0.0, scene.camera.m_per_px
+        length_m = scene.subject.length_m if isinstance(scene.subject, Tube) else math.inf
+        out = np.flatnonzero(lead_m >= length_m - 1e-4)
+        if out.size and out[0] >= 2:
+            k = out[0]
+            lead_speed_m_s = (lead_m[k - 1] - lead_m[k - 2]) / (grid_s[k - 1] - grid_s[k - 2])
+            self._exit_s, self._exit_px_s = float(grid_s[k]), min(2 * lead_speed_m_s, 150.0) / scale
         rng = np.random.default_rng([seed, 1])
         amplitude = rng.normal(size=(2, 6))
         self._amplitude = amplitude / np.sqrt((amplitude**2).sum(axis=1, keepdims=True) / 2)
@@ -542,19 +512,7 @@ class SceneMotion:
         self._hertz = rng.uniform(4, 55, 6)
         self._lamp_phase = float(rng.uniform(0, 2 * np.pi))
         # Growth at which the sway is `sway_px`; sway grows with the square of the distance, as for a cantilever.
-        subject = scene.subject
-        self.sway_length_px = subject.length_m / scene.camera.m_per_px if isinstance(subject, Tube) else 1.0
-
-    def _find_exit(self, grid_s: Floats, lead_m: Floats) -> tuple[float, float]:
-        """Time at which the end of the tail leaves the tip, and its speed there (px/s), twice that of the tip."""
-        if not isinstance(self.scene.subject, Tube):
-            return math.inf, 0.0
-        out = np.flatnonzero(lead_m >= self.scene.subject.length_m - 1e-4)
-        if not out.size or out[0] < 2:
-            return math.inf, 0.0
-        k = out[0]
-        lead_speed_m_s = (lead_m[k - 1] - lead_m[k - 2]) / (grid_s[k - 1] - grid_s[k - 2])
-        return float(grid_s[k]), min(2 * lead_speed_m_s, 150.0) / self.scene.camera.m_per_px
+        self.sway_length_px = length_m / scale
 
     def mid_exposure_s(self, frame: int | NDArray[np.int_]) -> Floats:
         """Return the middle of the exposure of frames."""
@@ -615,49 +573,29 @@ class SceneMotion:
         after = opened - 1
         return math.radians(door.open_deg - 12 * math.exp(-after / 1.5) * abs(math.sin(2.2 * after)))
 
-    def tip_plane_px(self, time_s: Floats) -> Floats:
-        """Return the tip of the tube or body in plane pixels, with sway and shake. Shapes: time_s (n,) → (n, 2)."""
-        along = self.lead_px(time_s)
-        across = np.array([self.sway_px(float(t)) for t in time_s]) * np.clip(along / self.sway_length_px, 0, 1.5) ** 2
-        shake = np.array([self.shake_px(float(t)) for t in time_s]).reshape(-1, 2)
-        ux, uy = self.scene.direction
-        on_path = np.array(self.scene.origin) + along[:, None] * np.array([ux, uy])
-        return np.asarray(on_path + across[:, None] * np.array([-uy, ux]) + shake)
-
 
 # ------------------------------------------------------------------------------
 # Moving objects in front of the backdrop: tube, ball and door, each composited over the light of a frame.
 
 TABLE_STEP_PX = 1 / 16  # Steps of the table of covers along the path (chosen)
-
 PROFILE_PER_PX = 16  # Entries per pixel of the profiles across (chosen)
-
 # How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)
 SLOPES = np.linspace(1.0, 4.0, 7)
-
-
-class PathMaps:
-    """Plane coordinates of every pixel, along the growth axis and across it: each float32 of the picture's shape."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.plane_x, self.plane_y = scene.camera.plane_maps()
-        ux, uy = (np.float32(part) for part in scene.direction)
-        dx, dy = self.plane_x - np.float32(scene.origin[0]), self.plane_y - np.float32(scene.origin[1])
-        self.along: Image = (dx * ux + dy * uy).astype(np.float32)
-        self.across: Image = (dy * ux - dx * uy).astype(np.float32)
 
 
 class TubeLayer:
     """Composites the everting tube with its payload over a frame."""
 
-    def __init__(self, scene_motion: SceneMotion, maps: PathMaps, rng: np.random.Generator) -> None:
+    def __init__(self, scene_motion: SceneMotion, maps: tuple[Image, Image], rng: np.random.Generator) -> None:
         scene = scene_motion.scene
         assert isinstance(scene.subject, Tube)
         self._motion, self._maps, self._tube, self._psf_px = scene_motion, maps, scene.subject, scene.psf_px
         self._radius_px = radius = scene.subject.diameter_m / 2 / scene.camera.m_per_px
-        length = max(math.ceil(float(maps.along.max())) + 8, 64)
+        length = max(math.ceil(float(maps[0].max())) + 8, 64)
         self._wall = film_wall(self._tube, rng, radius, length)
-        self._girth = film_girth(self._tube, rng, length)
+        # Stretch of distances from the axis along the everted wall, whose sides ripple
+        ripple = 0.7 * _smooth_noise(rng, (4, length), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length), 1, 40)[0]
+        self._girth = (1 + 0.08 * self._tube.texture * ripple).astype(np.float32)
         self._tail = tail_sums(self._tube, rng, radius, period_px=4096)
         self._profiles = tip_profiles(self._tube, radius, self._psf_px)
         self._ghost_across = 1.35 * radius
@@ -682,7 +620,7 @@ class TubeLayer:
         # Averaged over one pixel at least, so that the tail's texture is as soft at rest as in motion.
         slack = max(0.0, 1.0 - (tail_to - tail_from)) / 2
         shade_tube(
-            light, self._maps.along, self._maps.across, *shift, tip,
+            light, *self._maps, *shift, tip,
             scene_motion.sway_px(middle_s), scene_motion.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
             setback, slope_row, side, core, PROFILE_PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
             tail_to + slack,
@@ -696,12 +634,10 @@ class TubeLayer:
         fold_px, fold_sigma = 0.28 * self._radius_px, 0.07 * self._radius_px + sigma
         reach = 4.5 * max(sigma * SLOPES[-1], fold_sigma)
         first, last = float(path_px.min()) - fold_px - reach, float(path_px.max()) + reach
-        n = math.ceil((last - first) / TABLE_STEP_PX) + 2
-        edges = coverage_table(path_px, sigma * SLOPES, first, TABLE_STEP_PX, n)
-        width = np.array([fold_sigma])
-        front = coverage_table(path_px, width, first, TABLE_STEP_PX, n)
-        back = coverage_table(path_px - fold_px, width, first, TABLE_STEP_PX, n)
-        return np.concatenate([edges, front - back]), first
+        grid = first, TABLE_STEP_PX, math.ceil((last - first) / TABLE_STEP_PX) + 2
+        ahead = coverage_table(path_px, np.array([*(sigma * SLOPES), fold_sigma]), *grid)
+        ahead[-1:] -= coverage_table(path_px - fold_px, np.array([fold_sigma]), *grid)
+        return ahead, first
 
 
 def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, NDArray[np.int64], Image, Image]:
@@ -727,14 +663,9 @@ class BallLayer:
     """Composites a ball whose centre follows `centre_px` over a frame; it is visible from `emerges_at_px` on."""
 
     def __init__(
-        self,
-        scene_motion: SceneMotion,
-        maps: PathMaps,
-        rng: np.random.Generator,
-        ball: Ball,
-        centre_px: Callable[[Floats], Floats],
-        emerges_at_px: float = -1e9,
-    ) -> None:
+        self, scene_motion: SceneMotion, maps: tuple[Image, Image], rng: np.random.Generator, ball: Ball,
+        centre_px: Callable[[Floats], Floats], emerges_at_px: float = -1e9,
+    ) -> None:  # fmt: skip
         self._motion, self._maps, self._centre_px, self._from_px = scene_motion, maps, centre_px, emerges_at_px
         self._radius_px = ball.diameter_m / 2 / scene_motion.scene.camera.m_per_px
         self._surface = ball_surface(ball, rng, max(self._radius_px, 2.0))
@@ -749,53 +680,42 @@ class BallLayer:
         pieces = int(min(max(math.ceil(abs(ends[1] - ends[0]) / 0.7), 3), 80))
         path = self._centre_px(begin_s + span_s * (np.arange(pieces) + 0.5) / pieces)
         shade_ball(
-            light, self._maps.along, self._maps.across, *shift, path, self._radius_px, scene_motion.scene.psf_px,
+            light, *self._maps, *shift, path, self._radius_px, scene_motion.scene.psf_px,
             self._surface, self._from_px,
         )  # fmt: skip
 
 
-class DoorLayer:
-    """Composites the door over a frame: a plate hinged beside the resting tip that swings out of the path."""
+def lay_door(light: Image, scene_motion: SceneMotion, door: Door, frame: int, shake: tuple[float, float]) -> None:
+    """Lay the door over a picture, shape (height, width), in place: a plate hinged beside the resting tip that swings
+    out of the path, averaged over the beginning, middle and end of the exposure.
+    """
+    import cv2
 
-    def __init__(self, scene_motion: SceneMotion, door: Door) -> None:
-        scene = scene_motion.scene
-        scale = scene.camera.m_per_px
-        self._motion, self._door = scene_motion, door
-        self._length, self._half = door.length_m / scale, door.thickness_m / scale / 2
-        radius = scene.subject.diameter_m / 2 / scale
-        self._hinge = np.array([float(scene_motion.lead_px(0.0)) + 2 + self._half, -1.25 * radius])
-
-    def lay(self, light: Image, frame: int, shake: tuple[float, float]) -> None:
-        """Lay the door over a picture, in place, averaged over the beginning, middle and end of the exposure. Shapes:
-        light (height, width).
-        """
-        times_s = frame / self._motion.capture_fps + self._motion.exposure_s * np.array([0.1, 0.5, 0.9])
-        angles = [self._motion.door_angle_rad(float(t)) for t in times_s]
-        arm = np.array([[-1, -4], [1, -4], [1, self._length], [-1, self._length]]) * [self._half, 1]
-        knuckle = np.array([[-2, -7], [2, -7], [2, 5], [-2, 5]]) * [self._half, 1]
-        lit = np.array([[0.3, -4], [1, -4], [1, self._length], [0.3, self._length]]) * [self._half, 1]
-        self._paint(light, arm, angles, shake, self._door.brightness)
-        self._paint(light, lit, angles, shake, 1.35 * self._door.brightness)
-        self._paint(light, knuckle, [0.0], shake, 0.12)
-
-    def _paint(
-        self, light: Image, outline: Floats, angles: list[float], shake: tuple[float, float], brightness: float
-    ) -> None:
-        """Fill the outline, turned by each of `angles` about the hinge, each with its share of the exposure."""
-        import cv2
-
-        scene = self._motion.scene
-        ux, uy = scene.direction
-        axes = np.array([[ux, uy], [-uy, ux]])
+    scene = scene_motion.scene
+    scale, (ux, uy) = scene.camera.m_per_px, scene.direction
+    axes = np.array([[ux, uy], [-uy, ux]])
+    length, half = door.length_m / scale, door.thickness_m / scale / 2
+    radius = scene.subject.diameter_m / 2 / scale
+    hinge = np.array([float(scene_motion.lead_px(0.0)) + 2 + half, -1.25 * radius])
+    times_s = frame / scene_motion.capture_fps + scene_motion.exposure_s * np.array([0.1, 0.5, 0.9])
+    swing = [scene_motion.door_angle_rad(float(t)) for t in times_s]
+    # Plate, lit edge and knuckle of the hinge: sides in half thicknesses, ends in px, angles, brightness
+    for left, right, back, front, angles, level in (
+        (-1.0, 1, -4, length, swing, door.brightness),
+        (0.3, 1, -4, length, swing, 1.35 * door.brightness),
+        (-2.0, 2, -7, 5, [0.0], 0.12),
+    ):
+        outline = np.array([[left, back], [right, back], [right, front], [left, front]]) * [half, 1]
         turned = []
         for angle in angles:
             turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-            turned.append(scene.camera.picture_from_plane((outline @ turn + self._hinge) @ axes + scene.origin + shake))
+            on_plane = (outline @ turn + hinge) @ axes + scene.origin + shake
+            turned.append(scene.camera.picture_from_plane(on_plane))
         every = np.concatenate(turned)
         low = np.clip(np.floor(every.min(axis=0)).astype(int) - 4, 0, None)
         high = np.clip(np.ceil(every.max(axis=0)).astype(int) + 5, None, [light.shape[1], light.shape[0]])
         if (high <= low).any():
-            return
+            continue
         cover = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.float32)
         for corners in turned:
             layer = np.zeros(cover.shape, dtype=np.uint8)
@@ -803,7 +723,7 @@ class DoorLayer:
             cover += layer / np.float32(255 * len(turned))
         cover = np.asarray(cv2.GaussianBlur(cover, (0, 0), scene.psf_px), dtype=np.float32)
         region = light[low[1] : high[1], low[0] : high[0]]
-        region += cover * (np.float32(brightness) - region)
+        region += cover * (np.float32(level) - region)
 
 
 @dataclass(frozen=True)
@@ -826,74 +746,58 @@ class FrameRenderer:
     """Renders any frame of a recording, in any order; the same frame always comes out the same."""
 
     def __init__(
-        self,
-        scene: Scene,
-        motion: Motion,
-        *,
-        n_frames: int,
-        capture_fps: float,
-        exposure_s: float | None = None,
+        self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float | None = None,
         seed: int = 0,
-    ) -> None:
-        self.scene, self.n_frames, self.capture_fps, self.seed = scene, n_frames, capture_fps, seed
+    ) -> None:  # fmt: skip
+        from scipy.special import ndtri
+
+        self.scene, self._seed = scene, seed
         self.exposure_s = scene.exposure_fraction / capture_fps if exposure_s is None else exposure_s
         if not 0 < self.exposure_s <= 1 / capture_fps:
             raise ValueError(
                 f"An exposure of {self.exposure_s * 1e6:.0f} µs does not fit between frames at {capture_fps:g} a "
                 "second; choose a shorter one."
             )
-        self.scene_motion = SceneMotion(
+        self._motion = SceneMotion(
             scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=self.exposure_s, seed=seed
         )
-        maps = PathMaps(scene)
-        self._hang_backdrop(maps)
-        rng = np.random.default_rng([seed, 2])
+        # The backdrop, painted on plane pixels, and projected through the lens once, for frames without shake
+        plane_x, plane_y = scene.camera.plane_maps()
+        margin = 4 + math.ceil(4 * scene.shake_px)
+        x0, y0 = (math.floor(part.min()) - margin for part in (plane_x, plane_y))
+        x1, y1 = (math.ceil(part.max()) + margin for part in (plane_x, plane_y))
+        canvas = backdrop_canvas(scene, np.random.default_rng([seed, 0]), (y1 - y0 + 1, x1 - x0 + 1), (x0, y0))
+        self._backdrop = canvas, plane_x - np.float32(x0), plane_y - np.float32(y0)
+        self.still: Image = np.empty(plane_x.shape, np.float32)  # radiance of the static scene, shape (height, width)
+        sample_backdrop(*self._backdrop, 0.0, 0.0, self.still)
+        # What moves, on distances along the path and across it, px
+        ox, oy, ux, uy = np.array([*scene.origin, *scene.direction], dtype=np.float32)
+        dx, dy = plane_x - ox, plane_y - oy
+        maps, rng = (dx * ux + dy * uy, dy * ux - dx * uy), np.random.default_rng([seed, 2])
         self._subject: TubeLayer | BallLayer
         if isinstance(scene.subject, Tube):
-            self._subject = TubeLayer(self.scene_motion, maps, rng)
+            self._subject = TubeLayer(self._motion, maps, rng)
         else:
             radius = scene.subject.diameter_m / 2 / scene.camera.m_per_px
-            centre = lambda time_s: self.scene_motion.lead_px(time_s) - radius  # noqa: E731
-            self._subject = BallLayer(self.scene_motion, maps, rng, scene.subject, centre)
-        self._door = DoorLayer(self.scene_motion, scene.door) if scene.door else None
-        self._prepare_sensor()
-
-    def _hang_backdrop(self, maps: PathMaps) -> None:
-        """Paint the backdrop on plane pixels; project it through the lens once, for frames without shake."""
-        margin = 4 + math.ceil(4 * self.scene.shake_px)
-        x0, y0 = (math.floor(part.min()) - margin for part in (maps.plane_x, maps.plane_y))
-        x1, y1 = (math.ceil(part.max()) + margin for part in (maps.plane_x, maps.plane_y))
-        rng = np.random.default_rng([self.seed, 0])
-        self._canvas = backdrop_canvas(self.scene, rng, (y1 - y0 + 1, x1 - x0 + 1), (x0, y0))
-        self._canvas_x, self._canvas_y = maps.plane_x - np.float32(x0), maps.plane_y - np.float32(y0)
-        #: radiance of the static scene, shape (height, width)
-        self.still = np.empty(maps.plane_x.shape, dtype=np.float32)
-        sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self.still)
-
-    def _prepare_sensor(self) -> None:
-        """Prepare the gain of every pixel (vignetting, fixed pattern), and normal deviates."""
-        from scipy.special import ndtri
-
-        rng = np.random.default_rng([self.seed, 3])
-        sensor, (cx, cy) = self.scene.sensor, self.scene.camera.centre_px
-        height, width = self.scene.camera.height_px, self.scene.camera.width_px
-        yy, xx = np.mgrid[:height, :width]
-        radius2 = ((xx - cx) ** 2 + (yy - cy) ** 2) / (cx**2 + cy**2)
-        spread = rng.standard_normal((height, width)) + 0.5 * rng.standard_normal((1, width))
-        falloff = 1 - self.scene.light.vignetting * radius2
-        self._gain = (falloff * (1 + sensor.fixed_pattern * spread)).astype(np.float32)
-        cells = 1 << NORMAL_BITS
-        quantiles = ndtri((np.arange(cells) + 0.5) / cells)
+            centre = lambda time_s: self._motion.lead_px(time_s) - radius  # noqa: E731
+            self._subject = BallLayer(self._motion, maps, rng, scene.subject, centre)
+        # The sensor: gain of every pixel (vignetting, fixed pattern), and normal deviates
+        camera, rng = scene.camera, np.random.default_rng([seed, 3])
+        radius2 = ((camera.pixels() - camera.centre_px) ** 2).sum(axis=-1) / np.square(camera.centre_px).sum()
+        spread = rng.standard_normal(radius2.shape) + 0.5 * rng.standard_normal((1, camera.width_px))
+        falloff = 1 - scene.light.vignetting * radius2
+        self._gain = (falloff * (1 + scene.sensor.fixed_pattern * spread)).astype(np.float32)
+        quantiles = ndtri((np.arange(1 << NORMAL_BITS) + 0.5) / (1 << NORMAL_BITS))
         self._normals = (quantiles / quantiles.std()).astype(np.float32)
 
     def radiance(self, frame: int) -> Image:
         """Return the radiance at the sensor, before lamps, gain and noise. Shape (height, width)."""
-        shake = self.scene_motion.shake_px(float(self.scene_motion.mid_exposure_s(frame)))
+        shake = self._motion.shake_px(float(self._motion.mid_exposure_s(frame)))
         light = self.still.copy()
         if shake != (0.0, 0.0):
-            sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, *shake, light)
-        if self._door is not None:
-            self._door.lay(light, frame, shake)
+            sample_backdrop(*self._backdrop, *shake, light)
+        if self.scene.door is not None:
+            lay_door(light, self._motion, self.scene.door, frame, shake)
         ux, uy = self.scene.direction
         self._subject.lay(light, frame, (shake[0] * ux + shake[1] * uy, shake[1] * ux - shake[0] * uy))
         return light
@@ -913,17 +817,20 @@ class FrameRenderer:
         well_e = sensor.full_well_e if sensor.noise else 0.0
         full = float(2**sensor.bit_depth - 1 if span is None else span)
         expose(
-            light, self._gain, self.scene_motion.lamp(frame), well_e, sensor.read_noise_e, self.seed, frame,
+            light, self._gain, self._motion.lamp(frame), well_e, sensor.read_noise_e, self._seed, frame,
             self._normals, low, full, out,
         )  # fmt: skip
         return out
 
     def truth(self, frames: NDArray[np.int_]) -> Truth:
         """Return the true positions in these frames. Shapes: frames (n,)."""
-        time_s = self.scene_motion.mid_exposure_s(frames)
-        along = self.scene_motion.lead_px(time_s)
-        camera = self.scene.camera
-        tip = camera.picture_from_plane(self.scene_motion.tip_plane_px(time_s))
+        time_s = self._motion.mid_exposure_s(frames)
+        along, camera, (ux, uy) = self._motion.lead_px(time_s), self.scene.camera, self.scene.direction
+        sway = np.array([self._motion.sway_px(float(t)) for t in time_s])
+        across = sway * np.clip(along / self._motion.sway_length_px, 0, 1.5) ** 2
+        shake = np.array([self._motion.shake_px(float(t)) for t in time_s]).reshape(-1, 2)
+        on_path = np.array(self.scene.origin) + along[:, None] * np.array([ux, uy])
+        tip = camera.picture_from_plane(on_path + across[:, None] * np.array([-uy, ux]) + shake)
         return Truth(
             time_s=time_s,
             lead_position_m=along * camera.m_per_px - self.scene.start_m,
@@ -931,6 +838,6 @@ class FrameRenderer:
             tip_x_px=tip[:, 0],
             tip_y_px=tip[:, 1],
             in_frame=np.all((tip >= -0.5) & (tip <= np.array([camera.width_px, camera.height_px]) - 0.5), axis=1),
-            release_s=self.scene_motion.release_s,
+            release_s=self._motion.release_s,
             exposure_s=self.exposure_s,
         )

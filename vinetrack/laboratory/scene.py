@@ -9,7 +9,9 @@ plane pixels, brightness is radiance as a fraction of the sensor's full scale.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,27 +59,27 @@ class Camera:
     def plane_from_picture(self, picture_px: Floats) -> Floats:
         """Map points of the picture to the plane of growth. Shapes: picture_px (..., 2) → (..., 2)."""
         distorted = (np.asarray(picture_px, dtype=float) - self.centre_px) / self.focal_px
-        ray = np.concatenate([self._undistorted(distorted), np.ones((*distorted.shape[:-1], 1))], axis=-1)
+        # Newton's method on the radius r(1 + k1 r² + k2 r⁴) = r_bent; ten steps (chosen)
+        bent = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
+        radius = bent.copy()
+        for _ in range(10):
+            excess = radius * (1 + self.k1 * radius**2 + self.k2 * radius**4) - bent
+            radius -= excess / (1 + 3 * self.k1 * radius**2 + 5 * self.k2 * radius**4)
+        straight = distorted * np.divide(radius, bent, out=np.ones_like(radius), where=bent > 0)
+        ray = np.concatenate([straight, np.ones((*distorted.shape[:-1], 1))], axis=-1)
         normal = self.rotation[:, 2]
         depth = normal[2] * self.focal_px / (ray @ normal)
         spatial = ray * depth[..., None] - np.array([0.0, 0.0, self.focal_px])
         return np.asarray(spatial @ self.rotation[:, :2] + self.centre_px)
 
-    def _undistorted(self, distorted: Floats) -> Floats:
-        """Newton's method on the radius r(1 + k1 r² + k2 r⁴) = r_bent."""
-        distorted_radius = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
-        radius = distorted_radius.copy()
-        # 10: Newton steps of the inverse of the distortion (chosen)
-        for _ in range(10):
-            excess = radius * (1 + self.k1 * radius**2 + self.k2 * radius**4) - distorted_radius
-            radius -= excess / (1 + 3 * self.k1 * radius**2 + 5 * self.k2 * radius**4)
-        return distorted * np.divide(radius, distorted_radius, out=np.ones_like(radius), where=distorted_radius > 0)
+    def pixels(self) -> Floats:
+        """Return the coordinates of all pixels, shape (height_px, width_px, 2)."""
+        return np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), axis=-1).astype(float)
 
     def plane_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Plane pixel of each picture pixel: x and y, each of shape (height_px, width_px)."""
-        grid = np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), axis=-1).astype(float)
         is_plain = self.k1 == self.k2 == self.tilt_x_deg == self.tilt_y_deg == 0
-        plane = grid if is_plain else self.plane_from_picture(grid)
+        plane = self.pixels() if is_plain else self.plane_from_picture(self.pixels())
         return plane[..., 0].astype(np.float32), plane[..., 1].astype(np.float32)
 
 
@@ -89,7 +91,7 @@ class Target:
     """A board in the plane of growth."""
 
     kind: str = "charuco"
-    squares: tuple[int, int] = (12, 5)
+    squares: Sequence[int] = (12, 5)
     square_m: float = 0.020
     marker_m: float = 0.015
     dictionary: str = "DICT_4X4_100"
@@ -254,27 +256,24 @@ class Scene:
         return cx - ux * reach, cy - uy * reach
 
 
-def _camera_like(scene: Scene) -> Scene:
-    """Set the bit rate to that of a high-speed camera: 60 Mbit/s at 1280 × 720, in proportion to the picture's area."""
-    rate = 60.0 * scene.camera.width_px * scene.camera.height_px / (1280 * 720)
-    return replace(scene, encoding=replace(scene.encoding, bitrate_Mbit_s=rate))
-
-
-def _presets() -> dict[str, Scene]:
-    """All presets by name; `clean` and `demo` come first, harder ones follow."""
+def preset(name: str) -> Scene:
+    """Return a scene by name: `clean`, `demo`, or a harder one."""
     plain = Backdrop(brightness=0.1, gradient=0, texture=0, ruler=False, launcher=False, clutter=False)
     opaque = Tube(opacity=1.0, brightness=0.8, texture=0, tail_texture=0, tail_opacity=0, specular=0, tip_glow=0)
-    clean = Scene(
-        subject=opaque,
-        door=None,
-        backdrop=plain,
-        light=Light(vignetting=0),
-        sensor=Sensor(noise=False, fixed_pattern=0, bit_depth=16),
-        encoding=Encoding(codec="ffv1"),
-    )
+    raw, lossless = Sensor(noise=False, fixed_pattern=0, bit_depth=16), Encoding(codec="ffv1")
+    even = Light(vignetting=0)
+    clean = Scene(subject=opaque, door=None, backdrop=plain, light=even, sensor=raw, encoding=lossless)
     demo = Scene()
-    hard = _camera_like(demo)
-    tube = Tube()
+
+    def hard(**changes: Any) -> Scene:
+        """A scene at the bit rate of a high-speed camera: 60 Mbit/s at 1280 × 720, in proportion to the area."""
+        scene = replace(demo, **changes)
+        rate = 60.0 * scene.camera.width_px * scene.camera.height_px / (1280 * 720)
+        return replace(scene, encoding=Encoding(bitrate_Mbit_s=rate))
+
+    faint = Tube(opacity=0.22, brightness=0.42, texture=0.08, specular=0.03, tip_glow=0.03)
+    dark = Tube(opacity=0.75, brightness=0.10, texture=0.2, specular=0.08, tip_glow=0.02)
+    bright_wall = Backdrop(brightness=0.42, gradient=0.55)
     ball = Scene(
         camera=Camera(width_px=384, height_px=800, m_per_px=1 / 3660),
         subject=Ball(),
@@ -282,50 +281,30 @@ def _presets() -> dict[str, Scene]:
         growth_angle_deg=90.0,
         backdrop=Backdrop(launcher=False),
     )
-    return {
+    dark_wall = Backdrop(brightness=0.07, gradient=-0.04, texture=0.3, launcher=False)
+    scenes = {
         "clean": clean,
         "demo": demo,
-        "door": replace(hard, door=Door(brightness=0.85, length_m=0.05, thickness_m=0.006, swing_s=0.03)),
-        "wobble": replace(hard, subject=replace(tube, wobble_px=7.0)),
-        "flicker": replace(hard, light=Light(flicker=0.15)),
-        "low_contrast": replace(
-            hard,
-            subject=replace(tube, opacity=0.22, brightness=0.42, texture=0.08, specular=0.03, tip_glow=0.03),
-            backdrop=Backdrop(brightness=0.22, gradient=0.0, texture=0.08),
-        ),
-        "dark_tube": replace(
-            hard,
-            subject=replace(tube, opacity=0.75, brightness=0.10, texture=0.2, specular=0.08, tip_glow=0.02),
-            backdrop=Backdrop(brightness=0.55, gradient=-0.1),
-        ),
-        "half_frame_exposure": replace(hard, exposure_fraction=0.5),
-        "contrast_reversal": replace(
-            hard,
-            subject=replace(tube, opacity=0.65, brightness=0.42, specular=0.05),
-            backdrop=Backdrop(brightness=0.42, gradient=0.55),
-        ),
-        "shake": replace(hard, shake_px=0.8),
-        "reflections": replace(hard, subject=replace(tube, specular=0.5, reflection=0.3)),
-        "noisy": replace(hard, sensor=Sensor(full_well_e=1500, read_noise_e=35)),
-        "strong_tail": replace(hard, subject=replace(tube, tail_texture=0.6, tail_opacity=0.6, opacity=0.3)),
-        "diagonal": _camera_like(replace(demo, camera=Camera(width_px=640, height_px=640), growth_angle_deg=37.0)),
-        "downward": _camera_like(replace(demo, camera=Camera(width_px=320, height_px=960), growth_angle_deg=90.0)),
-        "payload": replace(hard, subject=replace(tube, payload_diameter_m=0.014)),
+        "door": hard(door=Door(brightness=0.85, length_m=0.05, thickness_m=0.006, swing_s=0.03)),
+        "wobble": hard(subject=Tube(wobble_px=7.0)),
+        "flicker": hard(light=Light(flicker=0.15)),
+        "low_contrast": hard(subject=faint, backdrop=Backdrop(brightness=0.22, gradient=0.0, texture=0.08)),
+        "dark_tube": hard(subject=dark, backdrop=Backdrop(brightness=0.55, gradient=-0.1)),
+        "half_frame_exposure": hard(exposure_fraction=0.5),
+        "contrast_reversal": hard(subject=Tube(opacity=0.65, brightness=0.42, specular=0.05), backdrop=bright_wall),
+        "shake": hard(shake_px=0.8),
+        "reflections": hard(subject=Tube(specular=0.5, reflection=0.3)),
+        "noisy": hard(sensor=Sensor(full_well_e=1500, read_noise_e=35)),
+        "strong_tail": hard(subject=Tube(tail_texture=0.6, tail_opacity=0.6, opacity=0.3)),
+        "diagonal": hard(camera=Camera(width_px=640, height_px=640), growth_angle_deg=37.0),
+        "downward": hard(camera=Camera(width_px=320, height_px=960), growth_angle_deg=90.0),
+        "payload": hard(subject=Tube(payload_diameter_m=0.014)),
         "light_stream": replace(demo, encoding=Encoding(crf=26, gop=250)),
-        "twelve_bit": replace(demo, sensor=Sensor(bit_depth=12), encoding=Encoding(codec="ffv1")),
-        "colour": replace(hard, sensor=Sensor(colour=True)),
+        "twelve_bit": replace(demo, sensor=Sensor(bit_depth=12), encoding=lossless),
+        "colour": hard(sensor=Sensor(colour=True)),
         "falling_ball": ball,
-        "dark_ball": replace(
-            ball,
-            subject=Ball(brightness=0.06, texture=0.2, specular=0.8),
-            backdrop=Backdrop(brightness=0.07, gradient=-0.04, texture=0.3, launcher=False),
-        ),
+        "dark_ball": replace(ball, subject=Ball(brightness=0.06, texture=0.2, specular=0.8), backdrop=dark_wall),
     }
-
-
-def preset(name: str) -> Scene:
-    """Return a scene by name, of those in `_presets`."""
-    scenes = _presets()
     if name not in scenes:
         raise ValueError(f"No scene is called {name!r}; choose one of {', '.join(scenes)}.")
     return scenes[name]

@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,17 +36,16 @@ class GroundTruth:
     pressures.
     """
 
-    effects: tuple[str, ...] = BASE_EFFECTS
+    effects: Sequence[str] = BASE_EFFECTS
     values: Mapping[str, Value] = field(default_factory=dict)
     damping_scatter: float = 0.03
     pressure_scatter: float = 0.01
     yield_error_kPa: float = 0.0
     noise_m: float = 1e-4
     noise_correlation: float = 0.0
-    release_frames: tuple[int, int] = (15, 40)
+    release_frames: Sequence[int] = (15, 40)
     frames_after_end: int = 4
     longest_frames: int = 12_000
-    origin_m: tuple[float, float] = (-0.05, 0.05)
     trace_sigma_kPa: float | None = None
     seed: int = 0
 
@@ -58,12 +56,8 @@ class GroundTruth:
 
 def read_ground_truth(path: Path) -> GroundTruth:
     """Read a ground truth from YAML, whose keys are the fields of `GroundTruth` and `filming`, which is ignored."""
-    content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
-    content.pop("filming", None)
-    for key in ("effects", "release_frames", "origin_m"):
-        if key in content:
-            content[key] = tuple(content[key])
-    return GroundTruth(**content)
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return GroundTruth(**{key: content[key] for key in content if key != "filming"})
 
 
 @dataclass(frozen=True)
@@ -107,7 +101,7 @@ def grow(trials: Sequence[Trial], truth: GroundTruth) -> list[VirtualTrial]:
         if moved[i].status == "ended":
             stop = min(stop, int(np.searchsorted(times[i] - release[i], moved[i].end_time_s)) + truth.frames_after_end)
         own_model = model.with_values(dict(zip(model.parameter_names, theta[i].tolist(), strict=True)))
-        origin_m = draw.uniform(*truth.origin_m)
+        origin_m = draw.uniform(-0.05, 0.05)  # a track's zero of position is arbitrary
         noise_m = ar1_noise(stop, truth.noise_m, truth.noise_correlation, draw)
         time_s, lead_m = times[i][:stop], moved[i].lead_position_m[:stop]
         gauge_Pa = None
@@ -167,17 +161,11 @@ class Vine:
     ) -> Trial:
         """Make one trial with this vine."""
         return Trial(
-            name=name,
-            capture_fps=capture_fps,
-            diameter_m=self.diameter_mm / 1e3,
-            thickness_m=self.thickness_um / 1e6,
-            length_m=self.length_mm / 1e3,
-            pressure_Pa=pressure_kPa * 1e3,
-            pressure_sigma_Pa=10.0 * pressure_kPa,
-            yield_pressure_Pa=self.yield_pressure_kPa * 1e3,
-            yield_pressure_sigma_Pa=200.0,
-            payload_kg=payload_g / 1e3,
-        )
+            name=name, capture_fps=capture_fps, payload_kg=payload_g / 1e3,
+            diameter_m=self.diameter_mm / 1e3, thickness_m=self.thickness_um / 1e6, length_m=self.length_mm / 1e3,
+            pressure_Pa=pressure_kPa * 1e3, pressure_sigma_Pa=10.0 * pressure_kPa,
+            yield_pressure_Pa=self.yield_pressure_kPa * 1e3, yield_pressure_sigma_Pa=200.0,
+        )  # fmt: skip
 
 
 def isometric_vine(scale: int) -> Vine:
