@@ -307,33 +307,28 @@ def draw_paper_damping(points: pd.DataFrame, damping: Mapping[str, Any]) -> Figu
     axes = fig.subplots(1, 2, sharex=True, sharey=True)
     for ax, part, (method, x, y, _, title) in zip(axes, steady, panels, strict=True):
         law = damping.get(method) or {}
-        _draw_force_panel(ax, part, x, y, law)
+        ax.set(xscale="log", yscale="log", xlabel="steady tail speed x_ss (m/s)")
+        for i, (scale, B) in enumerate(published.DAMPING_B.items()):
+            of_scale, colour = part[part["scale"] == scale], st.VINE_COLOURS[i]
+            if not len(of_scale):
+                continue
+            fitted = (law.get("vines") or {}).get(str(of_scale["vine"].iloc[0])) or {}
+            label = f"R = {scale}: B {number(fitted.get('B'))}, printed {B:g}; N = {len(of_scale)}"
+            style: dict[str, Any] = {"mfc": st.PAPER, "mec": colour, "ms": 5, "mew": 1.1, "ls": "none"}
+            ax.plot(of_scale[x], of_scale[y], st.VINE_MARKERS[i], label=label, **style)
+            span = np.geomspace(float(of_scale[x].min()) / 1.2, float(of_scale[x].max()) * 1.2, 50)
+            printed = "printed B and n" if scale == max(published.DAMPING_B) else None
+            ax.plot(span, B * span**published.EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
+            if fitted and law.get("n"):
+                ax.plot(span, fitted["B"] * span ** law["n"], color=colour, lw=1.4)
         n = with_interval(law.get("n"), law.get("n_95"))
         ax.set_title(f"{title}\nn = {n}, printed {published.EXPONENT:g}", fontsize=10.5)
-        ax.set_xlabel("steady tail speed x_ss (m/s)")
     axes[0].set_ylabel("growth force above yield (N)")
     for ax in axes:
         st.plain_log_ticks(ax)
         if ax.get_legend_handles_labels()[0]:
             ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, fontsize=9)
     return fig
-
-
-def _draw_force_panel(ax: Axes, points: pd.DataFrame, x: str, y: str, law: Mapping[str, Any]) -> None:
-    ax.set(xscale="log", yscale="log")
-    for i, (scale, B) in enumerate(published.DAMPING_B.items()):
-        part = points[points["scale"] == scale]
-        if not len(part):
-            continue
-        colour = st.VINE_COLOURS[i]
-        fitted = (law.get("vines") or {}).get(str(part["vine"].iloc[0])) or {}
-        label = f"R = {scale}: B {number(fitted.get('B'))}, printed {B:g}; N = {len(part)}"
-        ax.plot(part[x], part[y], st.VINE_MARKERS[i], mfc=st.PAPER, mec=colour, ms=5, mew=1.1, ls="none", label=label)
-        span = np.geomspace(float(part[x].min()) / 1.2, float(part[x].max()) * 1.2, 50)
-        printed = "printed B and n" if scale == max(published.DAMPING_B) else None
-        ax.plot(span, B * span**published.EXPONENT, color=st.INK, lw=1.2, ls=st.DASHED, label=printed)
-        if fitted and law.get("n"):
-            ax.plot(span, fitted["B"] * span ** law["n"], color=colour, lw=1.4)
 
 
 @figure("paper_fig4", "paper", "Fig. 4: the leading edge with the payload", data="paper_motions.csv")
@@ -357,7 +352,12 @@ def draw_paper_position(
         curves = _by_departure(motions)
         _draw_departures(ax, curves)
         if len(mean):
-            _draw_mean(ax, mean)
+            n_trials, mean = int(mean["n_trials"].iloc[0]), st.thinned(mean, 40)
+            time_s, position_cm = st.column(mean, "time_s"), st.column(mean, "lead_position_m", 100)
+            sigma_cm = np.nan_to_num(st.column(mean, "lead_position_sigma_m", 100))
+            st.band(ax, time_s, position_cm - sigma_cm, position_cm + sigma_cm, st.BLUE, 0.2)
+            label = f"mean of {n_trials} trials,\n± one trial's scatter"
+            ax.plot(time_s, position_cm, "o", color=st.BLUE, ms=3.2, mec=st.MUTED, mew=0.3, label=label)
         # Slower motions are cut off.
         ax.set(xlabel="time since release (s)", xlim=(0, 1.9 * float(curves["eq2"]["time_s"].iloc[-1])))
         ours = f"ours {100 * errors['rms_mean_m'].iloc[0]:.2f} cm" if len(errors) else "not among the trials"
@@ -397,15 +397,6 @@ def _draw_departures(ax: Axes, curves: Mapping[str, pd.DataFrame]) -> None:
     ):
         at = curves[name]["time_s"], 100 * curves[name]["lead_position_m"]
         ax.plot(*at, color=colour, lw=width, ls=line, label=label)
-
-
-def _draw_mean(ax: Axes, mean: pd.DataFrame) -> None:
-    part = st.thinned(mean, 40)
-    time_s, position_cm = st.column(part, "time_s"), st.column(part, "lead_position_m", 100)
-    sigma_cm = np.nan_to_num(st.column(part, "lead_position_sigma_m", 100))
-    st.band(ax, time_s, position_cm - sigma_cm, position_cm + sigma_cm, st.BLUE, 0.2)
-    label = f"mean of {int(mean['n_trials'].iloc[0])} trials,\n± one trial's scatter"
-    ax.plot(time_s, position_cm, "o", color=st.BLUE, ms=3.2, mec=st.MUTED, mew=0.3, label=label)
 
 
 @figure("paper_reservoir", "paper", "Pressure lost by a chamber", data="paper_pressures.csv")

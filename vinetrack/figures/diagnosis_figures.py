@@ -240,8 +240,26 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
     n_columns = min(len(panels), 3)
     fig = st.new_figure(1.0 + 3.2 * n_columns, 0.9 + 2.6 * math.ceil(len(panels) / n_columns))
     for ax, (parameter, against) in zip(st.panel_grid(fig, len(panels), n_columns), panels, strict=True):
-        chosen = known[(known["parameter"] == parameter) & (known["against"] == against)]
-        _draw_drift_panel(ax, chosen, str(against), markers)
+        groups = known[(known["parameter"] == parameter) & (known["against"] == against)]
+        name, unit, factor = drift_condition(str(against))
+        names, by_vine = list(dict.fromkeys(groups["vine"])), against == "vine"
+        for model, (colour, line, offset) in _MODELS.items():
+            of_model = groups[groups["model"] == model]
+            for vine, of_vine in [("", of_model)] if by_vine else of_model.groupby("vine", sort=False):
+                ordered = of_vine.sort_values("level")
+                places = [names.index(one) + offset for one in ordered["vine"]]
+                x = places if by_vine else st.column(ordered, "level", factor)
+                style: dict[str, Any] = {"color": colour, "marker": markers[str(vine)], "ms": 5, "elinewidth": 1.0}
+                style |= {"lw": 1.1, "ls": "none" if by_vine else line}
+                ax.errorbar(x, ordered["ratio"], ordered["ratio_sigma"], **style)
+        ax.axhline(1, color=st.INK, lw=0.8)
+        count = int(groups.loc[groups["model"] == groups["model"].iloc[0], "n_trials"].sum())
+        st.small_title(ax, f"{groups['symbol'].iloc[0]} against {name}, N = {count}", fontsize=9.5)
+        ax.set_xlabel(f"{name} ({unit})" if unit else name, fontsize=10)
+        if by_vine:
+            ax.set_xticks(range(len(names)), names, fontsize=8)
+            ax.margins(x=0.25)
+        ax.locator_params(axis="y", nbins=5)
     fig.supylabel("value / common law", fontsize=11)
     handles = [
         st.line_key(f"{model}: with {added}" if model == "after" and added else model, color=colour, marker="o", ms=5)
@@ -251,29 +269,6 @@ def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
     handles += [st.line_key(vine, color=st.MUTED, marker=markers[vine], ls="none") for vine in vines]
     st.page_legend(fig, handles[:10], min(len(handles), 4))
     return fig
-
-
-def _draw_drift_panel(ax: Axes, groups: pd.DataFrame, against: str, markers: dict[str, str]) -> None:
-    name, unit, factor = drift_condition(against)
-    names = list(dict.fromkeys(groups["vine"]))
-    by_vine = against == "vine"
-    for model, (colour, line, offset) in _MODELS.items():
-        of_model = groups[groups["model"] == model]
-        for vine, of_vine in [("", of_model)] if by_vine else of_model.groupby("vine", sort=False):
-            ordered = of_vine.sort_values("level")
-            places = np.array([names.index(name) for name in ordered["vine"]], dtype=float) + offset
-            x = places if by_vine else st.column(ordered, "level", factor)
-            style: dict[str, Any] = {"color": colour, "marker": markers.get(str(vine), "o"), "ms": 5, "elinewidth": 1.0}
-            ls = "none" if by_vine else line
-            ax.errorbar(x, ordered["ratio"], ordered["ratio_sigma"], lw=1.1, ls=ls, **style)
-    ax.axhline(1, color=st.INK, lw=0.8)
-    count = int(groups.loc[groups["model"] == groups["model"].iloc[0], "n_trials"].sum())
-    st.small_title(ax, f"{groups['symbol'].iloc[0]} against {name}, N = {count}", fontsize=9.5)
-    ax.set_xlabel(f"{name} ({unit})" if unit else name, fontsize=10)
-    if by_vine:
-        ax.set_xticks(range(len(names)), names, fontsize=8)
-        ax.margins(x=0.25)
-    ax.locator_params(axis="y", nbins=5)
 
 
 # ------------------------------------------------------------------------------
@@ -287,6 +282,8 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     are written where the misfit exceeds twice its standard error from replicate scatter. A pattern common to all
     conditions, or growing towards one pressure, is systematic; isolated patches are chance.
     """
+    from matplotlib.patches import Rectangle
+
     names = {"misfit_before_m": "before", "misfit_after_m": f"after: with {added}" if added else "after"}
     shown = [c for c in names if len(where) and np.isfinite(st.column(where, c)).any()]
     if not shown:
@@ -302,9 +299,21 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
     fig = st.new_figure(2.6 + 4.3 * len(shown), 0.3 * len(labels) + 1.75)
     axes = fig.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for ax, name in zip(axes, shown, strict=True):
-        _draw_cells(ax, where.assign(misfit_mm=st.column(where, name, 1e3)), labels, full_mm, numbered)
+        table = where.assign(misfit_mm=st.column(where, name, 1e3))
+        for row in st.rows(table[table["condition_label"].isin(labels) & np.isfinite(table["misfit_mm"])]):
+            y = labels.index(row.condition_label)
+            left, width = 100 * row.growth_from, 100 * (row.growth_to - row.growth_from)
+            # Cells become transparent with decreasing misfit, so that the page shows through.
+            depth, colour = min(abs(row.misfit_mm) / full_mm, 1.0), AHEAD if row.misfit_mm > 0 else BEHIND
+            ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, facecolor=colour, alpha=0.85 * depth, lw=0))
+            beyond = not abs(row.misfit_mm) <= 2e3 * row.scatter_m  # an unknown scatter (NaN) explains no misfit
+            if numbered and beyond and depth > 0.06:
+                words = st.with_minus(row.misfit_mm, "+.0f" if abs(row.misfit_mm) >= 9.95 else "+.1f")
+                ax.text(left + width / 2, y, words, ha="center", va="center", fontsize=7.5, color=st.INK)
+        ax.set(xlim=(0, 100), ylim=(len(labels) - 0.45, -0.55), xlabel="along the growth (%)")
+        ax.grid(visible=False)
+        ax.tick_params(axis="y", length=0)
         ax.set_title(names[name], fontsize=10)
-        ax.set_xlabel("along the growth (%)")
     axes[0].set_yticks(range(len(labels)), [f"{label}, N = {int(counts[label])}" for label in labels], fontsize=9)
     words = f"full colour: {full_mm:.2g} mm{'; numbers in mm, where beyond scatter' if numbered else ''}"
     handles = [
@@ -317,27 +326,6 @@ def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
         handles.append(st.patch_key(words, "none"))
     st.page_legend(fig, handles, 3 if len(shown) > 1 else 2, handlelength=1.3)
     return fig
-
-
-def _draw_cells(ax: Axes, table: pd.DataFrame, labels: Sequence[str], full_mm: float, numbered: bool) -> None:
-    """One row of cells a condition; they become transparent with decreasing misfit, so that the page shows through."""
-    from matplotlib.patches import Rectangle
-
-    for row in st.rows(table):
-        if row.condition_label not in labels or not np.isfinite(row.misfit_mm):
-            continue
-        y = labels.index(row.condition_label)
-        left, width = 100 * row.growth_from, 100 * (row.growth_to - row.growth_from)
-        depth = min(abs(row.misfit_mm) / full_mm, 1.0)
-        cell: dict[str, Any] = {"facecolor": AHEAD if row.misfit_mm > 0 else BEHIND, "alpha": 0.85 * depth, "lw": 0}
-        ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, **cell))
-        beyond = not abs(row.misfit_mm) <= 2e3 * row.scatter_m  # an unknown scatter (NaN) explains no misfit
-        if numbered and beyond and depth > 0.06:
-            words = st.with_minus(row.misfit_mm, "+.0f" if abs(row.misfit_mm) >= 9.95 else "+.1f")
-            ax.text(left + width / 2, y, words, ha="center", va="center", fontsize=7.5, color=st.INK)
-    ax.set(xlim=(0, 100), ylim=(len(labels) - 0.45, -0.55))
-    ax.grid(visible=False)
-    ax.tick_params(axis="y", length=0)
 
 
 # Quantities that the force may depend on: label, and factor from SI
@@ -394,32 +382,29 @@ def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
         return None
     on_grid = learned_force["condition"].fillna("") == ""
     grid, along = learned_force[on_grid], learned_force[~on_grid]
-    if len(variables) == 1:
-        fig, ax = st.one_panel(6.4, 3.6)
-        _draw_curve(ax, grid, along, variables[0])
-        st.page_legend(fig, None, 3)
+    conditions = f"N = {along['condition'].nunique()} conditions"
+    if len(variables) == 2:
+        fig = st.new_figure(9.6, 4.4)
+        left, right = fig.subplots(1, 2, sharex=True, sharey=True)
+        _draw_map(left, grid, along, variables, "force_N", "missing force (N)")
+        _draw_map(right, grid, along, variables, "sigma_N", "its standard error (N)")
+        st.small_title(left, f"grey: trials, {conditions}", color=st.MUTED)
+        right.set_ylabel("")
         return fig
-    fig = st.new_figure(9.6, 4.4)
-    left, right = fig.subplots(1, 2, sharex=True, sharey=True)
-    _draw_map(left, grid, along, variables, "force_N", "missing force (N)")
-    _draw_map(right, grid, along, variables, "sigma_N", "its standard error (N)")
-    st.small_title(left, f"grey: trials, N = {along['condition'].nunique()} conditions", color=st.MUTED)
-    right.set_ylabel("")
-    return fig
-
-
-def _draw_curve(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variable: str) -> None:
+    (variable,) = variables
     words, factor = _FORCE_AXES[variable]
+    fig, ax = st.one_panel(6.4, 3.6, xlabel=words, ylabel="missing force (N)")
     seen = grid[grid["trials"] > 0].sort_values(variable)
     at, force, half = st.column(seen, variable, factor), st.column(seen, "force_N"), st.column(seen, "sigma_N", 1.96)
     st.band(ax, at, force - half, force + half, st.BLUE, label="95 % band")
     ax.plot(at, force, color=st.BLUE, lw=1.8, label="learned force")
     ax.axhline(0, color=st.INK, lw=0.8)
     places, across = st.column(along, variable, factor), ax.get_xaxis_transform()
-    label = f"range of the trials, N = {along['condition'].nunique()} conditions"
+    label = f"range of the trials, {conditions}"
     ax.plot(places, np.full(places.size, 0.02), "|", color=st.MUTED, ms=6, transform=across, label=label)
-    ax.set(xlabel=words, ylabel="missing force (N)")
     ax.margins(x=0.01)
+    st.page_legend(fig, None, 3)
+    return fig
 
 
 def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list[str], name: str, label: str) -> None:

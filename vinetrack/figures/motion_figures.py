@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 @figure("overview", "damping", "All trials at a glance", data="trials.csv")
 def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure | None:
     """Speed of the leading edge against growth, replicates superposed. Thick: the steady window of the gated rule."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
     max_panels = 120  # Chosen: twelve rows of ten panels; further vines are left out, and the title says so
     shown = trials[trials["status"] != "left_out"]
     tables = {name: kinematics[name] for name in shown["trial"] if len(kinematics.get(name, ())) > 1}
@@ -54,11 +57,33 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     row_in = min(max(0.72 * 11.0 / n_columns, 1.15), 3.6)
     fig = st.new_figure(11.0, math.ceil(len(panels) / n_columns) * row_in + 1.15)
     axes = st.panel_grid(fig, len(panels), n_columns, sharex=True, sharey=not by_condition)
-    colours = _colours(fig, shown, by_condition)
+    colours: dict[str, Any] = {}
+    if by_condition:
+        styles = st.vine_styles(shown["vine"])
+        colours = {row.trial: styles[row.vine].colour for row in st.rows(shown)}
+    else:
+        scale = ScalarMappable(Normalize(shown["pressure_kPa"].min(), shown["pressure_kPa"].max()), "cividis")
+        bar = fig.colorbar(scale, ax=fig.axes, fraction=0.02, pad=0.01, aspect=40)
+        bar.set_label("pressure (kPa)")
+        bar.outline.set_visible(False)
+        colours = {row.trial: scale.to_rgba(row.pressure_kPa) for row in st.rows(shown)}
     for ax, (label, part) in zip(axes, panels, strict=True):
-        _draw_panel(ax, label, part, curves, colours, font)
+        drawn = part[part["trial"].isin(curves)]
+        for row in st.rows(drawn):
+            curve, colour = curves[row.trial], colours[row.trial]
+            ax.plot(curve["growth_mm"], curve["lead_velocity_m_s"], color=colour, lw=0.8, alpha=0.5)
+            steady = curve[curve["time_s"].between(row.steady_from_s, row.steady_to_s)]
+            if len(steady) > 1:
+                at = steady["growth_mm"], steady["lead_velocity_m_s"]
+                ax.plot(*at, color=colour, lw=2.2, solid_capstyle="butt")
+        words = textwrap.shorten(label, 30, placeholder="…") if font > 8 else label
+        st.small_title(ax, words, fontsize=font, pad=3)
+        st.corner_text(ax, 0.98, 0.05, f"N = {len(part)}", ha="right", fontsize=font - 1)
+        if n_failed := int((part["status"] == "failed").sum()):
+            st.corner_text(ax, 0.98, 0.2, f"{n_failed} failed", ha="right", fontsize=font - 1, color=st.VERMILLION)
+        st.small_ticks(ax, font - 0.5)
         if by_condition:
-            _limit_speed(ax, [curves[name] for name in part["trial"] if name in curves])
+            _limit_speed(ax, [curves[name] for name in drawn["trial"]])
     for ax in axes[-n_columns:]:
         ax.tick_params(labelbottom=True)
     axes[0].set_xlim(0, 1.02 * max(float(curve["growth_mm"].max()) for curve in curves.values()))
@@ -71,46 +96,6 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     title += f"; the first {max_panels} panels" if len(panels) == max_panels else ""
     st.page_labels(fig, "growth (mm)", "leading-edge speed (m/s)", title)
     return fig
-
-
-def _colours(fig: Figure, trials: pd.DataFrame, by_condition: bool) -> dict[str, Any]:
-    """Colour of each trial: that of its vine, or by pressure, with a bar of colours beside the panels."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    if by_condition:
-        styles = st.vine_styles(trials["vine"])
-        return {row.trial: styles[row.vine].colour for row in st.rows(trials)}
-    scale = ScalarMappable(Normalize(trials["pressure_kPa"].min(), trials["pressure_kPa"].max()), "cividis")
-    bar = fig.colorbar(scale, ax=fig.axes, fraction=0.02, pad=0.01, aspect=40)
-    bar.set_label("pressure (kPa)")
-    bar.outline.set_visible(False)
-    return {row.trial: scale.to_rgba(row.pressure_kPa) for row in st.rows(trials)}
-
-
-def _draw_panel(
-    ax: Axes,
-    label: str,
-    trials: pd.DataFrame,
-    curves: Mapping[str, pd.DataFrame],
-    colours: Mapping[str, Any],
-    font: float,
-) -> None:
-    for row in st.rows(trials):
-        if row.trial not in curves:
-            continue
-        curve, colour = curves[row.trial], colours[row.trial]
-        ax.plot(curve["growth_mm"], curve["lead_velocity_m_s"], color=colour, lw=0.8, alpha=0.5)
-        steady = curve[(curve["time_s"] >= row.steady_from_s) & (curve["time_s"] <= row.steady_to_s)]
-        if len(steady) > 1:
-            at = steady["growth_mm"], steady["lead_velocity_m_s"]
-            ax.plot(*at, color=colour, lw=2.2, solid_capstyle="butt")
-    st.small_title(ax, textwrap.shorten(label, 30, placeholder="…") if font > 8 else label, fontsize=font, pad=3)
-    st.corner_text(ax, 0.98, 0.05, f"N = {len(trials)}", ha="right", fontsize=font - 1)
-    if n_failed := int((trials["status"] == "failed").sum()):
-        st.corner_text(ax, 0.98, 0.2, f"{n_failed} failed", ha="right", fontsize=font - 1, color=st.VERMILLION)
-    ax.tick_params(labelsize=font - 0.5, colors=st.INK)
-    ax.locator_params(nbins=4)
 
 
 def _limit_speed(ax: Axes, curves: Sequence[pd.DataFrame], logarithmic: bool = False) -> None:
@@ -164,23 +149,19 @@ def draw_trial_motion(
     lead.set_title(title, pad=8, fontsize=st.fitting_size(title, 0.8 * 72 * 7.2, 11))
     _draw_speed(speed, kinematics, windows, travel_ratio)
     _draw_strip(strip, windows)
-    _share_ticks(strip, (lead, speed))
-    for i, (colour, line) in enumerate(notes):
-        fig.text(0.012, (text_in - 0.05 - i * line_in) / height_in, line, color=colour, fontsize=8.8, va="top")
-    return fig
-
-
-def _share_ticks(below: Axes, above: Sequence[Axes]) -> None:
-    """Draw the ticks of an axis in the panels above it; tick by tick, matplotlib would take a tenth of the figure."""
-    low, high = below.get_xlim()
-    ticks = [tick for tick in below.get_xticks() if low <= tick <= high]
-    below.set_xlim(low, high)
-    for ax in above:
+    # Ticks of the strip in the panels above; tick by tick, matplotlib would take a tenth of the figure.
+    low, high = strip.get_xlim()
+    ticks = [tick for tick in strip.get_xticks() if low <= tick <= high]
+    strip.set_xlim(low, high)
+    for ax in (lead, speed):
         ax.xaxis.set_visible(False)
         across = ax.get_xaxis_transform()
         ax.vlines(ticks, 0, 1, color=st.GRID, lw=0.7, zorder=0.5, transform=across)
-        outside: dict[str, Any] = {"transform": across, "clip_on": False}
-        ax.plot(ticks, [0] * len(ticks), ls="none", marker=3, ms=3.5, mew=0.8, color=st.INK, **outside)
+        style: dict[str, Any] = {"marker": 3, "ms": 3.5, "mew": 0.8, "color": st.INK, "clip_on": False}
+        ax.plot(ticks, [0] * len(ticks), ls="none", transform=across, **style)
+    for i, (colour, line) in enumerate(notes):
+        fig.text(0.012, (text_in - 0.05 - i * line_in) / height_in, line, color=colour, fontsize=8.8, va="top")
+    return fig
 
 
 def _draw_position(
@@ -268,11 +249,10 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
     Release and origin are fitted for each trial; pressure and B are those of the fit. Each panel states the root
     mean square of model minus measurement, and in brackets its ratio to the replicate scatter.
     """
-    corner = {"x": 0.03, "y": 0.97, "ha": "left", "va": "top"}  # which the curve of growth leaves empty
-    return _model_panels(
-        comparison, trajectories, _draw_positions, corner, "time since release (ms)", "growth (mm)",
-        "; dashed: this model, full: with the effects that were added",
-    )  # fmt: skip
+    corner = (0.03, 0.97, "left", "top")  # which the curve of growth leaves empty
+    added = "; dashed: this model, full: with the effects that were added"
+    labels = "time since release (ms)", "growth (mm)"
+    return _model_panels(comparison, trajectories, _draw_positions, corner, *labels, added)
 
 
 @figure("model_residuals", "model", "Residuals of the model", data="comparison.csv", if_refuted=SHOWS_REFUTED)
@@ -281,33 +261,26 @@ def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd
     standard deviation of the replicates. With a complete model the lines cross zero within the band; a bend that
     all trials of a panel share, or that grows with pressure, shows a missing effect.
     """
-    corner = {"x": 0.98, "y": 0.03, "ha": "right", "va": "bottom"}  # where residuals get extra room
-    return _model_panels(
-        comparison, trajectories, _draw_residuals, corner, "growth (mm)", "measurement − model (mm)", ""
-    )
+    corner = (0.98, 0.03, "right", "bottom")  # where residuals get extra room
+    labels = "growth (mm)", "measurement − model (mm)"
+    return _model_panels(comparison, trajectories, _draw_residuals, corner, *labels, "")
 
 
 def _model_panels(
-    comparison: pd.DataFrame,
-    trajectories: Mapping[str, pd.DataFrame],
-    draw: Callable[[Axes, list[pd.DataFrame], str], None],
-    corner: dict[str, Any],
-    x_label: str,
-    y_label: str,
-    if_added: str,
-) -> Figure | None:
+    comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame],
+    draw: Callable[[Axes, list[pd.DataFrame], str], None], corner: tuple[float, float, str, str], x_label: str,
+    y_label: str, if_added: str,
+) -> Figure | None:  # fmt: skip
     known = [row for row in st.rows(comparison) if row.condition in trajectories]
     farthest = sorted(known, key=lambda row: -np.nan_to_num(row.rms_position_m))[:60]  # in rows of eight, 1.4 in wide
-    chosen = {row.condition for row in farthest}
-    shown = [row for row in known if row.condition in chosen]
+    shown = [row for row in known if row in farthest]
     if not shown:
         return None
     n_columns = st.page_columns(len(shown), 8)
     n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
     n_points = min(max(12_000 // n_trials, 25), 150)
     styles = st.vine_styles([row.vine for row in shown])
-    font = st.panel_font(n_columns)
-    panel_in = min(11.0 / n_columns, 6.0)
+    font, panel_in, (x, y, ha, va) = st.panel_font(n_columns), min(11.0 / n_columns, 6.0), corner
     row_in = min(max(0.78 * panel_in, 1.35), 3.6)
     fig = st.new_figure(n_columns * panel_in, math.ceil(len(shown) / n_columns) * row_in + 0.95)
     for ax, row in zip(st.panel_grid(fig, len(shown), n_columns), shown, strict=True):
@@ -317,12 +290,10 @@ def _model_panels(
         st.small_title(ax, label, fontsize=st.fitting_size(label, 72 * (panel_in - 0.45), font, bold=False), pad=3)
         times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
         words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {len(parts)}"
-        st.corner_text(ax, words=words, fontsize=font - 1.5, **corner)
-        ax.tick_params(labelsize=font - 0.5, colors=st.INK)
-        ax.locator_params(nbins=4)
+        st.corner_text(ax, x, y, words, ha=ha, va=va, fontsize=font - 1.5)
+        st.small_ticks(ax, font - 0.5)
     title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
-    if "model_after_m" in trajectories[shown[0].condition]:
-        title += if_added
+    title += if_added if "model_after_m" in trajectories[shown[0].condition] else ""
     if len(known) > len(shown):
         title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
     st.page_labels(fig, x_label, y_label, textwrap.fill(title, int(n_columns * panel_in * 11)))

@@ -74,16 +74,15 @@ def _draw_kymograph(ax: Axes, tracking: Tracking) -> None:
     edge, by_hand = track.edge_px, hand_corrected(track.flag)
     odd = with_flag(track.flag, *set(FLAGS) - {"before_release"}) & ~by_hand
     fine = ~odd & ~by_hand & np.isfinite(edge)
-    ax.plot(edge[fine], time_ms[fine], color=st.ORANGE, linewidth=1.0, label=f"leading edge, N = {int(fine.sum())}")
+    ax.plot(edge[fine], time_ms[fine], color=st.ORANGE, lw=1.0, label=f"leading edge, N = {fine.sum()}")
     if odd.any():
-        shown = odd & np.isfinite(edge)
-        label = f"flagged, N = {int(odd.sum())}"
-        ax.plot(edge[shown], time_ms[shown], "x", color=st.SKY, markersize=4, markeredgewidth=1.1, label=label)
+        at = edge[odd & np.isfinite(edge)], time_ms[odd & np.isfinite(edge)]
+        ax.plot(*at, "x", color=st.SKY, ms=4, mew=1.1, label=f"flagged, N = {odd.sum()}")
     if by_hand.any():
         before = edge if track.tracked_px is None else track.tracked_px
-        ax.plot(before[by_hand], time_ms[by_hand], "+", color=st.SKY, markersize=5, markeredgewidth=1.0)
-        label = f"corrected by hand, N = {int(by_hand.sum())}"
-        ax.plot(edge[by_hand], time_ms[by_hand], "o", color=st.GREEN, markersize=4, fillstyle="none", label=label)
+        ax.plot(before[by_hand], time_ms[by_hand], "+", color=st.SKY, ms=5, mew=1.0)
+        label = f"corrected by hand, N = {by_hand.sum()}"
+        ax.plot(edge[by_hand], time_ms[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", label=label)
     ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)" if timed else "frame")
     ax.grid(visible=False)
 

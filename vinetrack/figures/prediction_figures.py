@@ -39,8 +39,8 @@ def draw_choice(choices: Sequence[Choice]) -> Figure:
         curves.plot(diameter_mm, final.median, marker, color=colour, ms=8, clip_on=False)
         bars.plot([k, k], [final.low, final.high], color=colour, lw=9, alpha=0.35, solid_capstyle="butt")
         bars.plot(k, final.median, marker, color=colour, ms=8)
-        style: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 10}
-        bars.annotate(f"{choice.odds:.0%}", (k, final.high), (0, 5), **style)
+        at = (k, final.high), (0, 5)
+        bars.annotate(f"{choice.odds:.0%}", *at, textcoords="offset points", ha="center", fontsize=10)
     final = choices[0].prediction.final
     label = f"{final.name} (m/s)" if final.y_over_L == 1 else f"{final.name}\nat y/L = {final.y_over_L:g} (m/s)"
     fastest = max(choice.prediction.final.high for choice in choices)
@@ -62,8 +62,8 @@ def draw_reservoir(
     """Draw the part of its gauge pressure that a closed chamber loses to a vine. Shapes (n_volumes,)."""
     # Below 10 mL the axis is in millilitres, so that its ticks need no exponent.
     factor, unit = (1e3, "L") if volumes_m3[0] >= 1e-5 else (1e6, "mL")
-    fig = st.new_figure(7.2, 4.4)
-    ax = fig.subplots()
+    fig, ax = st.one_panel(7.2, 4.4, xscale="log", ylabel="gauge pressure lost (%)")
+    ax.set_xlabel(f"volume of the chamber ({unit}); of the grown vine {factor * swept_m3:.3g} {unit}")
     for (law, lost), colour, style in zip(losses.items(), (st.BLUE, st.VERMILLION), ("-", st.DASHED), strict=True):
         ax.plot(factor * volumes_m3, 100 * lost, color=colour, ls=style, label=law)
     slow, fast = losses.values()
@@ -76,10 +76,8 @@ def draw_reservoir(
         ax.axvline(factor * chosen_m3, color=st.MUTED, lw=1.2)
         at = (factor * chosen_m3, 0.97), (5, 0), ("data", "axes fraction")
         ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", *at, va="top", **words)
-    ax.set(xscale="log", xlim=(factor * volumes_m3[0], factor * volumes_m3[-1]), ylim=(0.0, min(800 * loss, 100.0)))
+    ax.set(xlim=(factor * volumes_m3[0], factor * volumes_m3[-1]), ylim=(0.0, min(800 * loss, 100.0)))
     st.plain_log_ticks(ax, "x")
-    ax.set_xlabel(f"volume of the chamber ({unit}); of the grown vine {factor * swept_m3:.3g} {unit}")
-    ax.set_ylabel("gauge pressure lost (%)")
     ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.9))
     return fig
 
@@ -118,16 +116,16 @@ def draw_predictions(predictions: Sequence[VinePrediction], titles: Sequence[str
 
 def _draw_curves(axes: np.ndarray, table: pd.DataFrame, colour: str) -> None:
     """Position against time; speed and tension against growth."""
-    position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
+    position, speed, tension = axes.flat[:3]
     y_mm, along = st.column(table, "lead_position_m", 1e3), st.column(table, "y_over_L")
-    times_ms = [st.column(table, name, 1e3) for name in ("time_low_90_s", "time_s", "time_high_90_s")]
+    low_ms, median_ms, high_ms = (st.column(table, name, 1e3) for name in ("time_low_90_s", "time_s", "time_high_90_s"))
     # The axis ends with the slow limit, but at most at four times the end of the median.
-    early, middle, late = (float(np.max(t[np.isfinite(t)], initial=0.0)) for t in times_ms)
+    early, middle, late = (float(np.max(t[np.isfinite(t)], initial=0.0)) for t in (low_ms, median_ms, high_ms))
     last = min(late, 4 * middle) if middle > 0 else early or 1.0
-    ends = [np.where(np.isfinite(t), t, last) for t in (times_ms[0], times_ms[2])]
+    ends = (np.where(np.isfinite(t), t, last) for t in (low_ms, high_ms))
     position.fill_betweenx(y_mm, *ends, color=colour, alpha=0.18, lw=0)
-    come = np.isfinite(times_ms[1])
-    position.plot(times_ms[1][come], y_mm[come], color=colour)
+    come = np.isfinite(median_ms)
+    position.plot(median_ms[come], y_mm[come], color=colour)
     position.set_xlim(0.0, max(last, position.get_xlim()[1] if position.lines[1:] else 0.0))
     for ax, name, unit in ((speed, "lead_velocity", "m_s"), (tension, "tension", "N")):
         low, high = (st.column(table, f"{name}_{side}_90_{unit}") for side in ("low", "high"))
@@ -136,14 +134,12 @@ def _draw_curves(axes: np.ndarray, table: pd.DataFrame, colour: str) -> None:
 
 
 def _label_prediction(axes: np.ndarray, drawn: Sequence[VinePrediction], at_fraction: float) -> None:
-    position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
-    position.set(xlabel="time since release (ms)", ylabel="leading edge y (mm)")
-    position.set_ylim(bottom=0.0)
+    position, speed, tension = axes.flat[:3]
+    position.set(xlabel="time since release (ms)", ylabel="leading edge y (mm)", ylim=(0.0, None))
     for ax, label in ((speed, "speed of the leading edge ẏ (m/s)"), (tension, "tension of the tail (N)")):
         ax.set(xlabel="growth y/L", ylabel=label, xlim=(0.0, 1.0))
         ax.axvline(at_fraction, color=st.MUTED, lw=0.9, ls=st.DASHED)
-    low, high = speed.get_ylim()
-    speed.set_ylim(max(low, 0.0), high)
+    speed.set_ylim(max(speed.get_ylim()[0], 0.0))
     at: dict[str, Any] = {"transform": speed.get_xaxis_transform(), "ha": "right", "fontsize": 9, "color": st.MUTED}
     speed.text(at_fraction - 0.015, 0.03, f"y/L = {at_fraction:g}", **at)
     lowest = min(prediction.curve["tension_low_90_N"].min() for prediction in drawn)

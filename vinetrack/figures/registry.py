@@ -110,7 +110,7 @@ def draw(name: str, tables: Any) -> Figure | None:
 
 class FigureTables:
     """The tables of a results folder by the names that figures give them; each is read when a figure first needs it.
-    Those of the diagnosis are empty if there is none; those named `paper…` are the files of that name.
+    Those of the diagnosis are empty if there is none; `damping`, `scaling` and `paper…` are the files of that name.
     """
 
     def __init__(self, folder: Path, known: tuple[Trial, ...]) -> None:
@@ -118,21 +118,13 @@ class FigureTables:
         self.known = known
 
     def __getattr__(self, name: str) -> Any:
+        if name in ("damping", "scaling"):
+            return read_json(self.results.folder / f"{name}.json")
         if name.startswith("paper"):
             return read_result(self.results.folder / f"{name}.csv")
         from vinetrack.figures.diagnosis_figures import DiagnosisTables
 
         return getattr(self.diagnosed or DiagnosisTables(), name)
-
-    @cached_property
-    def damping(self) -> dict[str, Any]:
-        """The damping law, `damping.json`."""
-        return read_json(self.results.damping)
-
-    @cached_property
-    def scaling(self) -> dict[str, Any]:
-        """Powers of the size, `scaling.json`."""
-        return read_json(self.results.scaling)
 
     @cached_property
     def points(self) -> pd.DataFrame:
@@ -151,11 +143,8 @@ class FigureTables:
     @cached_property
     def kinematics(self) -> dict[str, pd.DataFrame]:
         """Motion of every trial that is not left out, by name."""
-        return {name: read_result(self.results.kinematics(name)) for name in self._names}
-
-    @property
-    def _names(self) -> list[str]:
-        return self.trials.loc[self.trials["status"] != "left_out", "trial"].tolist()
+        names = self.trials.loc[self.trials["status"] != "left_out", "trial"]
+        return {name: read_result(self.results.kinematics(name)) for name in names}
 
     @cached_property
     def comparison(self) -> pd.DataFrame:

@@ -11,9 +11,8 @@ import math
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -45,8 +44,7 @@ RULE_COLOURS = {"gated": BLUE, "quasi_steady": PURPLE, "paper": VERMILLION, "use
 DASHED: Any = (0, (4, 2))  # Line of the second of two models, methods or laws
 
 
-@dataclass(frozen=True)
-class VineStyle:
+class VineStyle(NamedTuple):
     """Colour and marker of a vine, the same in every figure."""
 
     colour: str
@@ -212,6 +210,12 @@ def page_labels(fig: Figure, x_label: str, y_label: str, title: str) -> None:
 def small_title(ax: Axes, title: str, **style: Any) -> None:
     """Put a remark, rather than a heading, above the axes."""
     ax.set_title(title, **{"fontsize": 9, "fontweight": "normal", **style})
+
+
+def small_ticks(ax: Axes, size: float) -> None:
+    """Make the labels of both axes of a small panel few and small."""
+    ax.tick_params(labelsize=size, colors=INK)
+    ax.locator_params(nbins=4)
 
 
 def corner_text(ax: Axes, x: float, y: float, words: str, **style: Any) -> None:
