@@ -130,8 +130,7 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
     subject, capture_fps = scene.subject, stated.capture_fps
     if isinstance(subject, Tube):
         payload_m = 0.6 * stated.diameter_m if stated.payload_kg > 0 else 0.0
-        size = {"diameter_m": stated.diameter_m, "length_m": stated.length_m, "payload_diameter_m": payload_m}
-        subject = replace(subject, **size)
+        subject = replace(subject, diameter_m=stated.diameter_m, length_m=stated.length_m, payload_diameter_m=payload_m)
     scene = replace(scene, subject=subject, camera=filming.camera, exposure_fraction=filming.exposure_fraction)
     n_frames = int(trial.track.time_s.size)
     time_s = np.linspace(0.0, n_frames / capture_fps, 8 * n_frames + 1)  # 8 samples a frame (chosen)

@@ -328,7 +328,7 @@ def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, s
 
 @njit(fastmath=True, nogil=True)
 def shade_tube(
-    out: Image, along: Image, across: Image, shift_along: float, shift_across: float,
+    out: Image, along: Image, across: Image, nearest: Image, shift_along: float, shift_across: float,
     tip_px: float, sway: float, sway_length: float, table: Image, table_first: float, table_step: float, fold_row: int,
     setback: Floats, slope_row: NDArray[np.int64], side: Image, core: Image, per_px: int, transmission: Image,
     glow: Image, girth: Image, tail: Image, tail_from: float, tail_to: float, tail_end: float, tail_opacity: float,
@@ -336,7 +336,7 @@ def shade_tube(
 ) -> None:  # fmt: skip
     """Draw the tube over `out`, in place. For each pixel: the mirror image is added, the tail is laid over the
     backdrop, then the film over both, in proportion to the coverage by the moving edge. Shapes: out, along, across
-    (height, width).
+    (height, width); nearest (height,), the least distance across in each row.
     """
     half_profile = (setback.size - 1) // 2
     reach = (half_profile - 1) / per_px
@@ -346,12 +346,15 @@ def shade_tube(
     columns = transmission.shape[1]
     n = table.shape[1]
     widest = reach / girth.min() + 2.25 * abs(sway) + (ghost_across if ghost > 0 else 0.0)
+    farthest = tip_px + table_first + n * table_step if ghost <= 0 else np.inf
     for y in range(out.shape[0]):
+        if nearest[y] > widest + abs(shift_across):
+            continue
         for x in range(out.shape[1]):
-            v = across[y, x] - shift_across
-            if abs(v) > widest:
-                continue
             u = along[y, x] - shift_along
+            v = across[y, x] - shift_across
+            if abs(v) > widest or u > farthest:
+                continue
             grown = min(max(u / sway_length, 0.0), 1.5)
             v -= sway * grown * grown
             if ghost > 0 and abs(v - ghost_across) < reach:
@@ -597,6 +600,7 @@ class TubeLayer:
         ripple = 0.7 * _smooth_noise(rng, (4, length), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length), 1, 40)[0]
         self._girth = (1 + 0.08 * self._tube.texture * ripple).astype(np.float32)
         self._tail = tail_sums(self._tube, rng, radius, period_px=4096)
+        self._nearest = np.abs(maps[1]).min(axis=1)
         self._profiles = tip_profiles(self._tube, radius, self._psf_px)
         self._ghost_across = 1.35 * radius
         self._payload: BallLayer | None = None
@@ -620,7 +624,7 @@ class TubeLayer:
         # Averaged over one pixel at least, so that the tail's texture is as soft at rest as in motion.
         slack = max(0.0, 1.0 - (tail_to - tail_from)) / 2
         shade_tube(
-            light, *self._maps, *shift, tip,
+            light, *self._maps, self._nearest, *shift, tip,
             scene_motion.sway_px(middle_s), scene_motion.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
             setback, slope_row, side, core, PROFILE_PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
             tail_to + slack,

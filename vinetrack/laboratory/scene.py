@@ -261,8 +261,7 @@ def preset(name: str) -> Scene:
     plain = Backdrop(brightness=0.1, gradient=0, texture=0, ruler=False, launcher=False, clutter=False)
     opaque = Tube(opacity=1.0, brightness=0.8, texture=0, tail_texture=0, tail_opacity=0, specular=0, tip_glow=0)
     raw, lossless = Sensor(noise=False, fixed_pattern=0, bit_depth=16), Encoding(codec="ffv1")
-    even = Light(vignetting=0)
-    clean = Scene(subject=opaque, door=None, backdrop=plain, light=even, sensor=raw, encoding=lossless)
+    clean = Scene(subject=opaque, door=None, backdrop=plain, light=Light(vignetting=0), sensor=raw, encoding=lossless)
     demo = Scene()
 
     def hard(**changes: Any) -> Scene:
