@@ -155,11 +155,10 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark
         repr((replace(trial, name="", order=0.0, **ungrouped), camera))
         for trial, camera in zip(exact, cameras, strict=True)
     ]
-    first = [signatures.index(signature) for signature in dict.fromkeys(signatures)]
-    simulated = make(
-        design.model, [exact[k] for k in first], [cameras[k] for k in first], (0.0, 0.0), np.random.default_rng(0), host
-    )
-    track_of = {signature: track for signature, (_, track) in zip(dict.fromkeys(signatures), simulated, strict=True)}
+    different = dict(zip(signatures, zip(exact, cameras, strict=True), strict=True))
+    trials, plans = zip(*different.values(), strict=True)
+    made = make(design.model, trials, plans, (0.0, 0.0), np.random.default_rng(0), host)
+    track_of = {signature: track for signature, (_, track) in zip(different, made, strict=True)}
     pairs = [(trial, track_of[signature]) for trial, signature in zip(design.trials, signatures, strict=True)]
     noise_m = math.sqrt(float(np.mean([camera.noise_m**2 for camera in design.cameras])))
     noise = (noise_m, design.cameras[0].noise_correlation)

@@ -12,9 +12,10 @@ sizes (`score_ratios`), scatter of single trials (`_required_means`), and misfit
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,78 +42,62 @@ from vinetrack.effects import Effect
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_data import FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
-from vinetrack.inference.marginal_likelihood import FitState, solve_per_trial, trial_effect_prior
+from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, eliminated, matrix_root, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, systematics_of
-from vinetrack.inference.sensitivity import (
-    DAMPING_DEVIATION,
-    N_TRIAL_EFFECTS,
-    ORIGIN,
-    PRESSURE,
-    RELEASE,
-    Jobs,
-    Predictor,
-)
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Predictor
 from vinetrack.inference.whitening import at_correlation
 
 # ------------------------------------------------------------------------------
 # Expected scores of effects of finite size: the model without the effect, fitted to noise-free data with it.
 #
-# In linear theory (`vinetrack.diagnosis.linear_power`) the free parameters move in proportion to the size of an
-# effect. An effect that they nearly imitate moves them by many standard errors before it becomes detectable, and by
-# then the sensitivities have changed. So each effect is put into noise-free trajectories at the size in question, the
-# model without it is fitted to them with noise and between-trial standard deviations held, and the score is computed
-# there: the Asimov data set of Cowan, Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011.
+# In linear theory the free parameters move in proportion to the size of an effect. An effect that they nearly imitate
+# moves them by many standard errors before it becomes detectable, and by then the sensitivities have changed. So each
+# effect is put into noise-free trajectories at the size in question, the model without it is fitted to them with noise
+# and between-trial standard deviations held, and the score is computed there: the Asimov data set of Cowan, Cranmer,
+# Gross & Vitells, European Physical Journal C 71, 1554, 2011.
 
 
-@dataclass(frozen=True)
-class NoiselessStart:
-    """Trajectories of a fit with the deviations of its trials set to zero, where every fit without an effect starts.
-    `predictor` has finite-difference steps that suit them; `columns` are their sensitivities at the fit's points, the
-    residual last.
-    """
-
-    state: FitState
-    predictor: Predictor
-    jobs: Jobs
-    columns: list[Floats]
-
-
-def noiseless_start(fit: Fit) -> NoiselessStart:
-    """Set the trial deviations of a fit to zero and linearise there: the same start for every effect and size."""
+def noiseless_start(fit: Fit) -> Fit:
+    """The fit with the deviations of its trials set to zero, linearised there: the same start for every effect."""
     trial_effects = fit.state.trial_effects.copy()
-    trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-    state = replace(fit.state, trial_effects=trial_effects)
-    predictor = _predictor_of(fit.predictor, fit.predictor.data)
-    columns = predictor.linearise(state.theta, trial_effects)
-    return NoiselessStart(state, predictor, predictor.job_arrays(state.theta, trial_effects), columns)
+    trial_effects[:, DEVIATION_COLUMNS] = 0.0
+    state, predictor = replace(fit.state, trial_effects=trial_effects), _predictor_of(fit, fit.predictor.data)
+    columns = tuple(predictor.linearise(state.theta, trial_effects))
+    solution = replace(fit.solution, state=state, columns=columns)
+    return replace(fit, predictor=predictor, solution=solution, smooth=None)
 
 
-def _predictor_of(predictor: Predictor, data: Sequence[FitTrial]) -> Predictor:
+def _predictor_of(fit: Fit, data: Sequence[FitTrial]) -> Predictor:
     """A predictor for other positions of the same trials, with the same initial finite-difference steps."""
-    other = Predictor(predictor.layout, data, predictor.host)
-    other.steps, other.pressure_step = predictor.steps.copy(), predictor.pressure_step.copy()
-    return other
+    before = fit.predictor
+    predictor = Predictor(before.layout, data, before.host)
+    predictor.steps, predictor.pressure_step = before.steps.copy(), before.pressure_step.copy()
+    return predictor
 
 
-def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: NoiselessStart) -> tuple[Floats, Floats]:
+def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) -> tuple[Floats, Floats]:
     """Sizes of an effect, and the ratios of its expected scores there to those of linear theory. Where the score at
     seven units, above any threshold, agrees with linear theory, no other size is computed. Returns sizes, ratios. Shape
     (n_sizes,).
     """
+
+    def ratio_at(multiple: float) -> float:
+        return score_ratio(tests, shape_index, multiple * unit, start)
+
     # Ratio of an expected score to that of linear theory from which neither is used, as below 0 (chosen)
     max_score_ratio = 2.0
-    large = score_ratio(tests, shape_index, 7 * unit, start)
+    large = ratio_at(7.0)
     # 0.02: relative deviation of an expected score from linear theory that is neglected (chosen)
     if 0 < abs(large - 1) < 0.02:
         return np.array([7 * unit]), np.array([large])
-    multiples, ratios = [4.0, 7.0], [score_ratio(tests, shape_index, 4 * unit, start), large]
+    multiples, ratios = [4.0, 7.0], [ratio_at(4.0), large]
     if not all(0 < ratio < max_score_ratio for ratio in ratios):
         return unit * np.array(multiples), np.ones(2)
     # 7.0: expected score from which no larger size is tried (chosen)
     # 56.0: multiple of the size of one standard error beyond which no size is tried (chosen)
     while ratios[-1] * multiples[-1] < 7.0 and multiples[-1] < 56.0:
-        ratio = score_ratio(tests, shape_index, 2 * multiples[-1] * unit, start)
+        ratio = ratio_at(2 * multiples[-1])
         if ratio == 1 or not 0 < ratio < max_score_ratio:
             break
         multiples.append(2 * multiples[-1])
@@ -120,20 +105,17 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Noise
     return unit * np.array(multiples), np.array(ratios)
 
 
-def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: NoiselessStart) -> float:
+def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -> float:
     """Expected score of an effect at a size, divided by that of linear theory. Returns 1 where the trajectories with
     the effect cannot be simulated, or the fit without it does not converge.
     """
-    fit, shape = tests.fit, tests.sensitivities.shapes[shape_index]
-    sigma = float(tests.scores.plain_sigma[shape_index])
-    if shape.whole or not shape.effect.parameters:
-        return 1.0
+    shape, sigma = tests.sensitivities.shapes[shape_index], float(tests.scores.plain_sigma[shape_index])
     try:
-        refit = fitted_without(fit, shape, size, start)
+        refit = fitted_without(start, shape, size)
         if not refit.solution.converged:
             return 1.0
         sensitivities = effect_sensitivities(refit, [shape])
-        if shape.effect.name in sensitivities.silent or not sensitivities.shapes:
+        if not sensitivities.shapes:
             return 1.0
         systematics = systematics_of(refit.predictor, refit.solution, refit.trials)
         # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
@@ -143,47 +125,13 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Noisel
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 
-def sizes_at_systematic_error(tests: MisfitTests) -> Floats:
-    """Sizes at which an effect moves positions by as much as their systematic errors. Returns deviations from absence,
-    SI, positive; 0 where positions have no such errors. Shape (n_shapes,).
-    """
-    fit = tests.fit
-    systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in fit.predictor.data]))
-    if not systematic_m > 0:
-        return np.zeros(len(tests.sensitivities.shapes))
-    displacement_m = residual_displacements(fit, tests.products)
-    return np.asarray(systematic_m / np.maximum(displacement_m, 1e-300))
-
-
-def residual_displacements(fit: Fit, products: Products) -> Floats:
-    """Distance of a fit without an effect from trajectories with a unit of its size, to first order. Returns root mean
-    square over trials of the largest distance, all parameters and trial effects re-estimated. Shape (n_shapes,).
-    """
-    problem, state, n_shapes = products.problem, fit.state, products.n_shapes
-    of_keys = np.vstack([projected(fit, products, state).lever_of_fit, np.zeros((1, n_shapes))])[problem.places]
-    precision = trial_effect_prior(problem, state)[1]
-    residual = N_TRIAL_EFFECTS + products.n_unknowns
-    effects, keys = slice(N_TRIAL_EFFECTS), slice(N_TRIAL_EFFECTS, residual)
-    shapes = slice(residual + 1, residual + 1 + n_shapes)
-    largest = []
-    for part in products.parts:
-        white = at_correlation(products.cross_products(part), state.rho) / state.variance[part, None, None]
-        of_effects = white[:, effects, effects] + precision[part][:, :, None] * np.eye(N_TRIAL_EFFECTS)
-        trial_response = solve_per_trial(
-            of_effects, white[:, effects, shapes] - white[:, effects, keys] @ of_keys[part]
-        )
-        largest += [
-            np.max(np.abs(columns[:, shapes] - columns[:, effects] @ by_effects - columns[:, keys] @ by_keys), axis=0)
-            for columns, by_effects, by_keys in zip(products.columns[part], trial_response, of_keys[part], strict=True)
-        ]
-    return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))
-
-
-def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: NoiselessStart) -> Fit:
+def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
     """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held."""
-    state, jobs = start.state, start.jobs.with_effect([shape.size.zero + size, *shape.other_values])
-    moved = start.predictor.run_as(fit.model + shape.effect, jobs)
-    before = fit.predictor.data
+    state, before = start.state, start.predictor.data
+    jobs = start.predictor.job_arrays(state.theta, state.trial_effects)
+    moved = start.predictor.run_as(
+        start.model + shape.effect, jobs.with_effect([shape.size.zero + size, *shape.other_values])
+    )
     used = [_used_points(trial_data, trajectory) for trial_data, trajectory in zip(before, moved, strict=True)]
     origins_m = state.trial_effects[:, ORIGIN]
     data = [
@@ -192,22 +140,14 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
     ]
     if any(trial_data.time_s.size < FEWEST_POINTS or not np.ptp(trial_data.lead_position_m) > 0 for trial_data in data):
         raise SimulationError(f"With {shape.effect.name} at that size a trial does not move.")
-    initial = [columns[keep] for columns, keep in zip(start.columns, used, strict=True)]
+    initial = [columns[keep] for columns, keep in zip(start.solution.columns, used, strict=True)]
     for columns, trial_data, measured, keep in zip(initial, data, before, used, strict=True):
         columns[:, -1] += trial_data.lead_position_m - measured.lead_position_m[keep]
-    predictor = _predictor_of(start.predictor, data)
+    predictor = _predictor_of(start, data)
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
     # 20, 0.2: most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
-    solution = solve(
-        predictor,
-        fit.solution.problem,
-        state,
-        held,
-        warm=True,
-        most_iterations=20,
-        columns=initial,
-        least_decrease=0.2,
-    )
+    how: dict[str, Any] = {"most_iterations": 20, "least_decrease": 0.2, "columns": initial}
+    solution = solve(predictor, start.solution.problem, state, held, warm=True, **how)
     trials = [
         replace(
             trial,
@@ -215,11 +155,13 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
             lead_position_m=trial_data.lead_position_m,
             predicted_position_m=trial_data.lead_position_m - columns[:, -1],
             predicted_velocity_m_s=-columns[:, RELEASE],
-            origin_m=float(solution.state.trial_effects[i, ORIGIN]),
+            origin_m=float(origin_m),
         )
-        for i, (trial, trial_data, columns) in enumerate(zip(fit.trials, data, solution.columns, strict=True))
+        for trial, trial_data, columns, origin_m in zip(
+            start.trials, data, solution.columns, solution.state.trial_effects[:, ORIGIN], strict=True
+        )
     ]
-    return replace(fit, predictor=predictor, solution=solution, trials=tuple(trials), smooth=None)
+    return replace(start, predictor=predictor, solution=solution, trials=tuple(trials))
 
 
 def _used_points(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.bool_]:
@@ -235,17 +177,44 @@ def _with_positions(trial_data: FitTrial, position_m: Floats, keep: NDArray[np.b
     stretch = np.cumsum(trial_data.first | np.concatenate([[False], ~keep[:-1]]))[keep]
     known = {name: getattr(trial_data, name) for name in ("stated_m", "slow_m", "relative_sd")}
     of_points: dict[str, Any] = {name: None if values is None else values[keep] for name, values in known.items()}
+    first = np.concatenate([[True], np.diff(stretch) > 0])
     return replace(
-        trial_data,
-        time_s=trial_data.time_s[keep],
-        lead_position_m=position_m[keep],
-        first=np.concatenate([[True], np.diff(stretch) > 0]),
-        **of_points,
+        trial_data, time_s=trial_data.time_s[keep], lead_position_m=position_m[keep], first=first, **of_points
     )
 
 
-DRAWS, SEED = 4000, 5  # Draws of the normal distributions, and their seed (derived)
+def sizes_at_systematic_error(tests: MisfitTests) -> Floats:
+    """Sizes at which an effect moves positions by as much as their systematic errors. Returns deviations from absence,
+    SI, positive; 0 where positions have no such errors. Shape (n_shapes,).
+    """
+    systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in tests.fit.predictor.data]))
+    if not systematic_m > 0:
+        return np.zeros(len(tests.sensitivities.shapes))
+    return np.asarray(systematic_m / np.maximum(residual_displacements(tests.fit, tests.products), 1e-300))
 
+
+def residual_displacements(fit: Fit, products: Products) -> Floats:
+    """Distance of a fit without an effect from trajectories with a unit of its size, to first order. Returns root mean
+    square over trials of the largest distance, all parameters and trial effects re-estimated. Shape (n_shapes,).
+    """
+    problem, state, n_unknowns = products.problem, fit.state, products.n_unknowns
+    lever = np.vstack([projected(fit, products, state).lever_of_fit, np.zeros((1, products.n_shapes))])
+    precision = trial_effect_prior(problem, state)[1]
+    largest = []
+    for part in products.parts:
+        white = at_correlation(products.cross_products(part), state.rho) / state.variance[part, None, None]
+        response = eliminated(white, precision[part])[1]
+        for columns, of_effects, places in zip(products.columns[part], response, problem.places[part], strict=True):
+            own = columns[:, N_TRIAL_EFFECTS:] - columns[:, :N_TRIAL_EFFECTS] @ of_effects
+            left = own[:, n_unknowns + 1 :] - own[:, :n_unknowns] @ lever[places]
+            largest.append(np.max(np.abs(left), axis=0))
+    return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))
+
+
+# ------------------------------------------------------------------------------
+# Detectable sizes: the distribution of every score at a size, against the threshold of its candidate.
+
+DRAWS, SEED = 4000, 5  # Draws of the normal distributions, and their seed (derived)
 
 # Scores at the true standard deviations for which the inflation is tabulated (chosen)
 SCORE_GRID = np.linspace(0.0, 40.0, 401)
@@ -261,26 +230,22 @@ def power_of(
 ) -> Power:
     """Compute which effects, or `only` one of them, at which sizes, the trials of a fit can detect."""
     start = noiseless_start(tests.fit) if nonlinear else None
-    known = _null_scores(tests), error_inflation(tests), sizes_at_systematic_error(tests)
-    effects = [
-        power
-        for effect in tests.effects
-        if only in ("", effect.name) and (power := _effect_power(tests, effect, start, *known)) is not None
-    ]
-    silent = dict.fromkeys(tests.sensitivities.silent, remark("no_response"))
-    wary = Remark()
-    if tests.exceeds_slow_errors or tests.poorly_fitted:
-        wary = remark("excess_counted_as_noise")
+    # Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)
+    normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(tests.signs)))
+    known = normal @ matrix_root(tests.scores.cosines).T, error_inflation(tests), sizes_at_systematic_error(tests)
+    asked = [effect for effect in tests.effects if only in ("", effect.name)]
+    powers = [_effect_power(tests, effect, start, *known) for effect in asked]
+    far_off = tests.exceeds_slow_errors or tests.poorly_fitted
     return Power(
         n_trials=len(tests.fit.trials),
         threshold=tests.family.single_shape_threshold,
         false_alarms=_false_alarms(tests.fit),
-        effects=tuple(effects),
-        not_testable={**(not_testable or {}), **silent},
+        effects=tuple(power for power in powers if power is not None),
+        not_testable={**(not_testable or {}), **dict.fromkeys(tests.sensitivities.silent, remark("no_response"))},
         numbers=_interval_widths(tests.fit),
         inputs=tuple(inputs or _inputs_of_fit(tests.fit)),
         model=tests.fit.model.names,
-        wary=wary,
+        wary=remark("excess_counted_as_noise") if far_off else Remark(),
     )
 
 
@@ -309,12 +274,12 @@ def typical_shapes(tests: MisfitTests, name: str) -> list[int]:
     return [small[len(small) // 2]] if small else sorted(indices, key=lambda k: abs(tests.sensitivities.shapes[k].step))
 
 
-def _plausible_sign(shape: CandidateShape) -> int:
-    """1 or −1: the side of absence on which the farther end of the plausible range lies."""
+def _ends(shape: CandidateShape) -> tuple[float, float]:
+    """Ends of the plausible range of a size as deviations from absence, the nearer first; 0 and 1 without a size."""
     if not shape.effect.parameters:
-        return 1
-    low, high = plausible_range(shape.size)
-    return 1 if abs(high - shape.size.zero) >= abs(low - shape.size.zero) else -1
+        return 0.0, 1.0
+    near, far = sorted((end - shape.size.zero for end in plausible_range(shape.size)), key=abs)
+    return near, far
 
 
 def _sided(scores: Floats, signs: Sequence[int]) -> Floats:
@@ -326,7 +291,7 @@ def _sided(scores: Floats, signs: Sequence[int]) -> Floats:
 def _effect_power(
     tests: MisfitTests,
     effect: Effect,
-    start: NoiselessStart | None,
+    start: Fit | None,
     null_scores: Floats,
     inflation: Floats,
     least: Floats,
@@ -338,16 +303,16 @@ def _effect_power(
     if not typical:
         return None
     shapes = [tests.sensitivities.shapes[k] for k in typical]
-    shape, size = shapes[0], shapes[0].size
+    shape, (near, far) = shapes[0], _ends(shapes[0])
     # Sizes (deviations from absence in SI, increasing in absolute value), and the expected scores of all shapes there
     information = tests.scores.information
     root = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    units = [one.step if one.whole else _plausible_sign(one) / root[k] for one, k in zip(shapes, typical, strict=True)]
-    sizes = np.array(units)
+    sizes = np.array([one.step for one in shapes] if shape.whole else [math.copysign(1 / root[typical[0]], far)])
     scores = information[typical] * sizes[:, None] / root
     if start is not None and not shape.whole:
-        sizes, ratios = score_ratios(tests, typical[0], float(units[0]), start)
-        scores = scores[0] * (ratios * sizes / units[0])[:, None]
+        unit = float(sizes[0])
+        sizes, ratios = score_ratios(tests, typical[0], unit, start)
+        scores = scores[0] * (ratios * sizes / unit)[:, None]
     scores = np.where(np.diag(information) > 0, scores, 0.0)
     indices = [k for k, name in enumerate(tests.sensitivities.effects) if name == effect.name]
     expected = _sided(scores, tests.signs)
@@ -356,7 +321,9 @@ def _effect_power(
     if not means[-1] > 0:
         return None
     needed = np.quantile(_required_means(tests, index, inflation[:, index]), PROBABILITIES)
-    steps = np.array([_size_with_mean(means, sizes, mean) for mean in needed])
+    # The sizes at which the score has these means: proportional below the first size and beyond the last
+    between = np.interp(needed, [0.0, *means], [0.0, *sizes])
+    steps = np.where(needed >= means[-1], sizes[-1] * needed / means[-1], between)
     if not shape.whole and np.isfinite(steps).all():
         # A detection below the size that systematic errors imitate counts with probability one half.
         away, smallest = np.abs(steps), float(least[typical[0]])
@@ -364,21 +331,18 @@ def _effect_power(
         steps = np.sign(steps) * np.where(away >= smallest, away, np.minimum(at_half_power, smallest))
     at_90 = abs(float(steps[PROBABILITIES.index(0.9)]))
     taken_for, named_alone = _confusion(tests, effect, _scores_at(sizes, scores, at_90), null_scores)
-    if not effect.parameters:
-        found_at = tuple(steps.tolist())
-        return EffectPower(effect.name, effect.kind, "", "size", "1", 0.0, 0.0, 1.0, found_at, taken_for, named_alone)
-    ends = sorted(plausible_range(size), key=lambda end: abs(end - size.zero))
-    same_side = (ends[0] - size.zero) * (ends[1] - size.zero) > 0
+    zero, of_size = 0.0, {"parameter": "", "symbol": "size", "unit": "1"}
+    if effect.parameters:
+        size = shape.size
+        zero, of_size = size.zero, {"parameter": f"{effect.name}.{size.name}", "symbol": size.symbol, "unit": size.unit}
     return EffectPower(
         effect=effect.name,
         kind=effect.kind,
-        parameter=f"{effect.name}.{size.name}",
-        symbol=size.symbol,
-        unit=size.unit,
-        zero=size.zero,
-        least=ends[0] if same_side else size.zero,
-        largest=ends[1],
-        sizes=tuple((size.zero + steps).tolist()),
+        **of_size,
+        zero=zero,
+        least=zero + near if near * far > 0 else zero,
+        largest=zero + far,
+        sizes=tuple((zero + steps).tolist()),
         taken_for=taken_for,
         named_alone=named_alone,
         other_values=shape.other_values,
@@ -393,13 +357,6 @@ def _scores_at(sizes: Floats, scores: Floats, size: float) -> Floats:
     if size > away[-1]:
         return np.asarray(scores[-1] * size / away[-1])
     return np.array([np.interp(size, away, [0.0, *column]) for column in scores.T])
-
-
-def _size_with_mean(means: Floats, sizes: Floats, mean: float) -> float:
-    """The size at which a score has this mean: proportional below the first size and beyond the last."""
-    if mean >= means[-1]:
-        return float(sizes[-1] * mean / means[-1])
-    return float(np.interp(mean, np.concatenate([[0.0], means]), np.concatenate([[0.0], sizes])))
 
 
 def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats:
@@ -436,41 +393,33 @@ def error_inflation(tests: MisfitTests) -> Floats:
     estimated. Shape (n_scores, n_shapes).
     """
     fit, scores = tests.fit, tests.scores
-    information = np.diag(scores.information)
-    estimated = estimable(fit.solution.problem)
     # Factors on the between-trial standard deviations at which the information is computed (chosen)
-    factors = [np.array([1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0]) if free else np.ones(1) for free in estimated]
-    spreads, penalties = [], []
-    for pressure in factors[0]:
-        for damping in factors[1]:
-            spreads.append((fit.state.spread[0] * pressure, fit.state.spread[1] * damping))
-            squares = np.array([pressure, damping]) ** 2
-            penalties.append(scores.degrees * float(np.sum(np.log(squares) + 1 / squares - 1)))
-    ratio = informations_at(fit, tests.products, spreads) / np.maximum(information, 1e-300)
+    factors = [(1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0) if free else (1.0,) for free in estimable(fit.solution.problem)]
+    pairs = np.array(list(itertools.product(*factors)))
+    spreads = [(pressure, damping) for pressure, damping in (pairs * fit.state.spread).tolist()]
+    penalties = scores.degrees * np.sum(2 * np.log(pairs) + 1 / pairs**2 - 1, axis=1)
+    ratio = informations_at(fit, tests.products, spreads) / np.maximum(np.diag(scores.information), 1e-300)
     remaining = np.clip(ratio, 1e-6, 1.0)
-    costs = np.array(penalties)[None, :, None] + SCORE_GRID[:, None, None] ** 2 * remaining
+    costs = penalties[None, :, None] + SCORE_GRID[:, None, None] ** 2 * remaining
     best = np.argmin(costs, axis=1)
     return np.asarray(1 / np.sqrt(np.take_along_axis(remaining, best, axis=0)))
-
-
-def _null_scores(tests: MisfitTests) -> Floats:
-    """Draws of the scores of all shapes where nothing is missing, shape (DRAWS, n_shapes)."""
-    values, vectors = np.linalg.eigh(tests.scores.cosines)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(np.random.default_rng(SEED).standard_normal((DRAWS, len(values))) @ root.T)
 
 
 def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Floats) -> tuple[dict[str, float], float]:
     """How often each other candidate scores highest at a size, whose scores have this mean, and how often the effect is
     named alone. Both among draws in which any candidate exceeds its threshold. A score counts where its size is
-    credible; an effect that contains another as a limit, be it this one or its rival, must be better by the Δχ² of the
-    answer set.
+    credible, see `likelihood_ratio`; an effect that contains another as a limit, be it this one or its rival, must be
+    better by the Δχ² of the answer set.
     """
     if np.isnan(mean).any():
         return {}, math.nan
-    drawn = null_scores + mean
-    counted = np.where(_credible(tests, drawn), _sided(drawn, tests.signs), 0.0)
-    squares, names = _largest_by_effect(tests, np.maximum(counted, 0.0) ** 2)
+    drawn, effects = null_scores + mean, np.array(tests.sensitivities.effects)
+    far = [abs(_ends(shape)[1]) if shape.effect.parameters else math.inf for shape in tests.sensitivities.shapes]
+    with np.errstate(invalid="ignore"):
+        credible = np.abs(drawn) <= CREDIBLE_RANGE_FACTOR * np.array(far) / tests.scores.plain_sigma + 3.0
+    counted = np.maximum(np.where(credible, _sided(drawn, tests.signs), 0.0), 0.0) ** 2
+    names = list(dict.fromkeys(tests.sensitivities.effects))
+    squares = np.stack([counted[:, effects == name].max(axis=1) for name in names], axis=1)
     itself = names.index(effect.name)
     limits = np.array([tests.family.threshold(name) for name in names])
     alarm = np.any(squares > limits**2, axis=1)
@@ -479,7 +428,7 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     containing = {other.name for other in tests.effects if effect.name in other.replaces}
     if any(name in effect.replaces for name in names):
         containing.add(effect.name)
-    squares[:, [k for k, name in enumerate(names) if name in containing]] -= ANSWER_SET_DELTA_CHI2
+    squares[:, [name in containing for name in names]] -= ANSWER_SET_DELTA_CHI2
     squares = squares[alarm]
     highest = np.argmax(squares, axis=1)
     others = np.delete(squares, itself, axis=1).max(axis=1, initial=-math.inf)
@@ -487,28 +436,6 @@ def _confusion(tests: MisfitTests, effect: Effect, mean: Floats, null_scores: Fl
     # 0.05: probability from which another candidate is listed (chosen)
     listed = sorted((name for name in rates if rates[name] >= 0.05), key=lambda name: -rates[name])
     return {name: rates[name] for name in listed}, float(np.mean(squares[:, itself] - others > ANSWER_SET_DELTA_CHI2))
-
-
-def _credible(tests: MisfitTests, scores: Floats) -> Floats:
-    """Whether the size that a score implies is one that the diagnosis would accept, see `likelihood_ratio`."""
-    sigma = tests.scores.plain_sigma
-    largest = np.array(
-        [
-            CREDIBLE_RANGE_FACTOR * max(abs(end - shape.size.zero) for end in plausible_range(shape.size))
-            if shape.effect.parameters
-            else math.inf
-            for shape in tests.sensitivities.shapes
-        ]
-    )
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.abs(scores) <= largest / sigma + 3.0)
-
-
-def _largest_by_effect(tests: MisfitTests, values: Floats) -> tuple[Floats, list[str]]:
-    """The largest of the values of each effect's shapes, shape (n_draws, n_effects), and the names of the effects."""
-    names = list(dict.fromkeys(tests.sensitivities.effects))
-    effect_of_shape = np.array([names.index(name) for name in tests.sensitivities.effects])
-    return np.stack([values[:, effect_of_shape == k].max(axis=1) for k in range(len(names))], axis=1), names
 
 
 def _false_alarms(fit: Fit) -> dict[str, float]:
