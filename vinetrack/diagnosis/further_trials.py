@@ -1,9 +1,8 @@
-"""The fewest further trials that give an effect of some size a target power, by linear theory.
+"""Further trials: the next experiment, which separates tied hypotheses; the fewest trials that give an effect of some
+size a target power; and those that would reveal most of what could be missing.
 
-Designs are evaluated by their information about the size (`design_information`): pairs of replicates are added one by
-one, each the one with the largest information, then exchanged until none gains (Fedorov 1972, Theory of Optimal
-Experiments). The power of each of these designs is computed by `vinetrack.diagnosis.linear_power` among all candidates:
-with thresholds, the scatter of single trials, and what the fit without the effect takes for scatter.
+Designs are evaluated by linear theory: one trial of every condition is simulated once, information adds up over trials,
+and trials are added one by one and exchanged until none gains (Fedorov 1972, Theory of Optimal Experiments).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
+from vinetrack.diagnosis.power import EffectPower, FurtherTrials, InformativeTrials, Power
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
@@ -32,23 +31,21 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, Fit
-from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.discriminating_design import (
     NEW_VINE,
     OTHER_RIG,
     SAME_RIG,
     Condition,
-    Hypothesis,
     RefitTerms,
-    best_design,
-    best_new_vines,
+    at_unknowns,
     conditions_by_effort,
     exchanged,
     extend,
     feasible_conditions,
     growth_courses,
     refit_terms,
+    separations,
     simulated_rises,
     worth,
 )
@@ -56,9 +53,6 @@ from vinetrack.planning.predictive_inputs import prior_ratio
 
 # ------------------------------------------------------------------------------
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
-#
-#     found = next_experiment([fit_with_drag, fit_with_inlet_loss], limits)
-#     print(found.text)
 #
 # Every condition within the limits is rated by linear theory, and the best set of trials found by exchange. Its
 # separation is predicted by refitting simulated trials; as a check, the trials are simulated again with the true
@@ -82,15 +76,10 @@ class NextExperiment:
     simulated_sigma: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     measurement: Remark = field(default_factory=Remark)
 
-    @property
-    def text(self) -> str:
-        """The advice in words."""
-        return str(self.advice)
-
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
         return {
-            "text": self.text,
+            "text": str(self.advice),
             "trials": self.trials,
             "separation_sigma": self.separation_sigma,
             "if_true_sigma": self.if_true_sigma,
@@ -134,7 +123,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     if not terms:
         return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
     design, rises = _best_option(terms, limits, seed)
-    return _recommendation([of_hypothesis.hypothesis for of_hypothesis in terms], design, rises, seed)
+    return _recommendation(terms, design, rises, seed)
 
 
 def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
@@ -143,19 +132,17 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
     """
     trace_decides = False
     effects: dict[str, Effect] = {}
-    for pair in pairs:
-        models = [fit.model for fit in pair]
-        only_first, only_second = (
-            [effect for effect in model if effect.name not in other.names]
-            for model, other in zip(models, reversed(models), strict=True)
-        )
-        trace_decides |= any(e.in_trace for e in only_first) != any(e.in_trace for e in only_second)
-        effects.update({effect.name: effect for effect in [*only_first, *only_second]})
-    measured = [effect for effect in effects.values() if effect.kind == "measurement"]
-    if not (trace_decides or effects):
+    for first, second in pairs:
+        both = (first.model, second.model), (second.model, first.model)
+        apart = [[effect for effect in model if effect.name not in other.names] for model, other in both]
+        in_trace = [any(effect.in_trace for effect in of_one) for of_one in apart]
+        trace_decides |= in_trace[0] != in_trace[1]
+        effects.update({effect.name: effect for effect in [*apart[0], *apart[1]]})
+    if not effects:
         return Remark()
-    facts = {"trace_decides": trace_decides, "effects": measured or list(effects.values())}
-    return Remark("deciding_measurements", {**facts, "faults_only": bool(measured)})
+    measured = [effect for effect in effects.values() if effect.kind == "measurement"]
+    known = {"trace_decides": trace_decides, "effects": measured or list(effects.values())}
+    return remark("deciding_measurements", **known, faults_only=bool(measured))
 
 
 def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[RefitTerms]:
@@ -176,24 +163,34 @@ def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) 
 
 
 def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> tuple[list[int], Floats]:
-    """The best set of trials of the least effort that is sufficient, else of all. Returns design (indices of
-    conditions, one a trial), rises (see `simulated_rises`).
+    """The best set of trials of the least effort that is sufficient, else of all: replicates of one condition,
+    exchanged one at a time. Returns design (indices of conditions, one a trial), rises (see `simulated_rises`).
     """
-    hypotheses = [of_hypothesis.hypothesis for of_hypothesis in terms]
-    options: list[tuple[list[int], Floats]] = []
-    before = -math.inf
+    conditions = terms[0].conditions
+
+    def worth_of_replicates(places: NDArray[np.intp]) -> Floats:
+        return worth(separations(terms, np.repeat(places[:, None], limits.trials, axis=1)))
 
     def best_vines(places: NDArray[np.intp]) -> list[str]:
+        best_first = places[np.argsort(-worth_of_replicates(places))]
         # 2: new vines that are tried, at most (chosen)
-        return best_new_vines(terms, places, limits.trials, 2 if len(terms) == 2 else 1)
+        return list(dict.fromkeys(conditions[k].trial.vine for k in best_first))[: 2 if len(terms) == 2 else 1]
 
-    for _, allowed in conditions_by_effort(hypotheses[0].conditions, best_vines):
-        design, predicted = best_design(terms, allowed, limits.trials)
+    options: list[tuple[list[int], Floats]] = []
+    before = -math.inf
+    for _, allowed in conditions_by_effort(conditions, best_vines):
+
+        def worth_with(others: list[int], allowed: NDArray[np.intp] = allowed) -> Floats:
+            return worth(separations(terms, [[*others, k] for k in allowed]))
+
+        values = worth_of_replicates(allowed)
+        start = [int(allowed[int(np.argmax(values))])] * limits.trials
+        design, predicted = exchanged(start, float(np.max(values)), allowed, worth_with)
         # 1.01: factor by which the worth of a design must exceed that with less effort for it to be
         # considered (chosen)
         if predicted > 1.01 * before:
             before = predicted
-            options.append((design, simulated_rises(hypotheses, design, [0], seed)))
+            options.append((sorted(design), simulated_rises(terms, sorted(design), [0], seed)))
             # 8.0: separation, in standard deviations, beyond which no further effort, such as making a new vine, is
             # recommended (chosen)
             if min(_by_pair(_separations(options[-1][1])).values()) >= 8.0:
@@ -201,61 +198,48 @@ def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> tuple[li
     return max(options, key=lambda option: float(worth(_separations(option[1])[None])[0]))
 
 
-def _recommendation(hypotheses: Sequence[Hypothesis], design: list[int], rises: Floats, seed: int) -> NextExperiment:
+def _recommendation(terms: Sequence[RefitTerms], design: list[int], rises: Floats, seed: int) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
-    separations = _separations(np.concatenate([rises, simulated_rises(hypotheses, design, [1], seed)]))
-    expected = _by_pair(separations)
-    names = [hypothesis.name for hypothesis in hypotheses]
-    pair_names = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
+    fits, names = [one.fit for one in terms], [one.name for one in terms]
+    between = _separations(np.concatenate([rises, simulated_rises(terms, design, [1], seed)]))
+    expected = _by_pair(between)
+    title = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
     worth_it = max(expected.values()) >= least_separation
-    # Draws of the check by number of hypotheses, otherwise one; one less beyond 20 standard deviations (chosen)
-    draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected.values()) > 20.0), 1)
-    simulated = {}
+    simulated: dict[tuple[int, int], tuple[float, float]] = {}
     if worth_it:
-        simulated = _simulated_separations(simulated_rises(hypotheses, design, range(draws), seed, thorough=True))
+        # Draws of the check by number of hypotheses, otherwise one; one less beyond 20 standard deviations (chosen)
+        draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected.values()) > 20.0), 1)
+        sigma = np.sqrt(np.maximum(simulated_rises(terms, design, range(draws), seed, thorough=True), 0.0))
+        for a, b in expected:
+            # Mean and standard deviation over the draws, in the direction that separates less
+            known = [drawn[np.isfinite(drawn)] for drawn in (sigma[:, a, b], sigma[:, b, a])]
+            least = min((drawn for drawn in known if drawn.size), key=np.mean, default=None)
+            if least is not None:
+                sd = float(np.std(least, ddof=1)) if least.size > 1 else math.nan
+                simulated[a, b] = float(np.mean(least)), sd
     unresolved = [
         pair for pair, sigma in expected.items() if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
     ]
     worth_it = worth_it and len(unresolved) < len(expected)
-    fits = [hypothesis.fit for hypothesis in hypotheses]
     # Where all pairs are resolved: those that a measurement would decide as well, with an effect of it in only one.
     kinds = [{effect.kind for effect in fit.model} for fit in fits]
-    pairs = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
-    measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in pairs])
-    trials = trial_entries(hypotheses[0].conditions, design)
-    if_true = {
-        pair: {names[a]: float(separations[a, b]), names[b]: float(separations[b, a])}
-        for (a, b), pair in pair_names.items()
+    to_measure = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
+    measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in to_measure])
+    trials = trial_entries(terms[0].conditions, design)
+    told: dict[str, Any] = {
+        "if_true": {title[a, b]: {names[a]: float(between[a, b]), names[b]: float(between[b, a])} for a, b in title},
+        "simulated": {title[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()},
     }
-    simulated_by_name = {pair_names[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()}
+    more = {"unresolved": [title[pair] for pair in unresolved], "measurement": measurement}
+    code = "trials_to_make" if worth_it else "no_trials_separate"
     return NextExperiment(
-        advice=remark(
-            "trials_to_make" if worth_it else "no_trials_separate",
-            trials=trials,
-            if_true=if_true,
-            simulated=simulated_by_name,
-            unresolved=[pair_names[pair] for pair in unresolved],
-            measurement=measurement,
-            least_sigma=least_separation,
-        ),
+        advice=remark(code, trials=trials, least_sigma=least_separation, **told, **more),
         trials=trials if worth_it else (),
-        separation_sigma={pair_names[pair]: sigma for pair, sigma in expected.items()},
-        if_true_sigma=if_true,
-        simulated_sigma=simulated_by_name,
+        separation_sigma={title[pair]: sigma for pair, sigma in expected.items()},
+        if_true_sigma=told["if_true"],
+        simulated_sigma=told["simulated"],
         measurement=measurement,
     )
-
-
-def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
-    """Mean and standard deviation of the simulated separations by pair, in the direction that separates less."""
-    sigma = np.sqrt(np.maximum(rises, 0.0))
-    simulated = {}
-    for a, b in itertools.combinations(range(rises.shape[1]), 2):
-        known = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
-        least = min((draws for draws in known if draws.size), key=lambda draws: float(np.mean(draws)), default=None)
-        if least is not None:
-            simulated[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
-    return simulated
 
 
 def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
@@ -301,24 +285,34 @@ class DesignInformation:
 
     def __init__(self, design: CampaignDesign, every: Sequence[Condition], effects: Sequence[str]) -> None:
         tests = tests_with_conditions(design, every, tuple(effects))
-        indices = {name: shapes[-1] for name in effects if (shapes := typical_shapes(tests, name))}
-        self.effects = list(indices)
-        names = [trial.name for trial in tests.fit.trials]
-        moving = [trial_data.time_s.size - trial_data.n_rest for trial_data in tests.fit.predictor.data]
-        blocks = _products_by_trial(tests, list(indices.values()))
-        before = {trial.name for trial in design.trials}
+        fit, products, problem = tests.fit, tests.products, tests.products.problem
+        shape_of = {name: shapes[-1] for name in effects if (shapes := typical_shapes(tests, name))}
+        self.effects = list(shape_of)
+        # Unknowns of the fit, then sizes of the effects; not the residual and other shapes
+        known = problem.prior_mean.size
+        size = known + len(shape_of)
+        residual_and_shapes = np.full(1 + products.n_shapes, -1)
+        residual_and_shapes[[1 + index for index in shape_of.values()]] = np.arange(known, size)
+        index = np.concatenate([problem.index, np.tile(residual_and_shapes, (len(fit.trials), 1))], axis=1)
+        of_trials = at_unknowns(products_without_trial_effects(products, fit.state), index, size)
+        # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
+        # (chosen); sizes of effects have none.
+        prior = np.append(np.maximum(problem.prior_precision, 1e-6), np.zeros(len(shape_of)))
         # 12: frames of growth below which a trial is not worth filming (chosen)
-        filmed = {name: k for k, name in enumerate(names) if name not in before and moving[k] >= 12}
+        before = {trial.name for trial in design.trials}
+        places = {trial.name: k for k, trial in enumerate(fit.trials)}
+        moving = [trial_data.time_s.size - trial_data.n_rest for trial_data in fit.predictor.data]
+        filmed = {name: k for name, k in places.items() if name not in before and moving[k] >= 12}
         self.conditions = tuple(condition for condition in every if condition.trial.name in filmed)
-        self.each = REPLICATES * blocks[[filmed[condition.trial.name] for condition in self.conditions]]
-        done = [k for k, name in enumerate(names) if name in before]
-        self.so_far = _prior_precision(tests, len(self.effects)) + blocks[done].sum(axis=0)
+        self.each = REPLICATES * of_trials[[filmed[condition.trial.name] for condition in self.conditions]]
+        done = [k for name, k in places.items() if name in before]
+        self.so_far = np.diag(prior) + of_trials[done].sum(axis=0)
 
     def total(self, chosen: Sequence[int]) -> Floats:
         """Cross products of the trials so far and of a design. Shape (n, n)."""
         return np.asarray(self.so_far + self.each[list(chosen)].sum(axis=0))
 
-    def information_of(self, totals: Floats) -> Floats:
+    def of(self, totals: Floats) -> Floats:
         """Information about the sizes of the effects with all other unknowns free. Shapes: totals (n_designs, n, n) →
         (n_designs, n_effects, n_effects).
         """
@@ -326,6 +320,14 @@ class DesignInformation:
         cross = totals[:, :-count, -count:]
         solved = np.linalg.solve(totals[:, :-count, :-count], cross)
         return np.asarray(totals[:, -count:, -count:] - np.swapaxes(cross, 1, 2) @ solved)
+
+    def of_first(self, totals: Floats) -> Floats:
+        """Information about the first effect alone, shape (n_designs,)."""
+        return np.asarray(np.maximum(self.of(totals)[:, 0, 0], 0.0))
+
+    def of_design(self, chosen: Sequence[int]) -> float:
+        """Information about the first effect from these trials and those so far."""
+        return float(self.of_first(self.total(chosen)[None])[0])
 
     def grown(self, allowed: NDArray[np.intp], worth: Worth, most: int, wanted: float = math.inf) -> list[int]:
         """Groups of trials added one by one, up to the `wanted` worth or `most` groups, and exchanged."""
@@ -337,12 +339,54 @@ class DesignInformation:
                 break
             chosen.append(int(allowed[int(np.argmax(values))]))
             now = float(np.max(values))
-        return self.improved(chosen, allowed, worth)
+        return self._improved(chosen, allowed, worth)
 
-    def improved(self, chosen: list[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
+    def _improved(self, chosen: list[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
         """The same number of groups, exchanged."""
         now = float(worth(self.total(chosen)[None])[0])
         return exchanged(chosen, now, allowed, lambda others: worth(self.total(others) + self.each[allowed]))[0]
+
+    def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
+        """The fewest pairs that reach the wanted information about the first effect, else the best `most`; and how many
+        trials by effort.
+        """
+
+        def cost(chosen: Sequence[int]) -> tuple[float, float]:
+            information = self.of_design(chosen)
+            return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
+
+        def best_vines(places: NDArray[np.intp]) -> list[str]:
+            """The new vines with the largest information in unlimited trials of all their conditions."""
+            vines = np.array([condition.trial.vine for condition in self.conditions])
+            new = list(dict.fromkeys(vines[places].tolist()))
+            unlimited = [self.so_far + UNLIMITED_TRIALS * self.each[vines == vine].sum(axis=0) for vine in new]
+            # 2: new vines that are tried, one at a time (chosen)
+            return [new[k] for k in np.argsort(-self.of_first(np.stack(unlimited)))[:2]]
+
+        options: dict[str, list[int]] = {}
+        effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
+        for effort, allowed in conditions_by_effort(self.conditions, best_vines):
+            words, chosen = effort_words[effort], self._smallest(allowed, wanted, most)
+            options[words] = min(options.get(words, chosen), chosen, key=cost)
+        reached = {words: REPLICATES * len(chosen) for words, chosen in options.items() if cost(chosen)[0] < math.inf}
+        return min(options.values(), key=cost, default=[]), reached
+
+    def _smallest(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
+        """Pairs added one by one up to the wanted information, exchanged, and removed where not needed; the most
+        informative first.
+        """
+        chosen = self.grown(allowed, self.of_first, most, wanted)
+        while len(chosen) > 1:
+            least = int(np.argmax(self.of_first(self.total(chosen) - self.each[chosen])))
+            fewer = self._improved(chosen[:least] + chosen[least + 1 :], allowed, self.of_first)
+            if self.of_design(fewer) < wanted:
+                break
+            chosen = fewer
+        order: list[int] = []
+        while chosen:
+            gains_of = self.of_first(self.total(order) + self.each[chosen])
+            order.append(chosen.pop(int(np.argmax(gains_of))))
+        return order
 
 
 def tests_with_conditions(
@@ -366,128 +410,6 @@ def tests_with_conditions(
     return planned_tests(extended)[0]
 
 
-def _products_by_trial(tests: MisfitTests, indices: Sequence[int]) -> Floats:
-    """Cross products of each trial: unknowns of its fit and effects of these shapes, in order."""
-    products = tests.products
-    blocks = products_without_trial_effects(products, tests.fit.state)
-    problem = with_shapes(products.problem, len(indices))
-    columns = np.concatenate([np.arange(products.n_unknowns), products.n_unknowns + 1 + np.array(indices, dtype=int)])
-    aligned = np.zeros((len(blocks), problem.prior_mean.size + 1, problem.prior_mean.size + 1))
-    rows = np.arange(len(blocks))[:, None, None]
-    selected = blocks[:, columns[:, None], columns]
-    np.add.at(aligned, (rows, problem.places[:, :, None], problem.places[:, None, :]), selected)
-    return aligned[:, :-1, :-1]
-
-
-def _prior_precision(tests: MisfitTests, n_effects: int) -> Floats:
-    """Prior precision of the same unknowns: sizes of effects have none."""
-    # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
-    # (chosen)
-    free = np.maximum(tests.products.problem.prior_precision, 1e-6)
-    return np.diag(np.append(free, np.zeros(n_effects)))
-
-
-def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:
-    """The same tests for some of the trials, which may be repeated."""
-    rows, fit, solution = np.array(indices), tests.fit, tests.fit.solution
-    predictor, problem, (state,) = subset(fit.predictor, solution.problem, rows, solution.state, every_parameter=True)
-    solution = replace(
-        solution,
-        state=state,
-        problem=problem,
-        cross_products=solution.cross_products[rows],
-        columns=tuple(solution.columns[row] for row in rows),
-    )
-    trials = tuple(fit.trials[row] for row in rows)
-    part = replace(fit, predictor=predictor, solution=solution, trials=trials, smooth=None)
-    products = tests.products.of(indices)
-    sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[row] for row in rows])
-    return replace(tests, fit=part, products=products, sensitivities=sensitivities, scores=scores_of(part, products))
-
-
-def further_trials(
-    design: CampaignDesign, now: EffectPower, value: float, target: float, limits: Limits | None = None
-) -> FurtherTrials:
-    """Find the fewest further trials that give an effect of some size a target power."""
-    limits = limits or Limits()
-    # 48: most further trials considered where `limits.trials` is not stated (chosen)
-    most = limits.trials if "trials" in limits.model_fields_set else 48
-    before = now.probability_at(value)
-    plan = FurtherTrials(now, value, target, before)
-    feasible = feasible_conditions(design.trials, limits)
-    if before >= target or not feasible:
-        return replace(plan, unlimited=before)
-    search = _Search(design, feasible, (now.effect,))
-    deviation = abs(value - now.zero)
-    wanted = search.information(()) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
-    if not math.isfinite(wanted):
-        # 4.7: score that a size needs where the trials so far have no information about it (derived)
-        wanted = (4.7 / deviation) ** 2
-    # 3: searches, each with the required information corrected by the shortfall of the one before (chosen)
-    for _ in range(3):
-        chosen, needed = search.fewest(wanted, most // REPLICATES)
-        plan = _evaluated(design, search, replace(plan, n_conditions=len(search.conditions), needed=needed), chosen)
-        shortfall = abs(plan.power.size_at(target) - now.zero) / deviation
-        if plan.is_reached or not math.isfinite(shortfall) or len(chosen) >= most // REPLICATES:
-            break
-        wanted = 1.02 * search.information(chosen) * shortfall**2
-    return plan
-
-
-class _Search(DesignInformation):
-    """The smallest design that has the wanted information about one effect."""
-
-    def first_information(self, totals: Floats) -> Floats:
-        """Information about the first effect alone, shape (n_designs,)."""
-        return np.asarray(np.maximum(self.information_of(totals)[:, 0, 0], 0.0))
-
-    def information(self, chosen: Sequence[int]) -> float:
-        """Information about the size from these trials and those so far."""
-        return float(self.first_information(self.total(chosen)[None])[0])
-
-    def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
-        """The fewest pairs that reach the wanted information, else the best `most`; and how many trials by effort."""
-
-        def cost(chosen: Sequence[int]) -> tuple[float, float]:
-            information = self.information(chosen)
-            return (len(chosen), 0.0) if information >= wanted else (math.inf, -information)
-
-        options: dict[str, list[int]] = {}
-        effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-        for effort, allowed in conditions_by_effort(self.conditions, self._best_new_vines):
-            words, chosen = effort_words[effort], self._design(allowed, wanted, most)
-            options[words] = min(options.get(words, chosen), chosen, key=cost)
-        reached = {
-            words: REPLICATES * len(chosen) for words, chosen in options.items() if self.information(chosen) >= wanted
-        }
-        return min(options.values(), key=cost, default=[]), reached
-
-    def _best_new_vines(self, places: NDArray[np.intp]) -> list[str]:
-        """The new vines with the largest information in unlimited trials of all their conditions."""
-        vines = np.array([condition.trial.vine for condition in self.conditions])
-        new = list(dict.fromkeys(vines[places].tolist()))
-        unlimited = [self.so_far + UNLIMITED_TRIALS * self.each[vines == vine].sum(axis=0) for vine in new]
-        # 2: new vines that are tried, one at a time (chosen)
-        return [new[k] for k in np.argsort(-self.first_information(np.stack(unlimited)))[:2]]
-
-    def _design(self, allowed: NDArray[np.intp], wanted: float, most: int) -> list[int]:
-        """Pairs added one by one up to the wanted information, exchanged, and removed where not needed; the most
-        informative first.
-        """
-        chosen = self.grown(allowed, self.first_information, most, wanted)
-        while len(chosen) > 1:
-            least = int(np.argmax(self.first_information(self.total(chosen) - self.each[chosen])))
-            fewer = self.improved(chosen[:least] + chosen[least + 1 :], allowed, self.first_information)
-            if self.information(fewer) < wanted:
-                break
-            chosen = fewer
-        order: list[int] = []
-        while chosen:
-            gains_of = self.first_information(self.total(order) + self.each[chosen])
-            order.append(chosen.pop(int(np.argmax(gains_of))))
-        return order
-
-
 def tests_of_designs(
     design: CampaignDesign, conditions: Sequence[Condition]
 ) -> Callable[[Sequence[Condition]], MisfitTests]:
@@ -496,12 +418,62 @@ def tests_of_designs(
     """
     unique = list({condition.trial.name: condition for condition in conditions}.values())
     tests = tests_with_conditions(design, unique, design.candidates)
-    index_of = {trial.name: k for k, trial in enumerate(tests.fit.trials)}
-    so_far = [index_of[trial.name] for trial in design.trials if trial.name in index_of]
-    return lambda added: with_trials(tests, [*so_far, *(index_of[condition.trial.name] for condition in added)])
+    fit, solution = tests.fit, tests.fit.solution
+    place_of = {trial.name: k for k, trial in enumerate(fit.trials)}
+    so_far = [place_of[trial.name] for trial in design.trials if trial.name in place_of]
+
+    def with_trials(added: Sequence[Condition]) -> MisfitTests:
+        places = [*so_far, *(place_of[condition.trial.name] for condition in added)]
+        rows = np.array(places)
+        predictor, problem, (state,) = subset(
+            fit.predictor, solution.problem, rows, solution.state, every_parameter=True
+        )
+        columns = tuple(solution.columns[k] for k in places)
+        part = replace(
+            solution, state=state, problem=problem, cross_products=solution.cross_products[rows], columns=columns
+        )
+        trials = tuple(fit.trials[k] for k in places)
+        of_part = replace(fit, predictor=predictor, solution=part, trials=trials, smooth=None)
+        products = tests.products.of(places)
+        sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[k] for k in places])
+        scores = scores_of(of_part, products)
+        return replace(tests, fit=of_part, products=products, sensitivities=sensitivities, scores=scores)
+
+    return with_trials
 
 
-def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, chosen: Sequence[int]) -> FurtherTrials:
+def further_trials(
+    design: CampaignDesign, now: EffectPower, value: float, target: float, limits: Limits | None = None
+) -> FurtherTrials:
+    """Find the fewest further trials that give an effect of some size a target power."""
+    limits = limits or Limits()
+    # 48: most further trials considered where `limits.trials` is not stated (chosen)
+    most = (limits.trials if "trials" in limits.model_fields_set else 48) // REPLICATES
+    before = now.probability_at(value)
+    plan = FurtherTrials(now, value, target, before)
+    feasible = feasible_conditions(design.trials, limits)
+    if before >= target or not feasible:
+        return replace(plan, unlimited=before)
+    search = DesignInformation(design, feasible, (now.effect,))
+    deviation = abs(value - now.zero)
+    wanted = search.of_design(()) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
+    if not math.isfinite(wanted):
+        # 4.7: score that a size needs where the trials so far have no information about it (derived)
+        wanted = (4.7 / deviation) ** 2
+    # 3: searches, each with the required information corrected by the shortfall of the one before (chosen)
+    for _ in range(3):
+        chosen, needed = search.fewest(wanted, most)
+        plan = _evaluated(design, search, replace(plan, n_conditions=len(search.conditions), needed=needed), chosen)
+        shortfall = abs(plan.power.size_at(target) - now.zero) / deviation
+        if plan.is_reached or not math.isfinite(shortfall) or len(chosen) >= most:
+            break
+        wanted = 1.02 * search.of_design(chosen) * shortfall**2
+    return plan
+
+
+def _evaluated(
+    design: CampaignDesign, search: DesignInformation, plan: FurtherTrials, chosen: Sequence[int]
+) -> FurtherTrials:
     """The plan with as many of these trials as needed, and the power after each."""
     conditions = [search.conditions[k] for k in chosen for _ in range(REPLICATES)]
     tests_with = tests_of_designs(design, conditions)
@@ -514,8 +486,8 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
             cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
             known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
             trials.append({**known, "probability": probability})
-    endless = search.first_information((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
-    ratio = math.sqrt(endless / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
+    endless = search.of_first((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
+    ratio = math.sqrt(endless / max(search.of_design(chosen[: len(trials) // REPLICATES]), 1e-300))
     unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))
     return replace(plan, trials=tuple(trials), power=power, unlimited=max(unlimited, probability))
 
@@ -535,18 +507,6 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
 SIZES = np.geomspace(0.1, 1.0, 9)
 
 
-@dataclass(frozen=True)
-class InformativeTrials:
-    """Recommended trials, and what they would show. `trials` are entries as of a next experiment
-    (`plan_text.trial_entries`); `now` and `then` are the power of the trials so far, and of these together with those
-    recommended.
-    """
-
-    trials: tuple[Mapping[str, Any], ...]
-    now: Power
-    then: Power
-
-
 def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | None = None) -> InformativeTrials | None:
     """Find the further trials within the limits that would reveal most of what could be missing."""
     limits = limits or Limits()
@@ -560,7 +520,7 @@ def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | No
 
     def expected_discoveries(totals: Floats) -> Floats:
         """Expected numbers of effects that are detected, and that are told from all others, added up."""
-        information = np.stack(_alone_and_distinct(search.information_of(totals)))
+        information = np.stack(_alone_and_distinct(search.of(totals)))
         scores = SIZES[:, None, None, None] * largest * np.sqrt(information)
         return np.asarray(ndtr(scores - power.threshold).mean(axis=0).sum(axis=(0, 2)))
 

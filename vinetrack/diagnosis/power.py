@@ -12,18 +12,15 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from vinetrack.core.notebook import plot
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.tables import JsonRecord
-from vinetrack.core.units import or_nan
 from vinetrack.inference.fit_result import OrNaN, or_open
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from vinetrack.diagnosis.further_trials import InformativeTrials
 
 
 # Probabilities at which detectable sizes are tabulated (chosen)
@@ -137,15 +134,11 @@ class SimulatedRates:
     def to_json(self) -> dict[str, object]:
         """As an entry of `simulated`."""
         return {
-            "effect": self.effect,
+            **{name: value for name, value in vars(self).items() if name != "count"},
             "value": None if math.isnan(self.value) else self.value,
-            "promised": self.promised,
             "rate": self.count / self.campaigns if self.campaigns else math.nan,
             "interval_95": list(self.interval),
-            "campaigns": self.campaigns,
-            "alarms": self.alarms,
             "named": dict(self.named),
-            "failed": self.failed,
         }
 
 
@@ -196,24 +189,39 @@ class FurtherTrials:
 
 
 @dataclass(frozen=True)
-class Power:
+class InformativeTrials:
+    """Recommended trials, and what they would show. `trials` are entries as of a next experiment; `now` and `then` are
+    the power of the trials so far, and of these together with those recommended.
+    """
+
+    trials: tuple[Mapping[str, Any], ...]
+    now: Power
+    then: Power
+
+
+StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)]
+
+
+@dataclass(frozen=True)
+class Power(JsonRecord):
     """Which effects the trials of a campaign can detect, and at which sizes. Printed, it is the text on the terminal.
     `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. `false_alarms` maps
     each test to its false-alarm rate; the total is at most their sum.
     """
 
-    n_trials: int
-    threshold: float
-    false_alarms: Mapping[str, float]
+    n_trials: int = 0
+    threshold: Annotated[OrNaN, Field(alias="threshold_sigma")] = math.nan
+    false_alarms: Mapping[str, OrNaN] = field(default_factory=dict)
     effects: tuple[EffectPower, ...] = ()
-    not_testable: Mapping[str, Remark] = field(default_factory=dict)
+    not_testable: Annotated[Mapping[str, StoredRemark], Field(alias="not_testable_codes")] = field(default_factory=dict)
     numbers: tuple[NumberWidth, ...] = ()
     inputs: tuple[PowerInput, ...] = ()
     model: tuple[str, ...] = ()
-    wary: Remark = field(default_factory=Remark)
-    simulated: tuple[SimulatedRates, ...] = ()
-    further: tuple[FurtherTrials, ...] = ()
-    recommended: InformativeTrials | None = None
+    wary: Annotated[StoredRemark, Field(alias="wary_code")] = field(default_factory=Remark)
+    # Written below, and not read again
+    simulated: Annotated[tuple[SimulatedRates, ...], Field(exclude=True, alias="unread_simulated")] = ()
+    further: Annotated[tuple[FurtherTrials, ...], Field(exclude=True)] = ()
+    recommended: Annotated[InformativeTrials | None, Field(exclude=True)] = None
 
     @property
     def false_alarm_rate(self) -> float:
@@ -237,40 +245,16 @@ class Power:
     def to_json(self) -> dict[str, Any]:
         """As `power` of `diagnosis.json`; sizes in SI units."""
         return {
-            "n_trials": self.n_trials,
-            "model": list(self.model),
-            "threshold_sigma": self.threshold,
+            **super().to_json(),
             "false_alarm_rate": self.false_alarm_rate,
-            "false_alarms": dict(self.false_alarms),
             "effects": [entry.to_json() for entry in self.effects],
             "not_testable": {name: str(why) for name, why in self.not_testable.items()},
-            "not_testable_codes": {name: why.to_json() for name, why in self.not_testable.items()},
-            "numbers": [vars(number) for number in self.numbers],
-            "inputs": [vars(entry) for entry in self.inputs],
             "wary": str(self.wary),
-            "wary_code": self.wary.to_json(),
             "simulated": [rates.to_json() for rates in self.simulated],
             "in_words": str(remark("detectable", power=self)).splitlines(),
             **({"recommended_trials": list(self.recommended.trials)} if self.recommended else {}),
             **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Power:
-        """Read what `to_json` wrote."""
-        return cls(
-            n_trials=int(content.get("n_trials") or 0),
-            threshold=or_nan(content.get("threshold_sigma")),
-            false_alarms={str(name): or_nan(rate) for name, rate in (content.get("false_alarms") or {}).items()},
-            effects=tuple(EffectPower.from_json(entry) for entry in content.get("effects") or ()),
-            not_testable={
-                str(name): Remark.from_json(why) for name, why in (content.get("not_testable_codes") or {}).items()
-            },
-            numbers=tuple(map(NumberWidth.from_json, content.get("numbers") or ())),
-            inputs=tuple(PowerInput(**entry) for entry in content.get("inputs") or ()),
-            model=tuple(content.get("model") or ()),
-            wary=Remark.from_json(content.get("wary_code")),
-        )
 
     def plot(self, name: str = "power", **options: Any) -> Figure:
         """Draw the map of effects against size."""

@@ -16,6 +16,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,11 +33,13 @@ from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
     LARGEST_SPREAD,
     LEAST_BETWEEN_TRIAL_SD,
+    eliminated,
     marginal,
     normal_equations,
     solve_per_trial,
+    step_within_bounds,
 )
-from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
+from vinetrack.inference.optimiser import FixedTerms, make_problem, solve
 from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -292,21 +295,6 @@ def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "th
 
 
 @dataclass(frozen=True)
-class ScatterLevels:
-    """Likelihood of the trials so far near the best values, for several assumed pairs of between-trial standard
-    deviations, along the first axis. `spread` and `factors` (on the fitted pair), shape (n_levels, 2); `information`,
-    (n_levels, n_free, n_free), and `gradient`, (n_levels, n_free), of half the sum of squares at the best values (not
-    zero at a bound); `rise` of −2 ln L, (n_levels,).
-    """
-
-    spread: Floats
-    factors: Floats
-    information: Floats
-    gradient: Floats
-    rise: Floats
-
-
-@dataclass(frozen=True)
 class Hypothesis:
     """One of the tied fits, extended to further conditions. `layout` maps the free parameters to the trials of the
     conditions: those of the fit first, then those of new vines. All are scaled as in the fit; `theta`, shape (n_free,),
@@ -319,18 +307,21 @@ class Hypothesis:
     conditions: Sequence[Condition]
     layout: ParameterMap
     theta: Floats
-    levels: ScatterLevels
-    sd_of_new: Floats
     variance: float
     rest_frames: int
     frames_behind_end: int
     longest_s: float
 
     @property
+    def n_old(self) -> int:
+        """Number of free parameters of the fit."""
+        return self.fit.solution.state.theta.size
+
+    @property
     def room(self) -> tuple[Floats, Floats]:
-        """Distance of each parameter to its lower and upper bound, shape (n_free,) each; the first is negative."""
+        """Distance of each parameter to its lower and upper bound, shape (n_free,) each."""
         lower, upper = self.layout.bounds
-        return np.minimum(lower - self.theta, 0.0), np.maximum(upper - self.theta, 0.0)
+        return np.maximum(self.theta - lower, 0.0), np.maximum(upper - self.theta, 0.0)
 
     def frame_s(self, place: int) -> float:
         """Frame interval of a condition: that of the trial it is modelled on."""
@@ -359,9 +350,14 @@ class Hypothesis:
             )
         rows = list(places)
         layout = replace(self.layout, index=self.layout.index[rows], base=self.layout.base[rows])
-        predictor = Predictor(layout, items, self.fit.predictor.host)
-        predictor.steps = self.fit.predictor.steps.copy()
-        return predictor
+        return _stepped_as(self.fit, layout, items)
+
+
+def _stepped_as(fit: Fit, layout: ParameterMap, data: Sequence[FitTrial]) -> Predictor:
+    """A predictor with the finite-difference steps of a fit."""
+    predictor = Predictor(layout, data, fit.predictor.host)
+    predictor.steps = fit.predictor.steps.copy()
+    return predictor
 
 
 def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
@@ -387,46 +383,20 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
                 row[column] = places[key, trial.vine]
         index.append(row)
         base.append(values)
-    added = numbers[len(old.free) :]
-    # 1.0: prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
-    precision_of_new = np.array([1 / 1.0**2 + (number.scale / number.prior_sd) ** 2 for number in added])
-    stated_sd = [number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0 for number in added]
-    sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
+    layout = ParameterMap(old.model, tuple(numbers), old.keys, np.array(index), np.array(base))
     everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
     moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
     return Hypothesis(
         name=name,
         fit=fit,
         conditions=conditions,
-        layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index), np.array(base)),
-        theta=np.concatenate([state.theta, [number.to_scaled(number.start) for number in added]]),
-        levels=_scatter_levels(fit, precision_of_new),
-        sd_of_new=np.array(sd_of_new),
+        layout=layout,
+        theta=np.concatenate([state.theta, layout.start[state.theta.size :]]),
         variance=float(np.exp(np.mean(np.log(state.variance)))),
         rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
         frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
         longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
     )
-
-
-def _scatter_levels(fit: Fit, precision_of_new: Floats) -> ScatterLevels:
-    """Likelihood of the trials so far at every scatter that a refit may estimate; new parameters have only priors."""
-    state, problem = fit.solution.state, fit.solution.problem
-    reduced = marginal(fit.solution.cross_products, problem, state)
-    fitted = np.maximum(state.spread, LEAST_BETWEEN_TRIAL_SD)
-    may_grow = np.array(fit.solution.estimable) & (np.array(state.spread) > LEAST_BETWEEN_TRIAL_SD)
-    # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
-    factors = np.array([(1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)])
-    spreads = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted)
-    pairs: list[tuple[float, float]] = list(dict.fromkeys(map(tuple, spreads.tolist())))
-    n_old = state.theta.size
-    of_new = np.diag(np.concatenate([np.zeros(n_old), precision_of_new]))
-    information, gradient = np.stack([of_new] * len(pairs)), np.zeros((len(pairs), len(of_new)))
-    level = np.zeros(len(pairs))
-    for k, pair in enumerate(pairs):
-        of_old, gradient[k, :n_old], square, log_det = normal_equations(reduced, problem, state, pair)
-        information[k, :n_old, :n_old], level[k] = of_old, square + log_det
-    return ScatterLevels(np.array(pairs), np.array(pairs) / fitted, information, gradient, level - level[0])
 
 
 def _behind_end(trial_data: FitTrial) -> int:
@@ -449,30 +419,37 @@ def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float]
     does not in time), for every condition; None where it is not worth filming or the model is in doubt.
     """
     last = hypotheses[-1]
-    every, longest_s = range(len(last.conditions)), last.longest_s
+    every, longest_s, fit = range(len(last.conditions)), last.longest_s, last.fit
     trial_effects = np.zeros((len(every), N_TRIAL_EFFECTS))
     times = [np.linspace(0.0, longest_s, 400)] * len(every)
     predictors = [hypothesis.predictor(every, times) for hypothesis in hypotheses]
     jobs_of = [p.jobs(hypothesis.theta, trial_effects) for p, hypothesis in zip(predictors, hypotheses, strict=True)]
     runs = [_simulated(predictor, jobs) for predictor, jobs in zip(predictors, jobs_of, strict=True)]
-    # 1.05: ratio of tail speed to steady speed at the same pressure above which the model predicts compression in
-    # the tail (chosen)
-    largest_ratio = max(1.05, _largest_speed_ratio(last.fit))
+    # The largest ratio of tail speed to steady speed among the trials so far
+    made = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
+    seen = [
+        _speed_ratio(fit, trial_fit.trial, job, trial_fit.trial.travel_ratio * trial_fit.predicted_velocity_m_s)
+        for trial_fit, job in zip(fit.trials, made, strict=True)
+        if trial_fit.trial.travel_ratio != 1
+    ]
+    # 1.05: the ratio above which the model predicts compression in the tail (chosen)
+    largest_ratio = max(1.05, *filter(math.isfinite, seen))
     growth: list[tuple[float, float] | None] = []
     for i, condition in enumerate(last.conditions):
-        trajectories = [trajectory for trajectory in (run[i] for run in runs) if trajectory is not None]
-        if len(trajectories) < len(runs):
+        trajectories = [run[i] for run in runs]
+        moving = [trajectory for trajectory in trajectories if trajectory is not None]
+        if len(moving) < len(runs):
             growth.append(None)
             continue
         length_m = condition.trial.length_m
         near_m = np.nan_to_num(END_FRACTION * length_m, nan=math.inf)
-        near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in trajectories)
-        grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in trajectories)
-        ratio = _speed_ratio(last.fit, condition.trial, jobs_of[-1][i], trajectories[-1].tail_velocity_m_s)
+        near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in moving)
+        grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
+        ratio = _speed_ratio(fit, condition.trial, jobs_of[-1][i], moving[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
         grows_enough = grown_m > 0.3 * (length_m if math.isfinite(length_m) else 0.0)
         is_compressed = condition.trial.tail_slack != "free" and ratio > largest_ratio
-        ends_s = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
+        ends_s = max(m.end_time_s if m.status == "ended" else math.inf for m in moving)
         is_worth_it = grows_enough and not is_compressed and near_s > 8 * last.frame_s(i)
         growth.append((near_s, ends_s) if is_worth_it else None)
     return growth
@@ -502,22 +479,12 @@ def _speed_ratio(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) ->
     return float(np.max(tail_velocity_m_s)) / (drive_N / B) ** (1 / n)
 
 
-def _largest_speed_ratio(fit: Fit) -> float:
-    """Largest ratio of tail speed to steady speed among the trials of the experiment."""
-    jobs = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
-    ratios = [
-        _speed_ratio(fit, trial_fit.trial, job, trial_fit.trial.travel_ratio * trial_fit.predicted_velocity_m_s)
-        for trial_fit, job in zip(fit.trials, jobs, strict=True)
-        if trial_fit.trial.travel_ratio != 1
-    ]
-    return max((value for value in ratios if math.isfinite(value)), default=0.0)
-
-
 def film_trials(
     truth: Hypothesis, places: Sequence[int], theta: Floats, deviations: Floats, rng: np.random.Generator
-) -> list[FitTrial | None]:
+) -> list[tuple[int, FitTrial]]:
     """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise, and
-    select usable points as for a fit; None where there are too few. Shapes: theta (n_free,); deviations (n_places, 2).
+    select usable points as for a fit; without those that have too few. Shapes: theta (n_free,); deviations (n_places,
+    2).
     """
     rho, frames_s = truth.fit.solution.state.rho, [truth.frame_s(place) for place in places]
     times = [s * np.arange(truth.rest_frames + math.ceil(truth.longest_s / s), dtype=float) for s in frames_s]
@@ -527,23 +494,169 @@ def film_trials(
     trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(places))
     trial_effects[:, PRESSURE] = np.where(predictor.has_pressure_deviation, deviations[:, 0], 0.0)
     trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.has_damping_deviation, deviations[:, 1], 0.0)
-    tracks: list[FitTrial | None] = []
-    for i, (blank, moved) in enumerate(
-        zip(predictor.data, predictor.run(predictor.jobs(theta, trial_effects)), strict=True)
-    ):
+    moved = predictor.run(predictor.jobs(theta, trial_effects))
+    filmed: list[tuple[int, FitTrial]] = []
+    for place, blank, trajectory, effects in zip(places, predictor.data, moved, trial_effects, strict=True):
         stop = blank.time_s.size
-        if moved.status == "ended":
-            last_s = trial_effects[i, RELEASE] + moved.end_time_s
-            stop = min(stop, int(np.searchsorted(blank.time_s, last_s)) + truth.frames_behind_end)
+        if trajectory.status == "ended":
+            last = int(np.searchsorted(blank.time_s, effects[RELEASE] + trajectory.end_time_s))
+            stop = min(stop, last + truth.frames_behind_end)
         noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - rho**2)), rho, rng)
-        position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
+        position_m = effects[ORIGIN] + trajectory.observed_position_m[:stop] + noise
         pressure_Pa = None if blank.trace is None else np.full(stop, blank.trial.pressure_Pa)
-        try:
+        with suppress(FitError):
             track = plain_track(blank.time_s[:stop], position_m, pressure_Pa=pressure_Pa)
-            tracks.append(prepare_trial(blank.trial, track))
-        except FitError:
-            tracks.append(None)
-    return tracks
+            filmed.append((place, prepare_trial(blank.trial, track)))
+    return filmed
+
+
+# ------------------------------------------------------------------------------
+# Separation of hypotheses by designs, to first order.
+#
+# With its trial effects eliminated, a trial is a quadratic form in the unknowns of a campaign, and forms add up. Those
+# of a refit are the free parameters of the hypothesis and, for each hypothesis that may be true, by how much the trial
+# moves as it says: minimised over the first, the diagonal of the others is what the refit does not explain.
+
+
+def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
+    """Blocks of trials at the unknowns of a campaign; those at −1 or `size` are dropped. Shapes: blocks (n, k, k);
+    index (n, k) → (n, size, size).
+    """
+    placed = np.zeros((len(blocks), size + 1, size + 1))
+    np.add.at(placed, (np.arange(len(blocks))[:, None, None], index[:, :, None], index[:, None, :]), blocks)
+    return placed[:, :size, :size]
+
+
+@dataclass(frozen=True)
+class RefitTerms(Hypothesis):
+    """−2 ln L of a refitted hypothesis at several assumed pairs of between-trial standard deviations (levels), as
+    quadratic forms in its free parameters and in the motion by each hypothesis. `so_far`, shape (n_levels, n, n), is
+    that of the trials so far near the best values, with its rise from level to level on the diagonal of the motions;
+    `each`, (n_levels, n_conditions, n, n), that of one trial of each condition.
+    """
+
+    so_far: Floats
+    each: Floats
+
+
+def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[RefitTerms]:
+    """Return the quadratic forms of each hypothesis, with one trial of each condition, at its best values so far."""
+    times, weights = zip(*(_times(hypotheses[0], k, *course) for k, course in enumerate(courses)), strict=True)
+    trial_effects = np.zeros((len(courses), N_TRIAL_EFFECTS))
+    predictors = [hypothesis.predictor(range(len(courses)), times) for hypothesis in hypotheses]
+    columns = [
+        np.stack(p.linearise(hypothesis.theta, trial_effects))
+        for p, hypothesis in zip(predictors, hypotheses, strict=True)
+    ]
+    root_weights = np.sqrt(np.stack(weights))[:, :, None]
+    # The last column is placeholder − motion; the placeholder cancels in the difference of two hypotheses.
+    motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
+    terms = []
+    for k, (hypothesis, sensitivities, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
+        # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
+        scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
+        differences = motions - motions[:, :, [k]]
+        both = scale * root_weights * np.concatenate([sensitivities[:, :, :-1], differences], axis=2)
+        products = np.swapaxes(both, 1, 2) @ both
+        spreads, factors, so_far = _so_far(hypothesis, len(hypotheses))
+        size, total = hypothesis.theta.size, so_far.shape[1]
+        true = np.arange(size, total)
+        index = np.concatenate([hypothesis.layout.index, np.tile(true, (len(courses), 1))], axis=1)
+        has_deviations = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
+        each = []
+        for spread, factor in zip(spreads, factors, strict=True):
+            precision = np.full((len(courses), N_TRIAL_EFFECTS), 1e-9)
+            precision[:, DEVIATION_COLUMNS] = 1 / spread**2
+            each.append(at_unknowns(eliminated(products, precision)[0], index, total))
+            scatter_rise = has_deviations @ (2 * np.log(factor) + 1 / factor**2 - 1)
+            each[-1][:, true, true] += scatter_rise[:, None]
+        terms.append(RefitTerms(**vars(hypothesis), so_far=so_far, each=np.stack(each)))
+    return terms
+
+
+def _so_far(hypothesis: Hypothesis, n_true: int) -> tuple[Floats, Floats, Floats]:
+    """Pairs of between-trial standard deviations that a refit may estimate, the fitted ones first, their factors on
+    those, shape (n_levels, 2) each, and the quadratic form of the trials so far at each, see `RefitTerms`.
+    """
+    solution, old, size = hypothesis.fit.solution, hypothesis.n_old, hypothesis.theta.size
+    spread = np.array(solution.state.spread)
+    fitted = np.maximum(spread, LEAST_BETWEEN_TRIAL_SD)
+    may_grow = np.array(solution.estimable) & (spread > LEAST_BETWEEN_TRIAL_SD)
+    # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
+    factors = np.array([(1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)])
+    spreads = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted)
+    pairs: list[tuple[float, float]] = list(dict.fromkeys(map(tuple, spreads.tolist())))
+    reduced = marginal(solution.cross_products, solution.problem, solution.state)
+    so_far, level = np.zeros((len(pairs), size + n_true, size + n_true)), np.zeros(len(pairs))
+    for k, pair in enumerate(pairs):
+        information, slope, square, log_det = normal_equations(reduced, solution.problem, solution.state, pair)
+        so_far[k, :old, :old], so_far[k, :old, size:], level[k] = information, slope[:, None], square + log_det
+    # 1.0: prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
+    new, true = np.arange(old, size), np.arange(size, size + n_true)
+    so_far[:, new, new] = 1 / 1.0**2 + hypothesis.layout.prior_precision[old:]
+    so_far[:, true, true] = (level - level[0])[:, None]
+    return np.array(pairs), np.array(pairs) / fitted, so_far
+
+
+def _times(hypothesis: Hypothesis, place: int, near_end_s: float, ends_s: float) -> tuple[Floats, Floats]:
+    """Times since release at which a condition is evaluated, and the number of frames that each represents. The first
+    represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
+    """
+    points = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
+    frame_s, step_s = hypothesis.frame_s(place), near_end_s / points
+    moving = (np.arange(points) + 0.5) * step_s
+    ends_filmed = np.isfinite(ends_s) and hypothesis.frames_behind_end > 0
+    last_s = 1.05 * ends_s if ends_filmed else moving[-1] + step_s  # just past the end
+    weights = np.full(points + 2, step_s / frame_s)
+    weights[0], weights[-1] = hypothesis.rest_frames, hypothesis.frames_behind_end if ends_filmed else 0.0
+    return np.concatenate([[-frame_s], moving, [last_s]]), weights
+
+
+def separations(terms: Sequence[RefitTerms], designs: Sequence[Sequence[int]] | NDArray[np.int_]) -> Floats:
+    """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal. Shapes:
+    designs (n_designs, n_trials) → (n_designs, n, n).
+    """
+    n, designs = len(terms), np.asarray(designs)
+    conditions = np.unique(designs)
+    squares = np.zeros((len(designs), n, n))
+    for b, refitted in enumerate(terms):
+        size = refitted.theta.size
+        # Parameters of the fit, and of the new vines among these conditions
+        use = np.union1d(np.arange(refitted.n_old), refitted.layout.index[conditions])
+        use = use[use >= 0]
+        below, above = (room[use] for room in refitted.room)
+        rows = np.append(use, np.arange(size, size + n))
+        least = np.full((len(designs), n), math.inf)
+        for so_far, each in zip(refitted.so_far, refitted.each, strict=True):
+            of_conditions = each[:, rows[:, None], rows]
+            form = sum(of_conditions[designs[:, k]] for k in range(designs.shape[1])) + so_far[rows[:, None], rows]
+            for a in range(n):
+                if a != b:
+                    gain = _largest_gain(
+                        form[:, : use.size, : use.size], form[:, : use.size, use.size + a], below, above
+                    )
+                    least[:, a] = np.minimum(least[:, a], form[:, use.size + a, use.size + a] - gain)
+        squares[:, :, b] = np.where(np.arange(n) == b, 0.0, least)
+    return np.sqrt(np.maximum(squares, 0.0))
+
+
+def _largest_gain(information: Floats, gradient: Floats, below: Floats, above: Floats) -> Floats:
+    """Largest 2 gᵀδ − δᵀIδ with δ from −`below` to `above`, shape (n_designs,)."""
+    step = solve_per_trial(information, gradient[:, :, None])[:, :, 0]
+    free = np.ones(below.size, dtype=bool)
+    for k in np.flatnonzero(np.any((step < -below) | (step > above), axis=1)):
+        step[k], _ = step_within_bounds(information[k].copy(), gradient[k].copy(), below, above, free)
+    return np.asarray(2 * np.sum(gradient * step, axis=1) - np.einsum("ni,nij,nj->n", step, information, step))
+
+
+def worth(between: Floats) -> Floats:
+    """Return the worth of designs: the sum over pairs of d²/(d² + 5²), d the smaller separation of the two directions.
+    Shapes: between (n_designs, n, n) → (n_designs,).
+    """
+    first, second = np.triu_indices(between.shape[1], 1)
+    square = np.minimum(between[:, first, second], between[:, second, first]) ** 2
+    # 5.0: separation, in standard deviations, at which a pair has half of its largest worth (chosen)
+    return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
 
 
 # ------------------------------------------------------------------------------
@@ -564,12 +677,11 @@ class PartlyLinear(Predictor):
 
     separable = False
 
-    def __init__(self, layout: ParameterMap, old: Predictor, solution: Solution, new: Sequence[FitTrial]) -> None:
-        super().__init__(layout, [*old.data, *new], old.host)
-        self.n_old, self.expansion_point, self.old_columns = len(old.data), solution.state, solution.columns
-        new_layout = replace(layout, index=layout.index[self.n_old :], base=layout.base[self.n_old :])
-        self.new = Predictor(new_layout, new, old.host)
-        self.new.steps = old.steps.copy()
+    def __init__(self, layout: ParameterMap, fit: Fit, new: Sequence[FitTrial]) -> None:
+        super().__init__(layout, [*fit.predictor.data, *new], fit.predictor.host)
+        self.n_old, self.fitted = len(fit.predictor.data), fit.solution
+        of_new = replace(layout, index=layout.index[self.n_old :], base=layout.base[self.n_old :])
+        self.new = _stepped_as(fit, of_new, new)
 
     def linearise(
         self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
@@ -577,9 +689,8 @@ class PartlyLinear(Predictor):
         """Sensitivities and residuals, as `Predictor.linearise`; the sensitivities of the old trials are constant.
         Shapes: theta (n_free,); trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points, n_columns + 1).
         """
-        residuals = self.residuals_of_old(theta, trial_effects)
-        columns = [np.column_stack([of_fit[:, :-1], r]) for of_fit, r in zip(self.old_columns, residuals, strict=True)]
-        return columns + self.new.linearise(
+        of_old = zip(self.fitted.columns, self._residuals_of_old(theta, trial_effects), strict=True)
+        return [np.column_stack([columns[:, :-1], residual]) for columns, residual in of_old] + self.new.linearise(
             theta, trial_effects[self.n_old :], trial_effects_only=trial_effects_only, past_end=past_end
         )
 
@@ -588,22 +699,20 @@ class PartlyLinear(Predictor):
         (n_free,); effect_sets (n_trials, N_TRIAL_EFFECTS) → (n_points,).
         """
         return [
-            self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
+            self._residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
             for trial_effects in effect_sets
         ]
 
-    def residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted positions of the old trials, m, to first order. Shapes: theta (n_free,);
-        trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points,).
-        """
-        at = self.expansion_point
+    def _residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
+        """Measured minus predicted positions of the old trials, m, to first order."""
+        at, columns = self.fitted.state, self.fitted.columns
         change = np.append(theta[: at.theta.size] - at.theta, np.zeros(theta.size - at.theta.size + 1))
         steps = np.hstack([trial_effects[: self.n_old] - at.trial_effects, change[self.layout.index[: self.n_old]]])
-        return [of_fit[:, -1] - of_fit[:, :-1] @ step for of_fit, step in zip(self.old_columns, steps, strict=True)]
+        return [of_fit[:, -1] - of_fit[:, :-1] @ step for of_fit, step in zip(columns, steps, strict=True)]
 
 
 def simulated_rises(
-    hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
+    hypotheses: Sequence[RefitTerms], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
 ) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
     values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
@@ -618,45 +727,57 @@ def simulated_rises(
     for k, a in np.ndindex(len(draws), n):
         rng = np.random.default_rng([seed, int(thorough), draws[k], a])
         truth = hypotheses[a]
-        theta = draw_parameters(truth, rng) if thorough else truth.theta
+        theta = _drawn_parameters(truth, rng) if thorough else truth.theta
         in_turn = alternating[(np.arange(len(design)) + draws[k]) % 4]
         deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
         try:
-            filmed = film_trials(truth, design, theta, deviations * truth.fit.solution.state.spread, rng)
+            new = film_trials(truth, design, theta, deviations * truth.fit.solution.state.spread, rng)
         except SimulationError:
             continue
-        new = [(place, trial_data) for place, trial_data in zip(design, filmed, strict=True) if trial_data is not None]
         if new:
-            after = np.array([_refitted(hypothesis, new, thorough=thorough) for hypothesis in hypotheses])
+            after = np.array([_refitted(hypothesis, new, thorough) for hypothesis in hypotheses])
             rises[k, a] = after - before - (after[a] - before[a])
     return rises
 
 
-def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
+def _drawn_parameters(truth: RefitTerms, rng: np.random.Generator) -> Floats:
     """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
     Returns free parameters, scaled, within their bounds. Shape (n_free,).
     """
     furthest_draw = 2.0  # Standard deviations at which draws are clipped: the linearised fit holds no further (chosen)
-    old = hypothesis.fit.predictor.layout.start.size
-    values, vectors = np.linalg.eigh(hypothesis.levels.information[0, :old, :old])
+    old = truth.n_old
+    values, vectors = np.linalg.eigh(truth.so_far[0, :old, :old])
     is_determined = values > 1e-9 * values[-1]
     sd = np.where(is_determined, 1 / np.sqrt(np.where(is_determined, values, 1.0)), 0.0)
     normal = np.clip(rng.standard_normal(old), -furthest_draw, furthest_draw)
-    of_new = rng.standard_normal(hypothesis.sd_of_new.size) * hypothesis.sd_of_new
-    down, up = hypothesis.room
-    return np.asarray(hypothesis.theta + np.clip(np.concatenate([vectors @ (sd * normal), of_new]), down, up))
+    added = truth.layout.free[old:]
+    stated_sd = [new.prior_sd / new.scale if math.isfinite(new.prior_sd) else 0.0 for new in added]
+    sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
+    change = np.concatenate([vectors @ (sd * normal), rng.standard_normal(len(added)) * np.array(sd_of_new)])
+    below, above = truth.room
+    return np.asarray(truth.theta + np.clip(change, -below, above))
 
 
-def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, thorough: bool) -> float:
-    """−2 ln L of a hypothesis fitted to old and new trials; NaN where the fit fails."""
+def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], thorough: bool) -> float:
+    """−2 ln L of a hypothesis fitted to old trials and to new ones of these conditions; NaN where the fit fails."""
     most = 20  # Iterations of a refit, at most (chosen)
-    places, data = [place for place, _ in new], [trial_data for _, trial_data in new]
-    layout, old = _extended_layout(hypothesis, places), hypothesis.fit.solution
-    quick = PartlyLinear(layout, hypothesis.fit.predictor, old, data)
+    fit, old = hypothesis.fit, hypothesis.fit.solution
+    # Of the parameters of new vines only those that the new trials depend on are free.
+    before, wide, rows = fit.predictor.layout, hypothesis.layout, [place for place, _ in new]
+    used = np.union1d(np.arange(hypothesis.n_old), wide.index[rows][wide.index[rows] >= 0])
+    index = np.where(wide.index[rows] < 0, -1, np.searchsorted(used, wide.index[rows]))
+    layout = ParameterMap(
+        wide.model,
+        tuple(wide.free[k] for k in used),
+        wide.keys,
+        np.concatenate([before.index, index]),
+        np.concatenate([before.base, wide.base[rows]]),
+    )
+    data = [trial_data for _, trial_data in new]
+    quick = PartlyLinear(layout, fit, data)
     try:
         # New releases are aligned, and the noise of the new trials is that of the old.
-        theta = layout.start
-        theta[: old.state.theta.size] = old.state.theta
+        theta = np.concatenate([old.state.theta, layout.start[hypothesis.n_old :]])
         aligned, _ = align(data, quick.new, theta, initial_trial_effects(data))
         state = replace(
             old.state,
@@ -664,200 +785,17 @@ def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], *, th
             trial_effects=np.concatenate([old.state.trial_effects, aligned]),
             variance=np.concatenate([old.state.variance, np.full(len(data), hypothesis.variance)]),
         )
-        problem, before = make_problem(quick, state.trial_effects), old.problem.release_origin_mean
-        means = np.concatenate([before, problem.release_origin_mean[len(before) :]])
-        problem = replace(problem, release_origin_mean=means)
+        problem = make_problem(quick, state.trial_effects)
+        problem.release_origin_mean[: quick.n_old] = old.problem.release_origin_mean
         # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
         fixed = FixedTerms(state.spread, (state.rho, state.variance))
         solution = solve(quick, problem, state, fixed, warm=True, most_iterations=most)
         whole: Predictor = quick
-        if thorough and all(trial_data.trace is None for trial_data in quick.data[: quick.n_old]):
-            whole = Predictor(layout, quick.data, quick.host)
+        if thorough and all(trial_data.trace is None for trial_data in fit.predictor.data):
+            whole = _stepped_as(fit, layout, quick.data)
             whole.steps = quick.new.steps.copy()
         solution = solve(whole, problem, solution.state, warm=True, most_iterations=most)
         smooth = smooth_errors(whole, solution)  # which absorb part of what is wrong in a hypothesis, as in every fit
     except SimulationError:
         return math.nan
     return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))
-
-
-def _extended_layout(hypothesis: Hypothesis, places: Sequence[int]) -> ParameterMap:
-    """Parameter map of old and new trials; of the new parameters only those that the new trials depend on are free."""
-    before, wide = hypothesis.fit.predictor.layout, hypothesis.layout
-    old = len(before.free)
-    needed = np.unique(wide.index[list(places)])
-    used = [*range(old), *needed[needed >= old].tolist()]
-    order = {place: k for k, place in enumerate(used)} | {-1: -1}
-    index = np.vectorize(order.__getitem__, otypes=[int])(wide.index[list(places)])
-    return ParameterMap(
-        wide.model,
-        tuple(wide.free[k] for k in used),
-        wide.keys,
-        np.concatenate([before.index, index]),
-        np.concatenate([before.base, wide.base[list(places)]]),
-    )
-
-
-# ------------------------------------------------------------------------------
-# Separation of hypotheses by designs, to first order.
-
-
-@dataclass(frozen=True)
-class RefitTerms:
-    """Quadratic form of −2 ln L of one hypothesis, refitted to one trial of every condition; beside the information of
-    the trials so far in its `levels`, which are the first axis here too. `information`, shape (n_levels, n_conditions,
-    n_free, n_free); `gradient`, (n_levels, n_conditions, n_free, n_hypotheses), and `misfit`, (n_levels,
-    n_conditions, n_hypotheses), with the rise of the scatter, if each hypothesis is true.
-    """
-
-    hypothesis: Hypothesis
-    information: Floats
-    gradient: Floats
-    misfit: Floats
-
-
-def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[RefitTerms]:
-    """Return the quadratic form of each hypothesis, with one trial of each condition, at its best values so far."""
-    times, weights = zip(*(_times(hypotheses[0], k, *course) for k, course in enumerate(courses)), strict=True)
-    trial_effects = np.zeros((len(courses), N_TRIAL_EFFECTS))
-    predictors = [hypothesis.predictor(range(len(courses)), times) for hypothesis in hypotheses]
-    columns = [
-        np.stack(p.linearise(hypothesis.theta, trial_effects))
-        for p, hypothesis in zip(predictors, hypotheses, strict=True)
-    ]
-    root_weights = np.sqrt(np.stack(weights))[:, :, None]
-    # The last column is placeholder − motion; the placeholder cancels in the difference of two hypotheses.
-    motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
-    terms = []
-    for k, (hypothesis, sensitivities, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
-        # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
-        scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
-        differences = motions - motions[:, :, [k]]
-        both = scale * root_weights * np.concatenate([sensitivities[:, :, :-1], differences], axis=2)
-        products = np.swapaxes(both, 1, 2) @ both
-        levels = hypothesis.levels
-        by_level = [_without_trial_effects(hypothesis, spread, products) for spread in levels.spread]
-        information, gradient, misfit = (np.stack(part) for part in zip(*by_level, strict=True))
-        has_deviations = np.stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
-        scatter_rise = (2 * np.log(levels.factors) + 1 / levels.factors**2 - 1) @ has_deviations.astype(float)
-        terms.append(RefitTerms(hypothesis, information, gradient, misfit + scatter_rise[:, :, None]))
-    return terms
-
-
-def _times(hypothesis: Hypothesis, place: int, near_end_s: float, ends_s: float) -> tuple[Floats, Floats]:
-    """Times since release at which a condition is evaluated, and the number of frames that each represents. The first
-    represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
-    """
-    points = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
-    frame_s, step_s = hypothesis.frame_s(place), near_end_s / points
-    moving = (np.arange(points) + 0.5) * step_s
-    ends_filmed = np.isfinite(ends_s) and hypothesis.frames_behind_end > 0
-    last_s = 1.05 * ends_s if ends_filmed else moving[-1] + step_s  # just past the end
-    weights = np.full(points + 2, step_s / frame_s)
-    weights[0], weights[-1] = hypothesis.rest_frames, hypothesis.frames_behind_end if ends_filmed else 0.0
-    return np.concatenate([[-frame_s], moving, [last_s]]), weights
-
-
-def _without_trial_effects(hypothesis: Hypothesis, spread: Floats, products: Floats) -> tuple[Floats, Floats, Floats]:
-    """Information, gradient and misfit over all free parameters, trial effects eliminated (Schur complement)."""
-    precision = np.full(N_TRIAL_EFFECTS, 1e-9)
-    precision[list(DEVIATION_COLUMNS)] = 1 / spread**2
-    within_trial = products[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + np.diag(precision)
-    reduced = products[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - products[
-        :, N_TRIAL_EFFECTS:, :N_TRIAL_EFFECTS
-    ] @ solve_per_trial(within_trial, products[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:])
-    index = hypothesis.layout.index
-    n, keys, size = len(products), index.shape[1], hypothesis.theta.size
-    every = np.arange(n)
-    information = np.zeros((n, size + 1, size + 1))  # the last row and column collect what is not free (index −1)
-    np.add.at(information, (every[:, None, None], index[:, :, None], index[:, None, :]), reduced[:, :keys, :keys])
-    gradient = np.zeros((n, size + 1, reduced.shape[2] - keys))
-    np.add.at(gradient, (every[:, None], index), reduced[:, :keys, keys:])
-    return information[:, :size, :size], gradient[:, :size], np.einsum("nkk->nk", reduced[:, keys:, keys:])
-
-
-def separations(terms: Sequence[RefitTerms], designs: Sequence[Sequence[int]] | NDArray[np.int_]) -> Floats:
-    """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal. Shapes:
-    designs (n_designs, n_trials) → (n_designs, n, n).
-    """
-    n, designs = len(terms), np.asarray(designs)
-    conditions = np.unique(designs)
-    squares = np.zeros((len(designs), n, n))
-    for b, refitted in enumerate(terms):
-        levels, (down, up) = refitted.hypothesis.levels, refitted.hypothesis.room
-        # Parameters about which these conditions or the trials so far have information
-        has_new = np.any(refitted.information[0][conditions].diagonal(axis1=1, axis2=2) > 0, axis=0)
-        has_old = (np.abs(levels.gradient[0]) > 0) | (np.count_nonzero(levels.information[0], axis=0) > 1)
-        use = np.flatnonzero(has_new | has_old)
-        for level, old_rise in enumerate(levels.rise):
-            information = _over_trials(refitted.information[level][:, use[:, None], use], designs)
-            information += levels.information[level][use[:, None], use]
-            gradient = levels.gradient[level][use, None] + _over_trials(refitted.gradient[level][:, use], designs)
-            misfit = _over_trials(refitted.misfit[level], designs) + old_rise
-            for a in range(n):
-                if a != b:
-                    square = misfit[:, a] - _largest_gain(information, gradient[:, :, a], down[use], up[use])
-                    squares[:, a, b] = square if level == 0 else np.minimum(squares[:, a, b], square)
-    return np.sqrt(np.maximum(squares, 0.0))
-
-
-def _over_trials(by_condition: Floats, designs: NDArray[np.int_]) -> Floats:
-    return np.asarray(sum(by_condition[designs[:, k]] for k in range(designs.shape[1])))
-
-
-def _largest_gain(information: Floats, gradient: Floats, down: Floats, up: Floats) -> Floats:
-    """Largest 2 gᵀδ − δᵀIδ with every δ within its bounds, shape (n_designs,), by an active-set method. A parameter
-    that would cross a bound is fixed there, and the others are solved again. None is released again, which seldom, and
-    then by little, overestimates the separation.
-    """
-    n, size = gradient.shape
-    step = np.zeros((n, size))
-    fixed: NDArray[np.bool_] = np.broadcast_to((down == 0) & (up == 0), (n, size)).copy()
-    for _ in range(4):
-        free = ~fixed
-        right = np.where(free, gradient - np.einsum("nij,nj->ni", information, np.where(fixed, step, 0.0)), 0.0)
-        of_free = information * (free[:, :, None] & free[:, None, :]) + fixed[:, :, None] * np.eye(size)
-        solved = solve_per_trial(of_free, right[:, :, None])[:, :, 0]
-        step = np.where(free, solved, step)
-        crossed = free & ((step < down) | (step > up))
-        if not crossed.any():
-            break
-        step = np.clip(step, down, up)
-        fixed |= crossed
-    return np.asarray(2 * np.sum(gradient * step, axis=1) - np.einsum("ni,nij,nj->n", step, information, step))
-
-
-def worth(between: Floats) -> Floats:
-    """Return the worth of designs: the sum over pairs of d²/(d² + 5²), d the smaller separation of the two directions.
-    Shapes: between (n_designs, n, n) → (n_designs,).
-    """
-    n = between.shape[1]
-    first, second = np.triu_indices(n, 1)
-    square = np.minimum(between[:, first, second], between[:, second, first]) ** 2
-    # 5.0: separation, in standard deviations, at which a pair has half of its largest worth (chosen)
-    return np.asarray(np.sum(square / (square + 5.0**2), axis=1))
-
-
-def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.intp], trials: int) -> tuple[list[int], float]:
-    """Find the trials that separate best: replicates of one condition, exchanged one at a time. Returns design
-    (indices among all conditions, increasing), worth (see `worth`).
-    """
-
-    def worth_with(others: list[int]) -> Floats:
-        return worth(separations(terms, [[*others, k] for k in allowed]))
-
-    values = _worth_of_replicates(terms, allowed, trials)
-    start = [int(allowed[int(np.argmax(values))])] * trials
-    design, best = exchanged(start, float(np.max(values)), allowed, worth_with)
-    return sorted(design), best
-
-
-def best_new_vines(terms: Sequence[RefitTerms], places: NDArray[np.intp], trials: int, most: int) -> list[str]:
-    """Return the new vines in order of the worth of replicates at their best condition, best first."""
-    conditions = terms[0].hypothesis.conditions
-    order = np.argsort(-_worth_of_replicates(terms, places, trials))
-    return list(dict.fromkeys(conditions[places[k]].trial.vine for k in order))[:most]
-
-
-def _worth_of_replicates(terms: Sequence[RefitTerms], places: NDArray[np.intp], trials: int) -> Floats:
-    return worth(separations(terms, np.repeat(places[:, None], trials, axis=1)))
