@@ -37,13 +37,12 @@ from vinetrack.planning.predictive_inputs import (
     predictive_inputs,
 )
 
-POINTS = 400  # Times at which each draw is evaluated (derived)
-
 
 @dataclass(frozen=True)
 class Runs:
     """Simulated draws, SI. Arrays have shape (n_draws,), or (n_draws, n_places) along `places_m`. At a place that a
-    draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge. Forces are those of the
+    draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge; `steady_tail_m_s` is that
+    of (P − P_y)A = B ẋⁿ, without weight or further effects, NaN for a model without damping. Forces are those of the
     first draws only; `slack` is whether the tail is compressed or slack.
     """
 
@@ -61,59 +60,60 @@ class Runs:
 
 def run(inputs: PredictiveInputs, places_m: Floats, samples: int, seed: int) -> Runs:
     """Draw predictive inputs and simulate every draw. Shapes: places_m (n_places,)."""
-    trials, rows = inputs.laid_out(inputs.draw(samples, seed))
-    moved, until_s = grown(inputs.model, trials, rows)
-    n_forces = min(samples, 300)  # Draws whose forces are evaluated, a third of a millisecond each (chosen)
-    time_s, velocity_m_s = np.full((samples, places_m.size), math.inf), np.zeros((samples, places_m.size))
-    tension_N, pressure_Pa = (np.full((n_forces, places_m.size), math.nan) for _ in range(2))
-    least_N, slack = np.full(n_forces, math.nan), np.zeros(n_forces)
-    for i, (trial, trajectory) in enumerate(zip(trials, moved, strict=True)):
+    model, names = inputs.model, inputs.model.parameter_names
+    trials, rows = inputs.drawn_trials(samples, seed)
+    moved, end_s = grown(model, trials, rows)
+    tension_N, pressure_Pa, least_N, slack = [], [], [], []
+    # 300: draws whose forces are evaluated, a third of a millisecond each (chosen)
+    for trial, row, trajectory in zip(trials[:300], rows.tolist(), moved, strict=False):
         position_m, lead_m_s = trajectory.lead_position_m, trajectory.lead_velocity_m_s
-        reached = places_m <= position_m[-1]
-        time_s[i, reached] = np.interp(places_m[reached], position_m, trajectory.time_s)
-        velocity_m_s[i, reached] = np.interp(places_m[reached], position_m, lead_m_s)
-        if i >= n_forces:
-            continue
-        model = replace(inputs.model, values=dict(zip(inputs.model.parameter_names, rows[i].tolist(), strict=True)))
-        terms = evaluate(model, trial, trajectory.time_s, position_m, lead_m_s)
+        terms = evaluate(
+            replace(model, values=dict(zip(names, row, strict=True))), trial, trajectory.time_s, position_m, lead_m_s
+        )
         drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
         tension = np.where(np.abs(terms.tension_N) < 1e-9 * drive_N, 0.0, terms.tension_N)
-        tension_N[i, reached] = np.interp(places_m[reached], position_m, tension)
-        pressure_Pa[i, reached] = np.interp(places_m[reached], position_m, terms.pressure_Pa)
+        tension_N.append(np.interp(places_m, position_m, tension, right=math.nan))
+        pressure_Pa.append(np.interp(places_m, position_m, terms.pressure_Pa, right=math.nan))
         moving = (position_m <= places_m[-1]) & (lead_m_s > 0)
-        if moving.any():
-            least_N[i] = np.min(tension[moving])
-        may_go_slack = trial.tail_slack == "free"
+        least_N.append(np.min(tension[moving]) if moving.any() else math.nan)
         # 0.01: compression of the tail from which the model is said to be in doubt, as a fraction of the
         # drive ½PA (chosen)
-        slack[i] = math.isfinite(trajectory.slack_from_s) if may_go_slack else least_N[i] < -0.01 * drive_N
-    last_m_s = np.array([trajectory.lead_velocity_m_s[-1] for trajectory in moved])
+        is_compressed = least_N[-1] < -0.01 * drive_N
+        slack.append(math.isfinite(trajectory.slack_from_s) if trial.tail_slack == "free" else is_compressed)
+    steady_m_s = np.full(samples, math.nan)
+    if DAMPING in names:
+        B, n = rows[:, names.index(DAMPING)], rows[:, names.index(EXPONENT)]
+        force_N = np.array([max(t.pressure_Pa - t.yield_pressure_Pa, 0.0) * t.area_m2 for t in trials])
+        with np.errstate(divide="ignore", over="ignore"):
+            steady_m_s = (force_N / B) ** (1 / n)
     return Runs(
         places_m=places_m,
-        time_s=time_s,
-        lead_velocity_m_s=velocity_m_s,
-        end_s=until_s,
-        end_lead_velocity_m_s=np.where(np.isfinite(until_s), last_m_s, 0.0),
-        steady_tail_m_s=_steady(inputs, trials, rows),
-        tension_N=tension_N,
-        least_tension_N=least_N,
-        pressure_Pa=pressure_Pa,
-        slack=slack,
+        time_s=np.array([np.interp(places_m, m.lead_position_m, m.time_s, right=math.inf) for m in moved]),
+        lead_velocity_m_s=np.array(
+            [np.interp(places_m, m.lead_position_m, m.lead_velocity_m_s, right=0.0) for m in moved]
+        ),
+        end_s=end_s,
+        end_lead_velocity_m_s=np.where(np.isfinite(end_s), [m.lead_velocity_m_s[-1] for m in moved], 0.0),
+        steady_tail_m_s=steady_m_s,
+        tension_N=np.array(tension_N),
+        least_tension_N=np.array(least_N),
+        pressure_Pa=np.array(pressure_Pa),
+        slack=np.array(slack),
     )
 
 
 def grown(
     model: Model, trials: Sequence[Trial], rows: Floats | None = None, host: Model | None = None
 ) -> tuple[list[Trajectory], Floats]:
-    """Simulate every trial at `POINTS` times of its growth. Returns trajectories, end_s (inf where a vine does not
-    reach its end). Shapes: rows (n_trials, n_parameters) → (n_trials,).
+    """Simulate every trial at 400 times of its growth. Returns trajectories, end_s (inf where a vine does not reach its
+    end). Shapes: rows (n_trials, n_parameters) → (n_trials,).
     """
     longest_s = 600.0  # Duration of a simulation, s (chosen)
     until_longest = [np.array([0.0, longest_s])] * len(trials)
     ends = simulate_many(model, trials, until_longest, parameters=rows, host=host)
     stop_s = np.array([last.end_time_s if last.status in ("ended", "stalled") else longest_s for last in ends])
     # Just before the end: without payload the speed diverges there, and is 0 after it.
-    times = [max(end, 1e-9) * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for end in stop_s]
+    times = [max(end, 1e-9) * (1 - 1e-9) * np.linspace(0.0, 1.0, 400) for end in stop_s]
     moved = simulate_many(model, trials, times, parameters=rows, host=host)
     return moved, np.where([last.status == "ended" for last in ends], stop_s, math.inf)
 
@@ -124,14 +124,13 @@ def final_speeds(
     """Return the final speed of every trial, m/s: a payload's at the end, else the leading edge's at `at_fraction`; 0
     for a vine that does not grow to its end. Shape (n_trials,).
     """
-    speeds = np.zeros(len(trials))
     moved, end_s = grown(model, trials, rows, host)
-    for k, (trial, trajectory) in enumerate(zip(trials, moved, strict=True)):
-        position_m, velocity_m_s = trajectory.lead_position_m, trajectory.lead_velocity_m_s
-        if told_by_payload(trial):
-            speeds[k] = trial.travel_ratio * velocity_m_s[-1]
-        else:
-            speeds[k] = np.interp(at_fraction * trial.length_m, position_m, velocity_m_s)
+    speeds = [
+        trial.travel_ratio * m.lead_velocity_m_s[-1]
+        if told_by_payload(trial)
+        else np.interp(at_fraction * trial.length_m, m.lead_position_m, m.lead_velocity_m_s)
+        for trial, m in zip(trials, moved, strict=True)
+    ]
     return np.where(np.isfinite(end_s), speeds, 0.0)
 
 
@@ -139,19 +138,8 @@ def drawn_final_speeds(
     inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int, only: Iterable[str] | None = None
 ) -> Floats:
     """Return the final speed in every draw, m/s, see `final_speeds`. Shape (n_draws,)."""
-    trials, rows = inputs.laid_out(inputs.draw(samples, seed, only))
+    trials, rows = inputs.drawn_trials(samples, seed, only)
     return final_speeds(inputs.model, trials, at_fraction, rows)
-
-
-def _steady(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> Floats:
-    """Tail speed of (P − P_y)A = B ẋⁿ, m/s, without weight or further effects; NaN for a model without damping."""
-    names = inputs.model.parameter_names
-    if DAMPING not in names:
-        return np.full(len(trials), math.nan)
-    B, n = rows[:, names.index(DAMPING)], rows[:, names.index(EXPONENT)]
-    force_N = np.array([max(t.pressure_Pa - t.yield_pressure_Pa, 0.0) * t.area_m2 for t in trials])
-    with np.errstate(divide="ignore", over="ignore"):
-        return np.asarray((force_N / B) ** (1 / n))
 
 
 CURVE_COLUMNS = (
@@ -224,8 +212,8 @@ class VinePrediction:
 
     @cached_property
     def neglected(self) -> tuple[Neglected, ...]:
-        """The final speed at the medians with each of the universal effects added, see `neglected`."""
-        return neglected(self.inputs, self.at_fraction)
+        """The final speed at the medians with each of the universal effects added, see `Neglected`."""
+        return _neglected(self.inputs, self.at_fraction)
 
     @property
     def table(self) -> pd.DataFrame:
@@ -308,15 +296,16 @@ def band(values: Floats) -> Floats:
 
 
 def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int) -> Iterator[Quantity]:
-    r, at = inputs.trial.travel_ratio, float(along[place])
+    trial, at = inputs.trial, float(along[place])
+    r = trial.travel_ratio
     speed = runs.lead_velocity_m_s[:, place]
 
     def quantity(name: str, where: float, values: Floats, unit: str) -> Quantity:
         low, median, high = (float(number) for number in band(values))
         return Quantity(name, where, low, median, high, unit)
 
-    if inputs.trial.payload_kg > 0:
-        if told_by_payload(inputs.trial) or not runs.slack.any():
+    if trial.payload_kg > 0:
+        if told_by_payload(trial) or not runs.slack.any():
             yield quantity(EJECTION, 1.0, r * runs.end_lead_velocity_m_s, "m/s")
         yield quantity("time to the end", 1.0, runs.end_s, "s")
     yield quantity(EDGE, at, speed, "m/s")
@@ -326,7 +315,7 @@ def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int)
         yield quantity("steady tail speed, Eq. (3)", math.nan, runs.steady_tail_m_s, "m/s")
     yield quantity(TENSION, at, runs.tension_N[:, place], "N")
     yield quantity(LEAST_TENSION, math.nan, runs.least_tension_N, "N")
-    stress = _hoop_stress_Pa(inputs.trial)
+    stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
     yield Quantity("hoop stress PD/2t", math.nan, stress, stress, stress, "Pa")
 
 
@@ -363,7 +352,7 @@ class Neglected:
 
 def _hazards(prediction: VinePrediction) -> Iterator[Remark]:
     inputs, trial = prediction.inputs, prediction.inputs.trial
-    stress = _hoop_stress_Pa(trial)
+    stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
     if stress > 0.9 * BURST_STRESS_PA:
         highest_kPa = burst_pressure_Pa(trial.diameter_m, trial.thickness_m) / 1e3
         facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "burst_kPa": highest_kPa}
@@ -387,14 +376,8 @@ def _hazards(prediction: VinePrediction) -> Iterator[Remark]:
     yield from (remark("rule", words=violation.words) for violation in violations if violation.rule != "tension")
 
 
-def _hoop_stress_Pa(trial: Trial) -> float:
-    return hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-
-
-def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
-    """Return the final speed at the medians with each of the universal effects added, largest change first. Each is
-    added by itself at its typical size; effects whose columns are blank are left out.
-    """
+def _neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
+    """Each of the universal effects by itself, largest change first; without those whose columns are blank."""
     host, trial = host_for(inputs.model), inputs.trial
     # Radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube, ν = ½.
     # 25e6: young's modulus of the film, 10 to 50 MPa (chosen)
@@ -497,29 +480,25 @@ def _best(
     room: Room, film_m: float, stated: StatedValues | None, fit: FitNumbers | None, at_fraction: float
 ) -> tuple[PredictiveInputs, Floats]:
     """Inputs of the fastest vine of one film, and the highest speed at every diameter of the first round."""
-    spans = [room.diameter_m, (max(room.length_m[0], 1e-6), room.length_m[1])]
-    limits = list(spans)
-    others = np.empty((0, 2))
-    inputs: PredictiveInputs | None = None
+    limits = [room.diameter_m, (max(room.length_m[0], 1e-6), room.length_m[1])]
+    spans, rounds = limits, []
     # 17, 9: numbers of diameters and lengths in each round (chosen)
     # 3: rounds of the search, each a finer grid around the optimum of the one before (chosen)
-    for round_number in range(3):
+    for _ in range(3):
         axes = [np.unique(np.geomspace(*span, count)) for span, count in zip(spans, (17, 9), strict=True)]
         vine_inputs = [predictive_inputs(room.trial(D, film_m, L), stated, fit) for D in axes[0] for L in axes[1]]
         rows = np.array([inputs.model.parameters_of(inputs.trial) for inputs in vine_inputs])
         trials = [inputs.trial for inputs in vine_inputs]
-        speeds = final_speeds(vine_inputs[0].model, trials, at_fraction, rows).reshape(axes[0].size, axes[1].size)
-        i, j = np.unravel_index(int(np.argmax(speeds)), speeds.shape)
-        inputs = vine_inputs[int(i) * axes[1].size + int(j)]
-        if round_number == 0:
-            others = np.column_stack([axes[0], speeds.max(axis=1)])
+        speeds = final_speeds(vine_inputs[0].model, trials, at_fraction, rows)
+        best = int(np.argmax(speeds))
+        highest = speeds.reshape(axes[0].size, axes[1].size).max(axis=1)
+        rounds.append((vine_inputs[best], np.column_stack([axes[0], highest])))
         # From the grid value below the optimum to the one above, within the limits.
         spans = [
             (max(low, float(axis[max(k - 1, 0)])), min(high, float(axis[min(k + 1, axis.size - 1)])))
-            for axis, k, (low, high) in zip(axes, (int(i), int(j)), limits, strict=True)
+            for axis, k, (low, high) in zip(axes, divmod(best, axes[1].size), limits, strict=True)
         ]
-    assert inputs is not None
-    return inputs, others
+    return rounds[-1][0], rounds[0][1]
 
 
 def _limits(room: Room, trial: Trial) -> tuple[str, ...]:

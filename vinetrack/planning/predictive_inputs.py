@@ -12,6 +12,7 @@ import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,11 +42,14 @@ SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
 
 BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
 
+# Diameter and thickness, m, of the printed vines, by their scale R
+PRINTED_SIZES = {R: (1e-3 * published.DIAMETER_MM[R], 1e-6 * published.THICKNESS_UM[R]) for R in published.DAMPING_B}
+
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
     """Return the prior of B of a vine of this size, N·(s/m)ⁿ."""
-    largest = max(published.DAMPING_B)
-    diameter, thickness = _printed_sizes()[largest]
+    largest = max(PRINTED_SIZES)
+    diameter, thickness = PRINTED_SIZES[largest]
     return published.DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
 
 
@@ -54,18 +58,13 @@ def prior_ratio(trial: Trial, like: Trial) -> float:
     return damping_prior(trial.diameter_m, trial.thickness_m) / damping_prior(like.diameter_m, like.thickness_m)
 
 
-def _printed_sizes() -> dict[int, tuple[float, float]]:
-    """Diameter and thickness, m, of the printed vines, by their scale R."""
-    return {R: (1e-3 * published.DIAMETER_MM[R], 1e-6 * published.THICKNESS_UM[R]) for R in published.DAMPING_B}
-
-
 def damping_scatter() -> float:
     """Return the standard deviation of ln B of the four printed values about the prior.
 
     >>> round(damping_scatter(), 3)
     0.113
     """
-    residuals = [math.log(published.DAMPING_B[R] / damping_prior(*size)) for R, size in _printed_sizes().items()]
+    residuals = [math.log(published.DAMPING_B[R] / damping_prior(*size)) for R, size in PRINTED_SIZES.items()]
     return math.sqrt(sum(residual**2 for residual in residuals) / SCATTER_DOF)
 
 
@@ -74,18 +73,16 @@ def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
     prediction error of a line fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the
     logarithm of the size; it grows beyond the smallest and the largest vine.
     """
-    sizes = [math.log(damping_prior(*size)) for size in _printed_sizes().values()]
+    sizes = [math.log(damping_prior(*size)) for size in PRINTED_SIZES.values()]
     middle = sum(sizes) / len(sizes)
     distance = math.log(damping_prior(diameter_m, thickness_m)) - middle
     leverage = 1 / len(sizes) + distance**2 / sum((size - middle) ** 2 for size in sizes)
     return damping_scatter() * math.sqrt(1 + leverage)
 
 
-def split_leverage(diameter_m: float, thickness_m: float) -> float:
-    """Return the change of ln B if 1 is added to the exponent of t and subtracted from that of D; 0 for t/D
-    as printed.
-    """
-    diameter, thickness = _printed_sizes()[max(published.DAMPING_B)]
+def _split_leverage(diameter_m: float, thickness_m: float) -> float:
+    """Change of ln B if 1 is added to the exponent of t and subtracted from that of D; 0 for t/D as printed."""
+    diameter, thickness = PRINTED_SIZES[max(PRINTED_SIZES)]
     return math.log(thickness_m / diameter_m / (thickness / diameter))
 
 
@@ -124,8 +121,8 @@ Sampler = Callable[[Draws, np.random.Generator], Draws]
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """One uncertainty; `sample` returns draws in which it varies, given draws in which it does not. `key` names its
-    stream of random numbers: uncertainties of the same key vary together, in different vines too.
+    """One uncertainty; `sample` returns the draws that vary with it, given all draws. `key` names its stream of random
+    numbers: uncertainties of the same key vary together, in different vines too.
     """
 
     name: str
@@ -170,15 +167,16 @@ class PredictiveInputs:
         draws = {name: np.full(count, value) for name, value in self.medians.items()}
         for uncertainty in self.uncertainties:
             if chosen is None or uncertainty.name in chosen:
-                draws = uncertainty.sample(draws, np.random.default_rng([seed, zlib.crc32(uncertainty.key.encode())]))
+                draws |= uncertainty.sample(draws, np.random.default_rng([seed, zlib.crc32(uncertainty.key.encode())]))
         bounds = {f"{effect.name}.{p.name}": p.bounds for effect in self.model for p in effect.parameters}
         bounds |= {YIELD: (0.0, math.inf), PRESSURE: (0.0, math.inf)}
         return {name: np.clip(values, *bounds[name]) for name, values in draws.items()}
 
-    def laid_out(self, draws: Draws) -> tuple[list[Trial], Floats]:
-        """Return the trials and model parameters of these draws, as the simulator takes them. Returns trials (one for
-        each draw, with its pressures), parameters. Shape (n, n_parameters).
+    def drawn_trials(self, count: int, seed: int, only: Iterable[str] | None = None) -> tuple[list[Trial], Floats]:
+        """The draws as the simulator takes them. Returns trials (one for each draw, with its pressures), model
+        parameters. Shape (count, n_parameters).
         """
+        draws = self.draw(count, seed, only)
         rows = np.column_stack([draws[name] for name in self.model.parameter_names])
         pairs = zip(draws[PRESSURE].tolist(), draws[YIELD].tolist(), strict=True)
         return [replace(self.trial, pressure_Pa=P, yield_pressure_Pa=P_y) for P, P_y in pairs], rows
@@ -191,9 +189,8 @@ class PredictiveInputs:
         first = [name for name in (DAMPING, EXPONENT, YIELD, PRESSURE) if name in draws]
         bands = []
         for name in dict.fromkeys([*first, *draws]):
-            symbol, unit = named[name]
-            low, median, high = (float(q) for q in np.quantile(draws[name], BAND))
-            bands.append(Input(name, symbol, unit, low, median, high, self.origins.get(name, Remark())))
+            low, median, high = np.quantile(draws[name], BAND).tolist()
+            bands.append(Input(name, *named[name], low, median, high, self.origins.get(name, Remark())))
         return bands
 
 
@@ -226,45 +223,16 @@ def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[
     return effect.name, sizes
 
 
-def _varied(name: str, change: Callable[[Floats, np.random.Generator], Floats]) -> Sampler:
-    """Return a sampler in which one input varies."""
-    return lambda draws, draw: {**draws, name: change(draws[name], draw)}
-
-
-def _deviates(draw: np.random.Generator, count: int, dof: float) -> Floats:
-    """Standard normal deviates, or deviates of Student's t with `dof` degrees of freedom, shape (count,)."""
-    return draw.standard_normal(count) if math.isinf(dof) else np.clip(draw.standard_t(dof, count), -20.0, 20.0)
-
-
-def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Sampler:
-    """Return a sampler that multiplies an input by a log-normal (or log-t) factor."""
-    return _varied(name, lambda values, draw: values * np.exp(log_sigma * _deviates(draw, values.size, dof)))
-
-
-def shifted(name: str, sigma: float) -> Sampler:
-    """Return a sampler that adds a normal deviate to an input."""
-    return _varied(name, lambda values, draw: values + sigma * draw.standard_normal(values.size))
-
-
 # ------------------------------------------------------------------------------
-# Fitted parameters in the form from which predictions draw: means, covariance, between-trial standard deviations.
-#
-# B is held as its logarithm, as in the fit.
+# Fitted parameters in the form from which predictions draw.
 
 
 @dataclass(frozen=True)
 class FitNumbers:
-    """The parameters of a fit, in the order of its `numbers`; `log` marks those held as logarithms. `mean` and
-    `covariance` are those of the parameters of a new trial, between-trial differences included. Parameters that the fit
-    does not determine have a variance of 0 and are listed in `open`.
-    """
+    """The parameters of a fit as of a new trial, see `fit_numbers`."""
 
     source: str
     fit: Fit | FitSummary
-    log: np.ndarray
-    mean: Floats
-    covariance: Floats
-    open: tuple[str, ...]
 
     def place(self, key: str, vine: str = "") -> int | None:
         """Return the index of a parameter, shared or of this vine; None where there is none."""
@@ -279,7 +247,7 @@ class FitNumbers:
             if number.key == YIELD_PRESSURE and (number.vine == vine or number.vine.startswith(f"{vine}, "))
         ]
         # Nothing is nearer than the first to a value that is not stated.
-        return min(places, key=lambda k: np.nan_to_num(abs(float(self.mean[k]) - stated_Pa)), default=None)
+        return min(places, key=lambda k: np.nan_to_num(abs(self.fit.numbers[k].value - stated_Pa)), default=None)
 
     def sizes(self) -> dict[str, tuple[float, float]]:
         """Diameter and thickness, m, of every vine with a fitted B and a name that contains them."""
@@ -297,6 +265,20 @@ class FitNumbers:
             return (trial.vine if trial.vine in same else same[0]), True
         return min(sizes, key=lambda vine: float(np.sum((np.log(sizes[vine]) - np.log(size)) ** 2)), default=""), False
 
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance of the parameters of a new trial, between-trial differences included, of ln B in place of B; 0
+        where the fit does not determine one. It is widened where the 95 % interval is wider than a normal one's.
+        """
+        covariance = self.fit.covariance
+        if self.fit.between is not None and self.fit.between.shape == covariance.shape:
+            covariance = covariance + np.nan_to_num(self.fit.between)
+        scale = np.zeros(len(self.fit.numbers))
+        for k, fitted in enumerate(self.fit.numbers):
+            if math.isfinite(self.fit.covariance[k, k]):
+                scale[k] = _widening(fitted) / (fitted.value if _is_log(fitted) else 1.0)
+        return np.asarray(np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale)
+
 
 def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
     """Read the parameters of a fit, in memory or from `fit.json`."""
@@ -306,28 +288,17 @@ def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
         raise FitError(f"{source} holds a fit without numbers: there is nothing to predict from.")
     if not any(number.key == DAMPING for number in fit.numbers):
         raise FitError(f"{source} is not a fit of everting vines: it has no B to predict with.")
-    values = np.array([number.value for number in fit.numbers])
-    log = np.array([number.key == DAMPING and number.value > 0 for number in fit.numbers])
-    slopes = np.where(log, 1 / np.where(log, values, 1.0), 1.0)
-    widening = np.array([_widening(number, bool(is_log)) for number, is_log in zip(fit.numbers, log, strict=True)])
-    covariance, is_known = fit.covariance, np.isfinite(np.diag(fit.covariance))
-    if fit.between is not None and fit.between.shape == covariance.shape:
-        # A prediction is of one trial, whose parameters differ from the shared ones.
-        covariance = covariance + np.nan_to_num(fit.between)
-    scale = np.where(is_known, slopes * widening, 0.0)
-    return FitNumbers(
-        source=source,
-        fit=fit,
-        log=log,
-        mean=np.where(log, np.log(np.where(log, values, 1.0)), values),
-        covariance=np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale,
-        open=tuple(number.symbol for number, known in zip(fit.numbers, is_known, strict=True) if not known),
-    )
+    return FitNumbers(source, fit)
 
 
-def _widening(number: Number, log: bool) -> float:
+def _is_log(number: Number) -> bool:
+    """Whether a parameter varies as its logarithm: B, as in the fit."""
+    return number.key == DAMPING and number.value > 0
+
+
+def _widening(number: Number) -> float:
     """Ratio of the fit's 95 % interval to that of a normal distribution, at least 1; 1 where a bound determines it."""
-    low, high, sigma = number.low, number.high, number.sigma
+    low, high, sigma, log = number.low, number.high, number.sigma, _is_log(number)
     if number.method != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
         return 1.0
     half = (math.log(high / low) if log else high - low) / 2
@@ -374,11 +345,10 @@ class _Assembly:
     """
 
     def __init__(self, trial: Trial, stated: StatedValues, fit: FitNumbers | None) -> None:
-        self.trial = trial if trial.vine else with_names([trial])[0]
-        self.stated, self.fit = stated, fit
-        self.vine, self.is_same = ("", False) if fit is None else fit.vine_for(self.trial)
-        size = self.trial.diameter_m, self.trial.thickness_m
-        self.printed_scale = next((scale for scale, printed in _printed_sizes().items() if _alike(printed, size)), None)
+        self.trial, self.stated, self.fit = trial, stated, fit
+        self.vine, self.is_same = ("", False) if fit is None else fit.vine_for(trial)
+        self.size = trial.diameter_m, trial.thickness_m
+        self.printed_scale = next((R for R, printed in PRINTED_SIZES.items() if _alike(printed, self.size)), None)
         self.values: dict[str, float] = {}
         self.origins: dict[str, Remark] = {}
         self.uncertainties: list[Uncertainty] = []
@@ -391,68 +361,77 @@ class _Assembly:
     def set_fitted(self, name: str, place: int, factor: float = 1.0, origin: str = "fitted", **facts: str) -> None:
         """Take an input from the fit, multiplied by a factor."""
         assert self.fit is not None
-        mean = float(self.fit.mean[place])
         self.from_fit[name] = place
-        value = factor * (math.exp(mean) if self.fit.log[place] else mean)
-        self.set(name, value, origin, source=self.fit.source, **facts)
+        self.set(name, factor * self.fit.fit.numbers[place].value, origin, source=self.fit.source, **facts)
 
-    def set_printed(self, name: str, value: float) -> None:
-        self.set(name, value, "printed", source=published.SOURCE)
+    def vary(
+        self, name: str, sigma: float, title: str, key: str, why: Remark, how: str = "added", dof: float = math.inf
+    ) -> None:
+        """Let an input vary by sigma times a normal deviate, or one of Student's t, if that is any: `added` to it, to
+        its `logarithm`, or `relative` to it.
+        """
 
-    def vary(self, name: str, key: str, sample: Sampler, why: str, **facts: object) -> None:
-        self.uncertainties.append(Uncertainty(name, remark(why, **facts), key, sample))
+        def sample(draws: Draws, draw: np.random.Generator) -> Draws:
+            values, normal = draws[name], math.isinf(dof)
+            deviates = draw.standard_normal(values.size) if normal else draw.standard_t(dof, values.size)
+            changes = sigma * (deviates if normal else np.clip(deviates, -20.0, 20.0))
+            if how == "added":
+                return {name: values + changes}
+            return {name: values * (np.exp(changes) if how == "logarithm" else 1 + changes)}
+
+        if sigma != 0:
+            self.uncertainties.append(Uncertainty(title, why, key, sample))
 
     def damping(self) -> None:
         """B: as stated, fitted or printed; else by the scaling prior, from the nearest vine of the fit if any."""
-        trial, fit, stated = self.trial, self.fit, self.stated
+        vine, fit, stated = self.trial.vine, self.fit, self.stated
         place = fit.place(DAMPING, self.vine) if fit else None
         if math.isfinite(stated.B):
+            why = remark("B_given", percent=100 * stated.B_error)
             self.set(DAMPING, stated.B, "given")
-            if (error := stated.B_error) > 0:
-                self.vary("error of B", f"B given|{trial.vine}", scaled(DAMPING, error), "B_given", percent=100 * error)
-            return
-        if fit is not None and place is not None and (self.is_same or fit.fit.numbers[place].vine == ""):
+            self.vary(DAMPING, max(stated.B_error, 0.0), "error of B", f"B given|{vine}", why, "logarithm")
+        elif fit is not None and place is not None and (self.is_same or fit.fit.numbers[place].vine == ""):
             self.set_fitted(DAMPING, place)
-            return
-        if place is None and self.printed_scale is not None:
+        elif place is None and self.printed_scale is not None:
             error = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
-            self.set_printed(DAMPING, published.DAMPING_B[self.printed_scale])
-            self.vary("error of B", f"B printed|{trial.vine}", scaled(DAMPING, error), "B_printed", percent=100 * error)
-            return
-        # The uncertainties of the prior are the scatter of the printed values about it, and the exponents of t against
-        # D.
-        size = trial.diameter_m, trial.thickness_m
-        split, scatter = split_leverage(*size), damping_log_sigma(*size)
-        if fit is None or place is None:
-            self.set(DAMPING, damping_prior(*size), "B_guessed")
+            why = remark("B_printed", percent=100 * error)
+            self.set(DAMPING, published.DAMPING_B[self.printed_scale], "printed", source=published.SOURCE)
+            self.vary(DAMPING, error, "error of B", f"B printed|{vine}", why, "logarithm")
         else:
-            like = fit.sizes()[self.vine]
-            factor = damping_prior(*size) / damping_prior(*like)
-            self.set_fitted(DAMPING, place, factor, "B_scaled", vine=self.vine)
-            self.notes.append(remark("B_carried_over", source=fit.source, vine=self.vine))
-            split -= split_leverage(*like)
-        facts = {"printed": 100 * damping_scatter(), "here": 100 * scatter, "dof": SCATTER_DOF}
-        sample = scaled(DAMPING, scatter, SCATTER_DOF)
-        self.vary("guess of B", f"B scatter|{trial.vine}", sample, "printed_B_scatter", **facts)
+            self._damping_by_scaling(place)
+
+    def _damping_by_scaling(self, place: int | None) -> None:
+        """B by the scaling prior. Its uncertainties are the scatter of the printed values about it, and the exponents
+        of t against D.
+        """
+        prior, split, scatter = damping_prior(*self.size), _split_leverage(*self.size), damping_log_sigma(*self.size)
+        if self.fit is None or place is None:
+            self.set(DAMPING, prior, "B_guessed")
+        else:
+            like = self.fit.sizes()[self.vine]
+            self.set_fitted(DAMPING, place, prior / damping_prior(*like), "B_scaled", vine=self.vine)
+            self.notes.append(remark("B_carried_over", source=self.fit.source, vine=self.vine))
+            split -= _split_leverage(*like)
+        why = remark("printed_B_scatter", printed=100 * damping_scatter(), here=100 * scatter, dof=SCATTER_DOF)
+        self.vary(DAMPING, scatter, "guess of B", f"B scatter|{self.trial.vine}", why, "logarithm", SCATTER_DOF)
         if abs(split) > 1e-9:
-            split_sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
-            here = 100 * abs(split) * split_sigma
-            sample = scaled(DAMPING, split * split_sigma)
-            self.vary("t against D", "B split", sample, "one_t_over_D", sigma=split_sigma, here=here)
+            sigma = 0.25  # Standard error of the exponent of t against that of D, at constant sum
+            why = remark("one_t_over_D", sigma=sigma, here=100 * abs(split) * sigma)
+            self.vary(DAMPING, split * sigma, "t against D", "B split", why, "logarithm")
 
     def exponent(self) -> None:
         """n: as stated, fitted or printed."""
-        stated, sigma = self.stated, exponent_sigma()
         place = self.fit.place(EXPONENT) if self.fit else None
-        if math.isfinite(stated.n):
-            self.set(EXPONENT, stated.n, "given")
-            if (error := stated.n_error) > 0:
-                self.vary("error of n", "n given", shifted(EXPONENT, error), "n_given", error=error)
+        if math.isfinite(self.stated.n):
+            self.set(EXPONENT, self.stated.n, "given")
+            error = max(self.stated.n_error, 0.0)
+            self.vary(EXPONENT, error, "error of n", "n given", remark("n_given", error=error))
         elif place is not None:
             self.set_fitted(EXPONENT, place)
         else:
-            self.set_printed(EXPONENT, published.EXPONENT)
-            self.vary("error of n", "n printed", shifted(EXPONENT, sigma), "n_printed", error=sigma)
+            error = exponent_sigma()
+            self.set(EXPONENT, published.EXPONENT, "printed", source=published.SOURCE)
+            self.vary(EXPONENT, error, "error of n", "n printed", remark("n_printed", error=error))
 
     def yield_pressure(self) -> None:
         """P_y: as fitted for this vine, unless the sheet contradicts it; as stated; as printed, for one vine or all."""
@@ -462,30 +441,28 @@ class _Assembly:
         if fit is not None and place is not None and math.isfinite(stated):
             # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
             tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
-            place = place if abs(stated - float(fit.mean[place])) <= max(tolerance, 1.0) else None
-        printed_Pa = 1000 * published.YIELD_PRESSURE_KPA
+            place = place if abs(stated - fit.fit.numbers[place].value) <= max(tolerance, 1.0) else None
+        printed_kPa = published.YIELD_PRESSURE_KPA
         if place is not None:
             self.set_fitted(YIELD, place)
         elif math.isfinite(stated):
             self.set(YIELD, stated, "given")
-            if sigma > 0:
-                key, sample = f"P_y stated|{trial.vine}", shifted(YIELD, sigma)
-                self.vary("stated P_y", key, sample, "P_y_stated", kPa=sigma / 1e3)
+            why = remark("P_y_stated", kPa=sigma / 1e3)
+            self.vary(YIELD, sigma, "stated P_y", f"P_y stated|{trial.vine}", why)
         elif self.printed_scale == 4:  # the vine whose yield pressure is printed
             rounding_Pa = 1000 / math.sqrt(12)
-            self.set_printed(YIELD, printed_Pa)
-            sample = shifted(YIELD, rounding_Pa)
-            self.vary("printed P_y", "P_y printed", sample, "P_y_printed", kPa=rounding_Pa / 1e3)
+            self.set(YIELD, 1000 * printed_kPa, "printed", source=published.SOURCE)
+            why = remark("P_y_printed", kPa=rounding_Pa / 1e3)
+            self.vary(YIELD, rounding_Pa, "printed P_y", "P_y printed", why)
         else:
-            self.set(YIELD, printed_Pa, "P_y_guessed")
-            # Nine of ten vines within a factor of 3
-            sample = scaled(YIELD, math.log(3.0) / float(ndtri(0.95)))
-            self.vary("guess of P_y", "P_y guess", sample, "P_y_guess", kPa=published.YIELD_PRESSURE_KPA)
+            self.set(YIELD, 1000 * printed_kPa, "P_y_guessed")
+            sigma = math.log(3.0) / float(ndtri(0.95))  # nine of ten vines within a factor of 3
+            self.vary(YIELD, sigma, "guess of P_y", "P_y guess", remark("P_y_guess", kPa=printed_kPa), "logarithm")
 
     def other_parameters(self, model: Model) -> None:
         """Parameters of all other effects: as stated, as fitted, or at their typical size."""
-        known = [(effect, p, f"{effect.name}.{p.name}") for effect in model for p in effect.parameters]
-        for effect, parameter, name in known:
+        for effect, parameter in [(one, p) for one in model for p in one.parameters]:
+            name = f"{effect.name}.{parameter.name}"
             if name in self.values:
                 continue
             place = self.fit.place(name, self.vine) if self.fit else None
@@ -503,9 +480,13 @@ class _Assembly:
         if low < least or high > most:
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             self.notes.append(remark("implausible", **facts, low=least, high=most, unit=unit))
+
+        def sample(draws: Draws, draw: np.random.Generator) -> Draws:
+            return {name: draw.uniform(low, high, draws[name].size)}
+
         if high > low:
-            sample = _varied(name, lambda values, draw: draw.uniform(low, high, values.size))
-            self.vary(f"{parameter.symbol} ({effect.name})", name, sample, "uniform", **facts, low=low, high=high)
+            why = remark("uniform", **facts, low=low, high=high)
+            self.uncertainties.append(Uncertainty(f"{parameter.symbol} ({effect.name})", why, name, sample))
 
     def joint_draw_of_fit(self) -> None:
         """Draw all inputs that the fit provides jointly, with their covariance."""
@@ -513,29 +494,32 @@ class _Assembly:
         if fit is None or not self.from_fit:
             return
         names, places = list(self.from_fit), list(self.from_fit.values())
-        covariance, log = fit.covariance[np.ix_(places, places)], fit.log[places]
+        covariance, numbers = fit.covariance[np.ix_(places, places)], [fit.fit.numbers[place] for place in places]
 
         def sample(draws: Draws, draw: np.random.Generator) -> Draws:
             size = next(iter(draws.values())).size
-            deviations = draw.multivariate_normal(np.zeros(len(places)), covariance, size, method="svd")
-            moved = {
-                name: draws[name] * np.exp(deviations[:, k]) if log[k] else draws[name] + deviations[:, k]
-                for k, name in enumerate(names)
+            changes = draw.multivariate_normal(np.zeros(len(places)), covariance, size, method="svd").T
+            return {
+                name: draws[name] * np.exp(change) if _is_log(number) else draws[name] + change
+                for name, number, change in zip(names, numbers, changes, strict=True)
             }
-            return {**draws, **moved}
 
         symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
         shown = ", ".join(symbols.get(name, name) for name in names)
         why = remark("with_covariance", names=shown, source=fit.source, count=len(fit.fit.trials))
         self.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", sample))
-        if fit.open:
-            self.notes.append(remark("not_determined", source=fit.source, names=", ".join(fit.open)))
+        variances = np.diag(fit.fit.covariance)
+        if not np.isfinite(variances).all():
+            open_ones = [
+                n.symbol for n, known in zip(fit.fit.numbers, np.isfinite(variances), strict=True) if not known
+            ]
+            self.notes.append(remark("not_determined", source=fit.source, names=", ".join(open_ones)))
 
     def between_trials(self) -> tuple[float, float]:
         """Relative between-trial standard deviations of pressure and B; both become uncertainties."""
         # Relative between-trial standard deviations of pressure and B (chosen)
         pressure, damping, origin = 0.01, 0.03, "assumed"
-        trial, dof = self.trial, {"pressure": math.inf, "B": math.inf}
+        trial, dof = self.trial, {"P": math.inf, "B": math.inf}
         if trial.pressure_Pa > 0 and math.isfinite(trial.pressure_sigma_Pa):
             pressure = trial.pressure_sigma_Pa / trial.pressure_Pa
         if self.stated.spreads is not None:
@@ -545,13 +529,11 @@ class _Assembly:
             spread = {name: one.value for name, one in fit.spreads.items()}
             pressure, damping = spread.get("pressure", pressure), spread.get("B", damping)
             few = float(max(len(fit.trials) - len(fit.numbers), 3))  # t of fewer degrees of freedom has no variance
-            dof |= {name: few for name, one in fit.spreads.items() if one.estimated}
+            dof |= {{"pressure": "P"}.get(name, name): few for name, one in fit.spreads.items() if one.estimated}
         self.set(PRESSURE, trial.pressure_Pa, "set")
-        relative = _varied(PRESSURE, lambda P, draw: P * (1 + pressure * _deviates(draw, P.size, dof["pressure"])))
-        for symbol, size, sample in (("P", pressure, relative), ("B", damping, scaled(DAMPING, damping, dof["B"]))):
-            if size > 0:
-                title, key = f"{symbol} from trial to trial", f"{symbol} trial|{trial.vine}"
-                self.vary(title, key, sample, "spread", origin=origin, percent=100 * size)
+        for symbol, name, size, how in (("P", PRESSURE, pressure, "relative"), ("B", DAMPING, damping, "logarithm")):
+            why, key = remark("spread", origin=origin, percent=100 * size), f"{symbol} trial|{trial.vine}"
+            self.vary(name, max(size, 0.0), f"{symbol} from trial to trial", key, why, how, dof[symbol])
         return pressure, damping
 
 
@@ -592,7 +574,7 @@ def predictive_inputs(
         fit = fit_numbers(fit)
     names = [*(fit.fit.names if fit else stated.model), *stated.effects]
     model = make_model(dict.fromkeys(names), stated.user_effects)
-    made = _Assembly(trial, stated, fit)
+    made = _Assembly(trial if trial.vine else with_names([trial])[0], stated, fit)
     made.damping()
     made.exponent()
     made.yield_pressure()
