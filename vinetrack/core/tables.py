@@ -14,11 +14,11 @@ import io
 import json
 import math
 import os
+import posixpath
 import re
-import stat
 import unicodedata
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -56,31 +56,24 @@ def missing_file_message(path: Path) -> tuple[str, str]:
 
 def is_pipe_or_device(path: Path) -> bool:
     """Whether a path leads to something other than a file or folder, reading which may block or never end."""
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError):
-        return False
-    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+    return os.access(path, os.F_OK) and not (path.is_file() or path.is_dir())
 
 
 def file_size(path: Path) -> int:
     """Return the size of a readable regular file."""
-    status = path.stat()
-    if stat.S_ISDIR(status.st_mode):
+    size = path.stat().st_size
+    if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
-    if not stat.S_ISREG(status.st_mode):
+    if not path.is_file():
         raise OSError(errno.EINVAL, NOT_A_FILE, str(path))
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, "permission denied; allow it to be read", str(path))
-    return status.st_size
+    return size
 
 
 def is_readable(path: Path) -> bool:
     """Whether a path leads to a readable regular file or folder."""
-    try:
-        return (path.is_dir() and os.access(path, os.R_OK | os.X_OK)) or file_size(path) >= 0
-    except (OSError, ValueError):
-        return False
+    return os.access(path, os.R_OK) and (path.is_file() or (path.is_dir() and os.access(path, os.X_OK)))
 
 
 def is_disk_full(error: BaseException) -> bool:
@@ -176,22 +169,19 @@ class Table:
         """Return a column as numbers; blank cells are NaN if `blank_is_nan`, else an error. Shape (n_rows,)."""
         cells = [row[column] for row in self.rows]
         # Fast path, 10 times faster: a column of plain numbers needs no check of each cell.
-        joined = "\n".join(cells).replace(",", ".") if self.decimal == "," else "\n".join(cells)
-        unambiguous = self.decimal == "." or (self.decimal == "," and not any("." in cell for cell in cells))
-        if unambiguous and re.fullmatch(r"[0-9eE+.\n-]*", joined):
+        if self.decimal == "." and not re.search(r"[^0-9eE+.\n-]", "\n".join(cells)):
             with contextlib.suppress(ValueError):
-                values = np.array([float(cell) for cell in joined.split("\n")], dtype=float)
-                if len(values) == len(cells) and np.all(np.isfinite(values)):
-                    return values
+                plain = np.array(cells, dtype=float)
+                if np.isfinite(plain).all():
+                    return plain
         values = np.full(len(cells), np.nan)
         for i, cell in enumerate(cells):
-            if cell == "" and blank_is_nan:
-                continue
-            try:
-                values[i] = parse_number(cell, self.decimal)
-            except TableError as error:
-                message = f"line {self.lines[i]}, column {column}: {cell[:40]!r} {error.message}"
-                raise TableError(message, error.remedy) from None
+            if cell or not blank_is_nan:
+                try:
+                    values[i] = parse_number(cell, self.decimal)
+                except TableError as error:
+                    message = f"line {self.lines[i]}, column {column}: {cell[:40]!r} {error.message}"
+                    raise TableError(message, error.remedy) from None
         return values
 
 
@@ -202,13 +192,9 @@ def parse_number(text: str, decimal: str = ".") -> float:
         raise TableError("is blank", "write a number", code="blank")
     if not _NUMBER.fullmatch(text):
         raise TableError("is not a number", "write digits only, without unit or separators", code="not_a_number")
-    mark = "," if "," in text else "."
-    if _AMBIGUOUS_NUMBER.fullmatch(text) and mark != decimal:
-        joined, pointed = re.sub("[.,]", "", text), text.replace(",", ".")
-        corrected = f"{pointed}0 or {joined}"
-        raise TableError(
-            "may be thousands or decimals", f"write {corrected}, whichever is meant", code="ambiguous_number"
-        )
+    if _AMBIGUOUS_NUMBER.fullmatch(text) and ("," if "," in text else ".") != decimal:
+        remedy = f"write {text.replace(',', '.')}0 or {re.sub('[.,]', '', text)}, whichever is meant"
+        raise TableError("may be thousands or decimals", remedy, code="ambiguous_number")
     value = float(text.replace(",", "."))
     if not math.isfinite(value):
         raise TableError("is too large a number", code="above_bounds")
@@ -221,10 +207,10 @@ def decode_text(data: bytes) -> str:
         encodings = ["utf-32"]
     elif data.startswith((b"\xff\xfe", b"\xfe\xff")):
         encodings = ["utf-16"]
+    elif b"\x00" in data:
+        raise TableError("is not text", "save the table as CSV (comma or semicolon separated)")
     else:
         encodings = ["utf-8-sig", "cp1252"]
-        if b"\x00" in data:
-            raise TableError("is not text", "save the table as CSV (comma or semicolon separated)")
     for encoding in encodings:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
@@ -325,17 +311,12 @@ def safe_join(folder: Path, relative: str) -> Path:
         raise TableError("contains characters that no path should have", "type it again")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
         raise TableError("is an absolute path", "write it relative to the experiment folder")
-    parts: list[str] = []
-    for part in text.split("/"):
-        if part == ".." and not parts:
-            raise TableError("leads out of the experiment folder", "move the file into it, or put a link there")
-        if part == "..":
-            parts.pop()
-        elif part not in ("", "."):
-            parts.append(part)
-    if not parts:
+    inside = posixpath.normpath(text)
+    if inside.split("/")[0] == "..":
+        raise TableError("leads out of the experiment folder", "move the file into it, or put a link there")
+    if inside == ".":
         raise TableError("names no file", "write a path relative to the experiment folder")
-    return folder.joinpath(*parts)
+    return folder / inside
 
 
 def result_file(folder: Path, name: str, suffix: str) -> Path:
@@ -441,76 +422,61 @@ def read_yaml(path: Path) -> YamlDocument:
 
 def parse_yaml(text: str, file: str) -> YamlDocument:
     """Parse YAML text; see `read_yaml`."""
+    from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     lines: dict[tuple[Any, ...], int] = {}
-    repeated: list[Problem] = []
+    problems: list[Problem] = []
+    content: Any = None
     try:
-        _walk(_round_trip().compose(text), (), lines, repeated, file)
-        content = {} if repeated else _builtin(_round_trip().load(text))
+        yaml = YAML(typ="safe", pure=True)
+        document = yaml.compose(text)
+        for path, line in _places(document):
+            if path in lines and path[-1] != "<<" and isinstance(path[-1], str):
+                remedy, key = f"keep one; the first is on line {lines[path]}", ".".join(map(str, path))
+                problems.append(Problem(message="is set twice", file=file, line=line, column=key, remedy=remedy))
+            lines[path] = line
+            if len(lines) > 10_000:  # largest document (chosen): nested aliases can expand beyond the memory
+                raise ValueError("too large")
+        if document is not None and not problems:
+            content = yaml.constructor.construct_document(document)
     except (YAMLError, RecursionError, ValueError, ArithmeticError, TypeError, LookupError, AttributeError) as error:
-        raise ExperimentError([_syntax_problem(error, file)]) from None
+        reason = getattr(error, "problem", None) or "it cannot be understood"
+        mark = getattr(error, "problem_mark", None)
+        remedy = "use spaces (no tabs) to indent, a space after each colon, and quotes around text that contains : or #"
+        line = mark.line + 1 if mark is not None else 0
+        problems = [Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)]
     content = {} if content is None else content
-    if repeated:
-        raise ExperimentError(repeated)
     if not isinstance(content, dict):
-        remedy = "write lines such as 'key: value'"
-        raise ExperimentError([Problem(message="holds no settings", file=file, remedy=remedy)])
+        problems = [Problem(message="holds no settings", file=file, remedy="write lines such as 'key: value'")]
+    if problems:
+        raise ExperimentError(problems)
     return YamlDocument(content, lines)
 
 
-def _round_trip() -> Any:
-    from ruamel.yaml import YAML
-
-    document = YAML()
-    document.preserve_quotes, document.width = True, 10_000
-    return document
-
-
-def _walk(
-    node: Any, path: tuple[Any, ...], lines: dict[tuple[Any, ...], int], repeated: list[Problem], file: str
-) -> None:
-    """Record the line of every key below a node in `lines`, and every repeated key in `repeated`."""
+def _places(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], int]]:
+    """Yield the path of every key and element below a node, and its line."""
     from ruamel.yaml.nodes import MappingNode, SequenceNode
 
-    # 10_000, 20: largest document (chosen): nested aliases can expand beyond the memory
-    if len(path) > 20 or len(lines) > 10_000:
+    if len(path) > 20:  # deepest document (chosen)
         raise ValueError("too large")
-    if isinstance(node, MappingNode):
-        for key_node, value_node in node.value:
-            line = key_node.start_mark.line + 1
-            key = (*path, key_node.value if isinstance(key_node.value, str) else "?")
-            if key in lines and key_node.value != "<<":
-                remedy = f"keep one; the first is on line {lines[key]}"
-                dotted = ".".join(str(part) for part in key)
-                repeated.append(Problem(message="is set twice", file=file, line=line, column=dotted, remedy=remedy))
-            lines[key] = line
-            _walk(value_node, key, lines, repeated, file)
-    elif isinstance(node, SequenceNode):
-        for i, element in enumerate(node.value):
-            lines[(*path, i)] = element.start_mark.line + 1
-            _walk(element, (*path, i), lines, repeated, file)
-
-
-def _syntax_problem(error: Exception, file: str) -> Problem:
-    """Return the problem of a text that is not YAML, with its line."""
-    mark = getattr(error, "problem_mark", None)
-    reason = getattr(error, "problem", None) or "it cannot be understood"
-    remedy = "use spaces (no tabs) to indent, a space after each colon, and quotes around text that contains : or #"
-    line = mark.line + 1 if mark is not None else 0
-    return Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)
+    for i, entry in enumerate(node.value if isinstance(node, MappingNode | SequenceNode) else ()):
+        first, inner = entry if isinstance(node, MappingNode) else (entry, entry)
+        name = i if first is inner else first.value if isinstance(first.value, str) else "?"
+        yield (*path, name), first.start_mark.line + 1
+        yield from _places(inner, (*path, name))
 
 
 def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -> str:
     """Return the text with a top-level key set to a value; everything else is kept, comments included."""
+    from ruamel.yaml import YAML
     from ruamel.yaml.util import load_yaml_guess_indent
 
-    before = parse_yaml(text, file).content
-    wanted = {**before, key: _builtin(value)}
-    if key in before and before == wanted:
+    before, value = parse_yaml(text, file).content, json.loads(json.dumps(value))
+    if key in before and before[key] == value:
         return text
-    document = _round_trip()
-    out = io.StringIO()
+    document, out = YAML(), io.StringIO()
+    document.preserve_quotes, document.width = True, 10_000
     if before:
         tree, indent, offset = load_yaml_guess_indent(text)
         tree[key] = _edited(tree.get(key), value)
@@ -523,46 +489,33 @@ def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -
     else:
         document.dump({key: _edited(None, value)}, out)
         changed = text + ("\n" if text and not text.endswith("\n") else "") + out.getvalue()
-    try:
-        correct = parse_yaml(changed, file).content == wanted
-    except ExperimentError:
-        correct = False
-    if not correct:
-        message, remedy = "cannot be changed without altering other settings", f"set it by hand: {key}: {value}"
-        raise ExperimentError([Problem(message=message, file=file, column=key, remedy=remedy)])
-    return changed
+    with contextlib.suppress(ExperimentError):
+        if parse_yaml(changed, file).content == {**before, key: value}:
+            return changed
+    message, remedy = "cannot be changed without altering other settings", f"set it by hand: {key}: {value}"
+    raise ExperimentError([Problem(message=message, file=file, column=key, remedy=remedy)])
 
 
 def _edited(old: Any, value: Any) -> Any:
     """Return a value in the form of the one it replaces, so that comments stay at what is kept."""
     from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-    if isinstance(value, Mapping):
+    if isinstance(value, dict):
         tree = old if isinstance(old, CommentedMap) else CommentedMap()
         for name in [name for name in tree if name not in value]:
             del tree[name]
-        for name, inner in value.items():
-            if name not in tree or _builtin(tree[name]) != _builtin(inner):
-                tree[name] = _edited(tree.get(name), inner)
+        changed = {name: inner for name, inner in value.items() if name not in tree or tree[name] != inner}
+        tree.update({name: _edited(tree.get(name), inner) for name, inner in changed.items()})
         return tree
-    if isinstance(value, Sequence) and not isinstance(value, str):
+    if isinstance(value, list):
         elements = old if isinstance(old, CommentedSeq) else CommentedSeq()
         if elements is not old:
             elements.fa.set_flow_style()
         for i in reversed(range(len(elements))):
-            if _builtin(elements[i]) not in value:
+            if elements[i] not in value:
                 del elements[i]
-        if _builtin(elements) != _builtin(value[: len(elements)]):
+        if elements != value[: len(elements)]:
             elements.clear()
         elements.extend(_edited(None, element) for element in value[len(elements) :])
         return elements
     return value
-
-
-def _builtin(value: Any) -> Any:
-    """Return a value in Python's own types, as YAML would load it."""
-    if isinstance(value, Mapping):
-        return {_builtin(name): _builtin(inner) for name, inner in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_builtin(inner) for inner in value]
-    return next((kind(value) for kind in (bool, int, float, str) if isinstance(value, kind)), value)
