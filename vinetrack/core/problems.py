@@ -86,25 +86,21 @@ class ExperimentError(UserError):
 
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     """Format problems, errors first and shared ones once, as at most `limit` lines; the last counts the rest."""
-    ordered = sorted(_merged(problems), key=lambda problem: problem.severity != "error")
-    if len(ordered) <= limit:
-        return [str(problem) for problem in ordered]
-    remaining = ordered[limit - 1 :]
-    errors = sum(problem.severity == "error" for problem in remaining)
-    more = f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"
-    return [*(str(problem) for problem in ordered[: limit - 1]), more]
-
-
-def _merged(problems: Iterable[Problem]) -> list[Problem]:
-    """Merge problems that differ only in trial, line and measured number; the result names the first and counts."""
     groups: dict[Problem, list[Problem]] = {}
-    for problem in problems:
+    for problem in problems:  # those that differ only in trial, line and measured number are one
         message = "" if problem.of_a_measurement else problem.message
         groups.setdefault(replace(problem, trial="", line=0, message=message), []).append(problem)
-    return [
+    merged = [
         group[0] if len(group) == 1 else replace(group[0], line=0, trial=f"{group[0].trial} and {len(group) - 1} more")
         for group in groups.values()
     ]
+    ordered = sorted(merged, key=lambda problem: problem.severity != "error")
+    if len(ordered) <= limit:
+        return list(map(str, ordered))
+    remaining = ordered[limit - 1 :]
+    errors = sum(problem.severity == "error" for problem in remaining)
+    more = f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"
+    return [*map(str, ordered[: limit - 1]), more]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -128,9 +124,7 @@ def _one_line(text: str) -> str:
 
 
 def in_words(told: Any) -> str:
-    """Return a remark or a result in words."""
-    # "vinetrack.narrative": room whose function `in_words(object)` makes sentences; it lies above, and is
-    # imported when words are requested
+    """Return a remark or a result in words; they are made in a room above, imported when words are requested."""
     words: str = import_module("vinetrack.narrative").in_words(told)
     return words
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +147,7 @@ class Trial:
 
 def join_flags(*flags: str) -> str:
     """Join flags by `;` in the order of FLAGS, without repetitions and blanks."""
-    present = {part for flag in flags if flag for part in split_flags(flag)}
+    present = ";".join(flags).split(";")
     return ";".join(flag for flag in FLAGS if flag in present)
 
 
@@ -158,7 +158,9 @@ def split_flags(flag: str) -> list[str]:
 
 def with_flag(flags: Iterable[str], *names: str) -> NDArray[np.bool_]:
     """Return the mask of points that carry one of these flags. Shape (n_frames,)."""
-    return np.array([any(name in names for name in split_flags(str(flag))) for flag in flags], dtype=bool)
+    texts = np.asarray(flags, dtype=str).tolist()
+    carrying = {text for text in set(texts) if not set(names).isdisjoint(text.split(";"))}
+    return np.array([text in carrying for text in texts], dtype=bool)
 
 
 def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
@@ -183,11 +185,8 @@ class Track:
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Mask, shape (n_frames,), of points that are measurements of the leading edge."""
-        usable = np.isfinite(self.lead_position_m) & np.isfinite(self.time_s)
-        for flag in {str(flag) for flag in self.flag[self.flag != ""]}:
-            if UNUSABLE_FLAGS.intersection(flag.split(";")):
-                usable &= self.flag != flag
-        return usable
+        measured = np.isfinite(self.lead_position_m) & np.isfinite(self.time_s)
+        return measured & ~with_flag(self.flag, *UNUSABLE_FLAGS)
 
 
 def plain_track(
@@ -235,6 +234,6 @@ class Window:
     x_ss_m_s: float = math.nan
     x_ss_sigma_m_s: float = math.nan
     drift: float = math.nan
-    drift_95: tuple[float, float] = field(default=(math.nan, math.nan))
+    drift_95: tuple[float, float] = (math.nan, math.nan)
     cv: float = math.nan
     doubtful: bool = False

@@ -9,9 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-import threading
-from collections.abc import Iterable, Iterator, Sequence, Sized
-from types import TracebackType
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Generic, TextIO, TypeVar
 
 if TYPE_CHECKING:
@@ -65,9 +63,9 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 class Progress(Generic[Item]):
-    """A bar with the time left, or a spinner; on standard error after half a second, if that is a terminal."""
+    """A bar with the time left, or a spinner; on standard error, if that is a terminal."""
 
-    def __init__(self, items: Iterable[Item] | None, total: int | None, description: str, unit: str = "") -> None:
+    def __init__(self, items: Iterable[Item], total: int | None, description: str, unit: str = "") -> None:
         from rich import progress as rich
         from rich.console import Console
 
@@ -85,13 +83,9 @@ class Progress(Generic[Item]):
         columns = [where(False, rich.SpinnerColumn()), where(False, text("{task.description} … {task.elapsed:.0f} s"))]
         columns += [where(True, column) for column in amount]
         self._items = items
-        self._bar = rich.Progress(*columns, console=Console(stderr=True), transient=True)
+        screen = Console(stderr=True)
+        self._bar = rich.Progress(*columns, console=screen, transient=True, disable=not sys.stderr.isatty())
         self._task = self._bar.add_task(description, total=total)
-        # 0.5: delay before a progress bar appears (chosen)
-        self._timer = threading.Timer(0.5, self._bar.start)
-        self._timer.daemon = True
-        if sys.stderr.isatty():
-            self._timer.start()
 
     def advance(self, count: int = 1) -> None:
         """Advance by a number of steps."""
@@ -108,34 +102,25 @@ class Progress(Generic[Item]):
 
     def __iter__(self) -> Iterator[Item]:
         with self:
-            for element in self._items or ():
+            for element in self._items:
                 yield element
                 self.advance()
 
     def __enter__(self) -> Progress[Item]:
+        self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._timer.cancel()
-        if self._timer.is_alive():
-            self._timer.join()
-        if self._bar.live.is_started:
-            self._bar.stop()
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
 
 
-def progress(work: Iterable[Item] | int, description: str, unit: str = "trial") -> Progress[Item]:
+def progress(work: Sequence[Item] | int, description: str, unit: str = "trial") -> Progress[Item]:
     """Return a progress bar over the elements of `work`, or over a number of steps."""
     if isinstance(work, int):
-        return Progress(None, work, description, unit)
-    return Progress(work, len(work) if isinstance(work, Sized) else None, description, unit)
+        return Progress((), work, description, unit)
+    return Progress(work, len(work), description, unit)
 
 
 def waiting(description: str) -> Progress[None]:
-    """Return a spinner with the elapsed time, for work of unknown length.
-
-    >>> with waiting("compiling the model"):
-    ...     pass
-    """
-    return Progress(None, None, description)
+    """Return a spinner with the elapsed time, for work of unknown length."""
+    return Progress((), None, description)

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import functools
 import multiprocessing
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
-# ------------------------------------------------------------------------------
-# Cores of a process, and its pool of threads for compiled code that releases Python's lock.
+Part = TypeVar("Part")
 
 
-@lru_cache
 def available_cores() -> int:
-    """Number of cores that this process may use, determined once."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # no affinity on macOS and Windows
-        return os.cpu_count() or 1
+    """Number of cores that this process may use; all where that cannot be asked (macOS, Windows)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def thread_pool(threads: int) -> ThreadPoolExecutor:
-    """Thread pool of this process; a forked process gets its own."""
+    """Thread pool of this process, for compiled code that releases Python's lock; a forked process gets its own."""
     return _pool(os.getpid(), threads)
 
 
@@ -46,30 +41,17 @@ def njit(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-# ------------------------------------------------------------------------------
-# Linear algebra in one thread.
-#
-# The matrices of a fit have ten to a few hundred rows: too few to be shared out. A library that does so nevertheless
-# keeps threads waiting for each other, which costs processor time, and far more of it where other work runs beside.
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    from threadpoolctl import threadpool_limits
 
-P = ParamSpec("P")
-R = TypeVar("R")
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
-def in_one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function so that linear algebra in it uses one thread; afterwards as many as before."""
-
-    @functools.wraps(function)
-    def limited(*args: P.args, **kwargs: P.kwargs) -> R:
-        from threadpoolctl import threadpool_limits
-
-        with threadpool_limits(1, user_api="blas"):
-            return function(*args, **kwargs)
-
-    return limited
-
-
-Part = TypeVar("Part")
+# Decorates a function so that linear algebra in it uses one thread; afterwards as many as before. The matrices of a
+# fit are too small to be shared out: threads that wait for each other cost processor time.
+in_one_blas_thread = _one_blas_thread()
 
 MOST_THREADS = 4  # Most threads of one recording (chosen)
 FEWEST_PICTURES = 16  # Fewest pictures for which another thread is used (chosen)

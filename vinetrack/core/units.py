@@ -24,9 +24,7 @@ GAS_CONSTANT_AIR_J_KG_K = 287.0  # Derived: 8.314 J/(mol·K) over 0.02896 kg/mol
 
 
 # ------------------------------------------------------------------------------
-# Formatting of numbers: values with as many digits as their error justifies.
-#
-# Used by terminal, report, figures and explorer alike.
+# Formatting of numbers, everywhere: values with as many digits as their error justifies.
 
 
 def decimals(sigma: float) -> int:
@@ -38,6 +36,12 @@ def decimals(sigma: float) -> int:
 def or_nan(value: Any) -> float:
     """Return a number of a JSON file as a float; NaN for None, which means unknown."""
     return math.nan if value is None else float(value)
+
+
+def _known(values: Sequence[float | None] | None) -> tuple[float, ...]:
+    """The values, or nothing if one of them is unknown."""
+    numbers = tuple(map(or_nan, values or ()))
+    return numbers if all(map(math.isfinite, numbers)) else ()
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -72,18 +76,18 @@ def with_error(value: float | None, sigma: float | None) -> str:
 
 def interval(bounds: Sequence[float | None] | None) -> str:
     """Return `(low, high)` as "low to high", with decimals that suit its width; "–" if unknown."""
-    if bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
+    if not _known(bounds):
         return "–"
-    low, high = (float(bound) for bound in bounds if bound is not None)
+    low, high = _known(bounds)
     places = min(decimals(high - low), 6) if high > low else 2
     return f"{low:.{places}f} to {high:.{places}f}"
 
 
 def with_interval(value: float | None, bounds: Sequence[float | None] | None, shown: bool = True) -> str:
     """Return `value (95 %: low to high)`, with decimals that suit the width; without bounds the value."""
-    if value is None or bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
+    if value is None or not _known(bounds):
         return number(value)
-    low, high = (float(bound) for bound in bounds if bound is not None)
+    low, high = _known(bounds)
     half = float(f"{(high - low) / 2:.1e}")  # 0.00999 rounds to 0.010
     places = min(decimals(half), 6) if half > 0 else 3
     return f"{value:.{places}f}" + (f" (95 %: {low:.{places}f} to {high:.{places}f})" if shown else "")
@@ -176,8 +180,8 @@ def other_units(name: str) -> dict[str, str]:
     {'chamber_ml': 'ml', 'chamber_cm3': 'cm3', 'chamber_m3': 'm3'}
     """
     quantity, own = split_unit(name)
-    same = {key for key in UNITS if own and UNITS[key].si == UNITS[own].si}
-    return {f"{quantity}_{key}": key for key in UNITS if key in same - {own}}
+    others = [key for key in UNITS if own and key != own and UNITS[key].si == UNITS[own].si]
+    return {f"{quantity}_{key}": key for key in others}
 
 
 def convert(value: float, unit: str, to: str) -> float:
