@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -19,8 +18,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 from vinetrack.experiment.settings import CALIBRATIONS, AxisSettings, ExperimentSettings, Limits, RunSettings
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """Reference entry of a column or key; fields that do not apply are blank. `measured` says how to measure it."""
 
     name: str
@@ -71,7 +69,7 @@ def picture_entries() -> list[Entry]:
 
 def reference_content() -> dict[str, list[dict[str, str]]]:
     """Return the reference for a program: lists of entries under `columns`, `experiment`, `picture` and `run`."""
-    return {name: [asdict(entry) for entry in entries] for name, _, entries in _groups()}
+    return {name: [entry._asdict() for entry in entries] for name, _, entries in _groups()}
 
 
 def _groups() -> tuple[tuple[str, str, list[Entry]], ...]:
@@ -143,9 +141,8 @@ def _allowed(field: FieldInfo) -> str:
     if choices:
         return ", ".join(dict.fromkeys(choices))
     rules = list(field.metadata)
-    for part in parts:  # constraints of the annotated parts of a union
-        for rule in getattr(part, "__metadata__", ()):
-            rules += rule.metadata if isinstance(rule, FieldInfo) else [rule]
+    for rule in (rule for part in parts for rule in getattr(part, "__metadata__", ())):
+        rules += rule.metadata if isinstance(rule, FieldInfo) else [rule]
     words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
     bounds = [f"{words[name]} {getattr(rule, name):g}" for rule in rules for name in words if hasattr(rule, name)]
     return ", ".join(dict.fromkeys(bounds))

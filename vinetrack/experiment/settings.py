@@ -148,10 +148,7 @@ Calibration = Annotated[Charuco | Checkerboard | TwoPoints | MmPerPx, Field(disc
 
 # Models of `calibration`, by its kind
 CALIBRATIONS: dict[str, type[BaseModel]] = {
-    "charuco": Charuco,
-    "checkerboard": Checkerboard,
-    "two_points": TwoPoints,
-    "mm_per_px": MmPerPx,
+    **{"charuco": Charuco, "checkerboard": Checkerboard, "two_points": TwoPoints, "mm_per_px": MmPerPx}
 }
 
 
@@ -358,7 +355,8 @@ def read_experiment_settings(path: Path, warnings: list[Problem] | None = None) 
     # A broken link is an error, not a missing file: defaults would silently replace the intended settings.
     if not os.path.lexists(path):
         return ExperimentSettings()
-    document = _in_key_units(read_yaml(path), path.name, [] if warnings is None else warnings)
+    document = read_yaml(path)
+    _to_key_units(document, path.name, [] if warnings is None else warnings)
     return _validate(ExperimentSettings, document, path.name)
 
 
@@ -426,46 +424,35 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
         if name in taken:
             message = f"is ignored, because the sheet also has {name}"
             problems.append(Problem("twice", message, other, file=file, line=1, severity="warning"))
-            continue
-        taken.add(name)
-        renamed[other] = name, unit
-        problems.append(_conversion(name, unit, column=other, file=file, line=1))
+        else:
+            taken.add(name)
+            renamed[other] = name, unit
+            problems.append(_conversion(name, unit, column=other, file=file, line=1))
     rows = [dict(row) for row in table.rows]
     for row in rows:
         for other, (name, unit) in renamed.items():
             row[name] = _converted(row.pop(other), unit, name, table.decimal)
-    columns = tuple(dict.fromkeys(renamed[name][0] if name in renamed else name for name in table.columns))
+    columns = tuple(dict.fromkeys(renamed.get(name, (name, ""))[0] for name in table.columns))
     return replace(table, columns=columns, rows=tuple(rows)), problems
 
 
-def _in_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> YamlDocument:
+def _to_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> None:
     """Convert keys in other units to those of the settings, with a warning each; of two units the blank gives way."""
-    content, lines = dict(document.content), dict(document.lines)
-    groups: dict[str, Iterable[type[BaseModel]]] = {
-        "": [ExperimentSettings],
-        "limits": [Limits],
-        "axis": [AxisSettings],
-        "calibration": CALIBRATIONS.values(),
+    groups: dict[tuple[str, ...], Iterable[type[BaseModel]]] = {
+        (): [ExperimentSettings],
+        ("limits",): [Limits],
+        ("axis",): [AxisSettings],
+        ("calibration",): CALIBRATIONS.values(),
     }
-    for group, models in groups.items():
-        given = content.get(group) if group else content
-        if not isinstance(given, dict):
-            continue
-        path = (group,) if group else ()
-        keys = given if given is content else dict(given)
+    for path, models in groups.items():
+        keys = document.content.get(path[0]) if path else document.content
         names = dict.fromkeys(name for model in models for name in model.model_fields)
         pairs = [(name, *other) for name in names for other in other_units(name).items()]
-        for name, other, unit in pairs:
-            if other not in keys or None not in (keys.get(name), keys[other]):
-                continue
-            value = keys.pop(other)
-            if value is not None:
-                line = lines[*path, name] = lines.get((*path, other), 0)
+        for name, other, unit in pairs if isinstance(keys, dict) else ():
+            if other in keys and None in (keys.get(name), keys[other]) and (value := keys.pop(other)) is not None:
+                line = document.lines[*path, name] = document.lines.get((*path, other), 0)
                 keys[name] = _converted(value, unit, name)
                 problems.append(_conversion(name, unit, column=".".join((*path, other)), file=file, line=line))
-        if group:
-            content[group] = keys
-    return YamlDocument(content, lines)
 
 
 def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
