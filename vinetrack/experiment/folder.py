@@ -224,7 +224,7 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     try:
         pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
     except TrackError as error:
-        row.add_error(error, column)
+        row.add_error(error, column, row.values[column])
         return
     if pressure is None:
         remedy = "fill it in, or give the track a column pressure_kPa"
@@ -269,17 +269,15 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
         try:
             if row["action"] not in ("move", "drop", "confirm"):
                 raise tables.TableError("is not an action", "write move, drop or confirm", code="not_a_choice")
-            column = "frame"
-            frame = tables.parse_number(row["frame"], table.decimal)
             column = "edge_px"
             edge_px = tables.parse_number(row["edge_px"], table.decimal) if row["action"] == "move" else math.nan
             column = "frame"
+            frame = tables.parse_number(row["frame"], table.decimal)
             if frame < 0 or frame != int(frame):
                 raise tables.TableError("is not a frame number", "frames are counted 0, 1, 2, …", code="not_a_frame")
-            repeated = int(frame) in by_frame
-            by_frame[int(frame)] = Correction(int(frame), row["action"], edge_px)
-            if repeated:
+            if frame in by_frame:
                 raise tables.TableError("is corrected twice", "keep one of the lines", code="twice")
+            by_frame[int(frame)] = Correction(int(frame), row["action"], edge_px)
         except tables.TableError as error:
             place: dict[str, Any] = {"line": line, "trial": row["trial"], "column": column, "value": row[column]}
             problems.append(Problem.from_error(error, CORRECTIONS_FILE, **place))
@@ -392,10 +390,11 @@ def check_experiment(
     readable: list[Trial] = []
     named_videos = {trial.video for trial in experiment.trials if trial.video}
     for trial in experiment.trials:
-        of_trial = _check_track(trial) if trial.track else _check_video(trial, named_videos)
+        of_trial = _check_track(trial) if trial.track else []
+        if trial.video:
+            of_trial = _check_video(trial.video, named_videos)
+            readable += [] if of_trial else [trial]
         trial_problems += [replace(problem, trial=trial.name) for problem in of_trial]
-        if trial.video and not of_trial:
-            readable.append(trial)
     if readable and open_videos is not None:
         trial_problems += open_videos(experiment, readable)
     return problems + [_with_location(problem, experiment) for problem in trial_problems]
@@ -454,27 +453,20 @@ def _check_track(trial: Trial) -> list[Problem]:
     return [Problem(code, message, severity="warning", **place) for code, message in remarks.items()]
 
 
-def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
+def _check_video(path: Path, named_videos: Set[Path]) -> list[Problem]:
     """Check that a recording exists and is not empty; `named_videos` are the recordings named by any trial."""
-    path = trial.video
-    if path is None:
-        return []
-    code, remedy = "empty", ""
+    code, message, remedy = "empty", "is an empty file", "copy it again"
     try:
+        if any(path.iterdir()) if path.is_dir() else tables.file_size(path):
+            return []
         if path.is_dir():
             message, remedy = "is an empty folder", "put the frames in it"
-            if any(path.iterdir()):
-                return []
-        elif tables.file_size(path) == 0:
-            message, remedy = "is an empty file", "copy it again"
-        else:
-            return []
     except (FileNotFoundError, ValueError):
         code, (message, remedy) = "no_file", tables.missing_file_message(path)
         if not path.is_symlink() and (close := closest_entry(path, named_videos)):
             remedy = f"did you mean {close}?"
     except OSError as error:
-        code, message = "unreadable", f"cannot be read: {error.strerror}"
+        code, message, remedy = "unreadable", f"cannot be read: {error.strerror}", ""
     return [Problem(code, message, "video", value=path.name, remedy=remedy)]
 
 

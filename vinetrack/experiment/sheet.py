@@ -66,10 +66,9 @@ class Row:
         place: dict[str, Any] = {"file": SHEET, "trial": self.name, "line": self.line}
         self.problems.append(Problem(code, message, column, severity=severity, **place, **details))
 
-    def add_error(self, error: InputError, column: str) -> None:
+    def add_error(self, error: InputError, column: str, value: str | None = None) -> None:
         """Record why the value of a column cannot be used."""
-        place: dict[str, Any] = {"trial": self.name, "line": self.line, "column": column}
-        self.problems.append(Problem.from_error(error, SHEET, value=self.values.get(column), **place))
+        self.add(error.code, error.message, column, value=value, allowed=error.allowed, remedy=error.remedy)
 
     def add_blank(self, columns: Sequence[str], remedy: str = "fill it in") -> None:
         """Report required columns that have no value, unless another problem already concerns them."""
@@ -81,20 +80,26 @@ class Row:
 
 
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
-    """Read and check the cells of one row; shared settings fill blank cells."""
+    """Read and check the cells of one row; shared settings fill blank cells. An invalid name gives way to the line."""
     cells, line = table.rows[index], table.lines[index]
-    row = Row(cells.get("trial", f"line-{line}"), line)
-    _check_name(row)
+    name = cells.get("trial", f"line-{line}")
+    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}", name, re.ASCII):
+        row = Row(name, line)
+    else:
+        row = Row(f"line-{line}", line)
+        code, message = ("name", "is not a valid trial name") if name else ("blank", "is blank")
+        remedy = "at most 100 characters, no spaces or dots, no hyphen first: files are named after it"
+        row.add(code, message, "trial", value=name, allowed=COLUMNS["trial"].allowed, remedy=remedy)
     for name, column in COLUMNS.items():
         text = cells.get(name, "")
-        if text == "":
+        if not text:
             if name in SHARED and (shared := getattr(settings, name)) is not None:
                 row.values[name] = shared
             continue
         try:
             row.values[name] = read_cell(column, text, table.decimal)
         except CellError as error:
-            row.problems.append(Problem.from_error(error, SHEET, trial=row.name, line=line, column=name, value=text))
+            row.add_error(error, name, text)
             continue
         if column.kind == "number" and (hint := unusual_value_hint(column, row.values[name])):
             row.add("unusual", f"is unusual: {hint}", name, "warning", value=text)
@@ -132,20 +137,8 @@ def closest_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
         names = {entry.name.lower(): entry.name for entry in sorted(path.parent.iterdir()) if entry not in taken}
     except (OSError, ValueError):
         return ""
-    return next(
-        (names[close] for close in difflib.get_close_matches(path.name.lower(), names, 1, CLOSE_NAME_RATIO)), ""
-    )
-
-
-def _check_name(row: Row) -> None:
-    """Report an invalid trial name, and replace it by the number of the line."""
-    given = row.name
-    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,99}", given, re.ASCII):
-        return
-    row.name = f"line-{row.line}"
-    code, message = ("name", "is not a valid trial name") if given else ("blank", "is blank")
-    remedy = "at most 100 characters, no spaces or dots, no hyphen first: files are named after it"
-    row.add(code, message, "trial", value=given, allowed=COLUMNS["trial"].allowed, remedy=remedy)
+    close = difflib.get_close_matches(path.name.lower(), names, 1, CLOSE_NAME_RATIO)
+    return names[close[0]] if close else ""
 
 
 def check_row(row: Row, folder: Path) -> None:
@@ -155,7 +148,7 @@ def check_row(row: Row, folder: Path) -> None:
             try:
                 safe_join(folder, row.values[name])
             except TableError as error:
-                row.add_error(error, name)
+                row.add_error(error, name, row.values[name])
     if "video" in row.values and "track" in row.values:
         message, remedy = "has both a video and a track", "keep one of the two"
         row.add("two_recordings", message, "track", value=row.values["track"], remedy=remedy)
