@@ -291,16 +291,11 @@ def _find_decimal(cells: list[str], delimiter: str) -> str:
     """Return the decimal mark: that of the unambiguous numbers; without any, that which the separator suggests."""
     if not any("," in cell for cell in cells):
         return "."
-    marks: set[str] = set()
-    ambiguous: set[str] = set()
-    for cell in cells:
-        if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell):
-            (ambiguous if _AMBIGUOUS_NUMBER.fullmatch(cell) else marks).add("," if "," in cell else ".")
-    if not marks and delimiter == ";":
-        marks = ambiguous
-    if len(marks) == 2:
-        return ""
-    return marks.pop() if marks else "."
+    numbers = [cell for cell in cells if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell)]
+    clear = [cell for cell in numbers if not _AMBIGUOUS_NUMBER.fullmatch(cell)]
+    counted = numbers if not clear and delimiter == ";" else clear
+    marks = {"," if "," in cell else "." for cell in counted}
+    return "" if len(marks) == 2 else marks.pop() if marks else "."
 
 
 def safe_join(folder: Path, relative: str) -> Path:

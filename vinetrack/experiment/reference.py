@@ -34,37 +34,29 @@ def _bounds_of(column: str) -> str:
     return COLUMNS[column].allowed.removesuffix(COLUMNS[column].unit).rstrip()
 
 
-def setting_entries(model: type[BaseModel], prefix: str = "") -> Iterator[Entry]:
+def setting_entries(model: type[BaseModel], prefix: str = "", suffix: str = "") -> Iterator[Entry]:
     """Yield the entries of all keys of a settings model that are not columns; keys of a group as `group.key`."""
     for name, field in model.model_fields.items():
-        if model is ExperimentSettings and name in SHARED:
+        if name == "kind" or (model is ExperimentSettings and name in SHARED):
             continue
         if model is Limits and name in COLUMNS:
             words = "Range to choose from." if name in LIMITED["range"] else "Values to choose from."
             yield Entry(prefix + name, COLUMNS[name].unit, "as in the trials so far", _bounds_of(name), words)
             continue
         key = split_unit(name)[1]
+        unit = UNITS[key].text if key else "mm/px" if name == "mm_per_px" else "px" if name.endswith("_px") else ""
         meaning = " ".join((field.description or "").split())
-        yield Entry(prefix + name, UNITS[key].text if key else "", _default(field), _allowed(field), meaning)
+        measured = next((text for text in field.metadata if isinstance(text, str)), "")
+        yield Entry(f"{prefix}{name}{suffix}", unit, _default(name, field), _allowed(field), meaning, measured)
         if isinstance(field.default, BaseModel):
             yield from setting_entries(type(field.default), f"{name}.")
 
 
-def picture_entries() -> list[Entry]:
-    """Entries of the keys of `calibration`, by its kind, and of `axis`."""
-    entries = []
-    models: dict[str, type[BaseModel]] = {**CALIBRATIONS, "": AxisSettings}
-    for kind, model in models.items():
-        for name, field in model.model_fields.items():
-            if name != "kind":
-                ends = {"_per_px": "mm/px", "_mm": "mm", "_px": "px"}
-                unit = next((text for end, text in ends.items() if name.endswith(end)), "")
-                shown = f"calibration.{name} (kind: {kind})" if kind else f"axis.{name}"
-                default = "required" if field.is_required() else "from the motion"
-                default = "none: a straight line" if name == "via_px" else default
-                measured = next(text for text in field.metadata if isinstance(text, str))
-                entries.append(Entry(shown, unit, default, _allowed(field), field.description or "", measured))
-    return entries
+def _picture_entries() -> Iterator[Entry]:
+    """Yield the entries of the keys of `calibration`, by its kind, and of `axis`."""
+    for kind, model in CALIBRATIONS.items():
+        yield from setting_entries(model, "calibration.", f" (kind: {kind})")
+    yield from setting_entries(AxisSettings, "axis.")
 
 
 def reference_content() -> dict[str, list[dict[str, str]]]:
@@ -81,7 +73,7 @@ def _groups() -> tuple[tuple[str, str, list[Entry]], ...]:
     return (
         ("columns", title, columns),
         ("experiment", "Keys of experiment.yaml", list(setting_entries(ExperimentSettings))),
-        ("picture", "Keys of calibration and axis in experiment.yaml", picture_entries()),
+        ("picture", "Keys of calibration and axis in experiment.yaml", list(_picture_entries())),
         ("run", run_title, list(setting_entries(RunSettings))),
     )
 
@@ -124,8 +116,10 @@ def reference_lines() -> list[str]:
     ]
 
 
-def _default(field: FieldInfo) -> str:
-    value = field.default
+def _default(name: str, field: FieldInfo) -> str:
+    value = {"via_px": "none: a straight line", "width_mm": "from the motion"}.get(name, field.default)
+    if field.is_required():
+        return "required"
     if value is None or isinstance(value, BaseModel):
         return ""
     if isinstance(value, bool):

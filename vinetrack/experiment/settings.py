@@ -176,24 +176,23 @@ class Limits(_LimitedColumns):
     hoop_stress_MPa: Positive = 7.8
     """Largest hoop stress allowed in the film."""
 
-    @field_validator(*LIMITED["range"], mode="before")
+    @field_validator(*LIMITED["range"], *LIMITED["choice"], mode="before")
     @classmethod
-    def _range(cls, value: Any, info: Any) -> Any:
-        return value if value is None else read_range(COLUMNS[info.field_name], value)
-
-    @field_validator(*LIMITED["choice"], mode="before")
-    @classmethod
-    def _values(cls, value: Any, info: Any) -> Any:
+    def _as_in_the_sheet(cls, value: Any, info: Any) -> Any:
         column = COLUMNS[info.field_name]
+        if value is None:
+            return None
+        if column.limit == "range":
+            return read_range(column, value)
         if isinstance(value, str) and ":" in value:
             low, high = read_range(column, value)
             steps = np.geomspace(low, high, 5) if low > 0 else np.linspace(low, high, 5)
             return tuple(sorted({low, *(float(f"{step:.3g}") for step in steps[1:-1]), high}))
-        if isinstance(value, list | tuple):
-            if not value:
-                raise CellError("is empty", "name at least one value, or remove the key", code="empty")
-            return tuple(sorted({read_limit(column, limit) for limit in value}))
-        return value if value is None else (read_limit(column, value),)
+        if not isinstance(value, list | tuple):
+            return (read_limit(column, value),)
+        if not value:
+            raise CellError("is empty", "name at least one value, or remove the key", code="empty")
+        return tuple(sorted({read_limit(column, limit) for limit in value}))
 
 
 # Type of the value of each kind of column; all others are numbers
