@@ -319,9 +319,8 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     """Read the conditions in use of a folder or sheet, filmed or not: the first row of each, or `every_row`."""
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
-        remedy = (
-            f"did you mean {close}?" if (close := closest_entry(file)) else f"give a folder with {SHEET}, or a sheet"
-        )
+        close = closest_entry(file)
+        remedy = f"did you mean {close}?" if close else f"give a folder with {SHEET}, or a sheet"
         raise ExperimentError([Problem("no_file", "does not exist", file=str(file), remedy=remedy)])
     table, header = read_sheet(file)
     settings = read_experiment_settings(file.parent / "experiment.yaml")
@@ -334,9 +333,9 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     rows, problems = _checked_rows(table, settings, REQUIRED_FOR_PREDICTION)
     problems = [*header, *(replace(problem, file=file.name) for problem in problems)]
     trials = _trials(rows, settings, problems)
-    first = {trial.condition: trial for trial in reversed(trials)}
     if not every_row:
-        trials = [first[condition] for condition in dict.fromkeys(trial.condition for trial in trials)]
+        first = {trial.condition: trial for trial in reversed(trials)}
+        trials = [trial for trial in trials if trial is first[trial.condition]]
     return PlannedTrials(tuple(trials), settings, file.parent, tuple(problems))
 
 
@@ -368,10 +367,9 @@ def _trials(rows: Sequence[Row], settings: ExperimentSettings, problems: Sequenc
         raise ExperimentError(problems)
     trials = []
     for row in rows:
-        values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS}
-        trial = make_trial(replace(row, values=values), Path(), settings)
-        trial = replace(trial, capture_fps=row.number("capture_fps"))
+        unused = {*_RECORDING_COLUMNS} - {"capture_fps"}
+        values = {name: value for name, value in row.values.items() if name not in unused}
         if "yield_pressure_kPa" not in values:
-            trial = replace(trial, yield_pressure_Pa=math.nan, yield_pressure_sigma_Pa=math.nan)
-        trials.append(trial)
+            values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)
+        trials.append(make_trial(replace(row, values=values), Path(), settings))
     return list(with_names(trials))
