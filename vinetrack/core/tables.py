@@ -21,6 +21,7 @@ import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -47,10 +48,8 @@ NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, o
 def missing_file_message(path: Path) -> tuple[str, str]:
     """Return message and remedy for a missing file; a broken link, as to an unmounted disk, is named as such."""
     if path.is_symlink():
-        return (
-            "is a link to something that does not exist",
-            "connect the disk it points to, or copy the file itself there",
-        )
+        remedy = "connect the disk it points to, or copy the file itself there"
+        return "is a link to something that does not exist", remedy
     return "does not exist", "check the path and its upper and lower case"
 
 
@@ -133,9 +132,9 @@ def _is_stack(path: Path) -> bool:
         return False
 
 
-def natural_order(text: str) -> list[tuple[int, int, str]]:
+def natural_order(text: str) -> list[Any]:
     """Sort key that orders numbers in a name by value: 2 before 10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.findall(r"\d+|\D+", text)]
+    return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"(\d+)", text))]
 
 
 MAX_TABLE_BYTES = 200_000_000  # Largest file read as a table (chosen)
@@ -242,25 +241,23 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
         delimiter, lines, skip_lines = match[1], lines[1:], skip_lines + 1
     else:
         delimiter = _find_delimiter(next((line for line in lines if line.strip()), ""))
-    records = _records("\n".join(lines), delimiter)
-    header = next(((line, cells) for line, cells in records if any(cells)), None)
-    if header is None:
+    records = [(line, cells) for line, cells in _records("\n".join(lines), delimiter) if any(cells)]
+    if not records:
         raise TableError("is empty", "its first line must name the columns")
-    columns = tuple(header[1])
-    named = [column for column in columns if column]
+    (_, columns), *body = records
+    named, width = tuple(filter(None, columns)), len(columns)
     if repeated := sorted({column for column in named if named.count(column) > 1}):
         raise TableError(f"names the column {repeated[0]!r} twice", "keep one of them")
-    body = [(line, cells) for line, cells in records if line > header[0] and any(cells)]
-    width = len(columns)
-    rows = tuple(
-        {name: cell for name, cell in zip(columns, cells + [""] * (width - len(cells)), strict=False) if name}
-        for _, cells in body
+    pairs = [list(zip_longest(columns, cells[:width], fillvalue="")) for _, cells in body]
+    return Table(
+        columns=named,
+        rows=tuple({name: cell for name, cell in row if name} for row in pairs),
+        lines=tuple(line + skip_lines for line, _ in body),
+        extra=tuple(tuple(filter(None, cells[width:])) for _, cells in body),
+        delimiter=delimiter,
+        decimal=_find_decimal([cell for _, cells in body for cell in cells], delimiter),
+        nameless=any(cell and not name for row in pairs for name, cell in row),
     )
-    extra = tuple(tuple(filter(None, cells[width:])) for _, cells in body)
-    nameless = any(cell and not name for _, cells in body for name, cell in zip(columns, cells, strict=False))
-    cells_in_body = [cell for _, cells in body for cell in cells]
-    lines_of_rows = tuple(line + skip_lines for line, _ in body)
-    return Table(tuple(named), rows, lines_of_rows, extra, delimiter, _find_decimal(cells_in_body, delimiter), nameless)
 
 
 def _find_delimiter(header: str) -> str:
