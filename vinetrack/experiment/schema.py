@@ -51,14 +51,14 @@ class Column:
     measured: str
 
     @property
-    def scale(self) -> Unit | None:
-        """The unit; None for text and for numbers without one."""
-        return UNITS.get(self.unit_key)
+    def scale(self) -> Unit:
+        """The unit; one without a name for text and for numbers that have none."""
+        return UNITS.get(self.unit_key, Unit("", ""))
 
     @property
     def unit(self) -> str:
         """The unit as it is printed; blank if there is none."""
-        return self.scale.text if self.scale else ""
+        return self.scale.text
 
     @property
     def allowed(self) -> str:
@@ -80,12 +80,11 @@ class Column:
 
     def to_si(self, value: float) -> float:
         """Convert a value of this column to SI."""
-        return self.scale.to_si(value) if self.scale else value
+        return self.scale.to_si(value)
 
     def of_trial(self, trial: Trial) -> float:
         """Return a trial's value of this column."""
-        value = float(getattr(trial, self.field))
-        return self.scale.from_si(value) if self.scale else value
+        return self.scale.from_si(float(getattr(trial, self.field)))
 
 
 def _read_columns() -> dict[str, Column]:
@@ -187,13 +186,12 @@ def read_limit(column: Column, value: Any) -> float:
 
 def _check_number(column: Column, value: float) -> float:
     """Return the value unchanged if its column allows it."""
-    if column.kind == "choice":
-        if value not in (1, 2):
-            raise CellError("is not a travel ratio", code="not_a_choice")
-    elif value > column.high:
+    if column.kind == "choice" and value not in (1, 2):
+        raise CellError("is not a travel ratio", code="not_a_choice")
+    if value > column.high:
         message = f"is above {column.high:g} {column.unit}"
         raise CellError(message, _likely_unit(column, value), code="above_bounds")
-    elif value < column.low or (column.above_low and value == column.low):
+    if value < column.low or (column.above_low and value == column.low):
         message = f"{'is not above' if column.above_low else 'is below'} {column.low:g} {column.unit}".strip()
         raise CellError(message, _likely_unit(column, value), code="below_bounds")
     return value
@@ -327,6 +325,5 @@ def _part(column: Column, trial: Trial) -> str:
     if column.kind == "bends":
         value = "-".join("x".join(_digits(1000 * m) for m in (b.start_m, b.arc_m, b.radius_m)) for b in trial.bends)
     else:
-        number = column.of_trial(trial)
-        value = _digits(number) if math.isfinite(number) else ""
+        value = _digits(number) if math.isfinite(number := column.of_trial(trial)) else ""
     return column.condition_part.format(value) if value else ""
