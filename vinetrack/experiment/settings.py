@@ -448,7 +448,10 @@ def _to_key_units(document: YamlDocument, file: str, problems: list[Problem]) ->
         names = dict.fromkeys(name for model in models for name in model.model_fields)
         pairs = [(name, *other) for name in names for other in other_units(name).items()]
         for name, other, unit in pairs if isinstance(keys, dict) else ():
-            if other in keys and None in (keys.get(name), keys[other]) and (value := keys.pop(other)) is not None:
+            if other not in keys or None not in (keys.get(name), keys[other]):
+                continue
+            value = keys.pop(other)
+            if value is not None:
                 line = document.lines[*path, name] = document.lines.get((*path, other), 0)
                 keys[name] = _converted(value, unit, name)
                 problems.append(_conversion(name, unit, column=".".join((*path, other)), file=file, line=line))

@@ -43,9 +43,14 @@ class Row:
     problems: list[Problem] = field(default_factory=list)
 
     @property
+    def faulty(self) -> set[str]:
+        """Columns that have an error; a blank for one of the row as a whole."""
+        return {problem.column for problem in self.problems if problem.severity == "error"}
+
+    @property
     def failed(self) -> bool:
         """Whether the row has an error."""
-        return any(problem.severity == "error" for problem in self.problems)
+        return bool(self.faulty)
 
     @property
     def in_use(self) -> bool:
@@ -73,9 +78,8 @@ class Row:
     def add_blank(self, columns: Sequence[str], remedy: str = "fill it in") -> None:
         """Report required columns that have no value, unless another problem already concerns them."""
         code = "blank" if self.line else "missing"  # a row that stands in no file has no blank cells
-        faulty = {problem.column for problem in self.problems if problem.severity == "error"}
         for name in columns:
-            if name not in self.values and name not in faulty:
+            if name not in {*self.values, *self.faulty}:
                 self.add(code, f"is {code}", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
 
 
@@ -168,8 +172,7 @@ def check_row(row: Row, folder: Path) -> None:
 
 def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
     """Report required cells that are blank; return required columns that neither sheet nor settings have."""
-    faulty = {problem.column for problem in row.problems if problem.severity == "error"}
-    if "travel_ratio" in faulty:
+    if "travel_ratio" in row.faulty:
         return set()
     required = list(REQUIRED_COLUMNS if row.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
     if "pressure_kPa" in required and ("pressure_trace" in row.values or "track" in row.values):
@@ -179,7 +182,7 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
         required.append("capture_fps")
         if "capture_fps" in columns:
             row.add_blank(["capture_fps"], "write the capture rate; the rate stored in the file is that of playback")
-    return set(required) - set(columns) - set(row.values) - faulty
+    return set(required) - set(columns) - set(row.values)
 
 
 def _may_state_rate(folder: Path, video: str) -> bool:
