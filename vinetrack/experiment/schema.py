@@ -21,7 +21,7 @@ from typing import Any
 from vinetrack.core.problems import InputError
 from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import parse_number
-from vinetrack.core.units import UNITS, Unit, convert, split_unit
+from vinetrack.core.units import NO_UNIT, UNITS, Unit, convert, split_unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Column:
     @property
     def scale(self) -> Unit:
         """The unit; one without a name for text and for numbers that have none."""
-        return UNITS.get(self.unit_key, Unit("", ""))
+        return UNITS.get(self.unit_key, NO_UNIT)
 
     @property
     def unit(self) -> str:

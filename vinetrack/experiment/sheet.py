@@ -78,8 +78,9 @@ class Row:
     def add_blank(self, columns: Sequence[str], remedy: str = "fill it in") -> None:
         """Report required columns that have no value, unless another problem already concerns them."""
         code = "blank" if self.line else "missing"  # a row that stands in no file has no blank cells
+        known = {*self.values, *self.faulty}
         for name in columns:
-            if name not in {*self.values, *self.faulty}:
+            if name not in known:
                 self.add(code, f"is {code}", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
 
 
