@@ -122,7 +122,7 @@ def of_recordings(counts: list[int], cores: int, folder: Path) -> None:
             if what == "one pressure changed":
                 with_another_pressure(experiment / "trials.csv")
             used, verdict = run_chain(experiment, results, cores)
-            new = set(kept.glob("*.npz")) - tracks
+            new = set(kept.glob("*.track")) - tracks
             tracks |= new
             show(f"{count} recordings, {what}", used, results / experiment.name, len(new), verdict)
             first.setdefault(count, (used.processor_s, decoding.processor_s))

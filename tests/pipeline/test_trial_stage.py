@@ -22,11 +22,11 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import run_settings
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge, draw_strip
 from vinetrack.pipeline import overlays_stage
-from vinetrack.pipeline.stages import Job, Kept, map_unordered, packed, unpacked
+from vinetrack.pipeline.stages import Job, Kept, map_unordered
 from vinetrack.pipeline.trials import analyse_trials
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video import survey
-from vinetrack.video.track import Tracking, in_metres
+from vinetrack.video.track import Tracking
 from vinetrack.video.write import write_clip
 
 SHEET: dict[str, object] = {
@@ -122,17 +122,6 @@ def test_a_changed_scale_gives_the_metres_of_a_new_track(tracked, tmp_path):
         assert (tmp_path / file).read_bytes() == (results / file).read_bytes(), file
 
 
-def test_what_is_kept_is_every_bit_of_a_tracking(tracked):
-    (path, *_) = (tracked[1] / ".kept").glob("*.npz")
-    tracking = unpacked(path.read_bytes())
-    again = unpacked(packed(tracking))
-    assert (again.axis, again.ending, again.track.notes) == (tracking.axis, tracking.ending, tracking.track.notes)
-    np.testing.assert_array_equal(again.kymograph, tracking.kymograph)
-    np.testing.assert_array_equal(again.track.lead_position_sigma_m, tracking.track.lead_position_sigma_m)
-    trial = read_experiment(tracked[0]).trial("b")
-    assert np.nanmax(in_metres(again, trial, 3e-4).track.lead_position_m) > 0.15
-
-
 @pytest.mark.slow
 def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked, tmp_path):
     folder, results = tracked
@@ -141,10 +130,10 @@ def test_a_killed_stage_goes_on_at_the_recording_where_it_stopped(tracked, tmp_p
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     ends = time.monotonic() + 120
     with subprocess.Popen(command, env=environment) as first:
-        while not list((tmp_path / ".kept").glob("[!.]*.npz")) and time.monotonic() < ends:
+        while not list((tmp_path / ".kept").glob("[!.]*.track")) and time.monotonic() < ends:
             time.sleep(0.005)
         first.send_signal(signal.SIGKILL)
-    kept = {path: path.stat().st_ino for path in (tmp_path / ".kept").glob("[!.]*.npz")}
+    kept = {path: path.stat().st_ino for path in (tmp_path / ".kept").glob("[!.]*.track")}
     assert kept
     subprocess.run(command, env=environment, check=True)
     assert {path: path.stat().st_ino for path in kept} == kept

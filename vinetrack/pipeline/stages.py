@@ -7,25 +7,22 @@ that does part of a run calls the same function. Imports stay light: Snakemake l
 from __future__ import annotations
 
 import hashlib
-import io
-import json
 import multiprocessing
 import os
+import pickle
 import sys
 import threading
 import time
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-
-from vinetrack.core.records import Track
 from vinetrack.core.tables import write_bytes
 
 if TYPE_CHECKING:
@@ -183,11 +180,6 @@ def code_hash(*rooms: str) -> str:
     return digest.hexdigest()[:16]
 
 
-SCALARS = (
-    "blur_px", "exposure_frames", "tube_width_px", "tube_width_sigma_px", "seen_exposure_frames", "fast_px_per_frame",
-)  # fmt: skip
-
-
 def identity(path: Path) -> tuple[tuple[str, int, int], ...]:
     """Name, size and time of modification of a file and of those that share its name, or of all files of a folder."""
     files = path.rglob("*") if path.is_dir() else path.parent.glob(f"{path.stem}.*")
@@ -209,11 +201,12 @@ class Kept:
         libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2", "skimage")]
         code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
         self.tracked = _key(code, libraries, film.resolve(), identity(film), others)
-        path = self.folder / f"{self.tracked}.npz"
+        path = self.folder / f"{self.tracked}.track"
         if not (data := _read(path)):
-            data = packed(make())
+            data = zlib.compress(pickle.dumps(make()), 1)
             write_bytes(path, data)
-        return unpacked(data)
+        tracking: Tracking = pickle.loads(zlib.decompress(data))  # the same, bit by bit, whether made now or before
+        return tracking
 
     def figure(
         self,
@@ -252,46 +245,3 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except FileNotFoundError:
         return b""
-
-
-def packed(tracking: Tracking) -> bytes:
-    """A tracking in pixels as a file of arrays without pickled objects."""
-    from vinetrack.video.curved_axis import axis_entry
-
-    track, ending = tracking.track, tracking.ending
-    text = {
-        **{name: getattr(tracking, name) for name in SCALARS},
-        "axis": axis_entry(tracking.axis) | {"width_px": tracking.axis.width_px},
-        "notes": track.notes,
-        "ending": vars(ending),
-        "shown": [frame for frame, _ in tracking.pictures],
-    }
-    file = io.BytesIO()
-    np.savez_compressed(
-        file, text=np.array(json.dumps(text)), time_s=track.time_s, edge_px=track.edge_px, flag=track.flag,
-        sigma_px=track.lead_position_sigma_m, systematic_px=np.asarray(track.lead_position_systematic_m),
-        kymograph=tracking.kymograph, shake_px=tracking.shake_px, strip_frames=tracking.strip_rows,
-        pictures=np.stack([picture for _, picture in tracking.pictures]),
-    )  # fmt: skip
-    return file.getvalue()
-
-
-def unpacked(data: bytes) -> Tracking:
-    """Read what `packed` wrote."""
-    from vinetrack.video.curved_axis import axis_from_entry
-    from vinetrack.video.point_quality import Ending
-    from vinetrack.video.track import Tracking
-
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        text: dict[str, Any] = json.loads(str(arrays["text"]))
-        track = Track(
-            arrays["time_s"], np.full(len(arrays["time_s"]), np.nan), arrays["sigma_px"], arrays["flag"],
-            arrays["edge_px"], notes=tuple(text["notes"]), lead_position_systematic_m=arrays["systematic_px"],
-        )  # fmt: skip
-        ending = Ending(**text["ending"])
-        return Tracking(
-            track=track, axis=axis_from_entry(text["axis"]), kymograph=arrays["kymograph"],
-            pictures=tuple(zip(text["shown"], arrays["pictures"], strict=True)), shake_px=arrays["shake_px"],
-            strip_frames=arrays["strip_frames"], ending=replace(ending, remarks=tuple(ending.remarks)),
-            **{name: text[name] for name in SCALARS},
-        )  # fmt: skip
