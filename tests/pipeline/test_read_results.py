@@ -189,8 +189,8 @@ def test_predictions_take_the_model_that_the_diagnosis_ended_with_and_no_refuted
         with pytest.raises(ResultsError):
             choose_fit(tmp_path)
     else:
-        content, heading = choose_fit(tmp_path)
-        assert content["model"] == model
+        fit, heading = choose_fit(tmp_path)
+        assert list(fit.names) == model
         assert ("air_drag added" in " ".join(heading)) == bool(added)
 
 

@@ -55,7 +55,7 @@ from vinetrack.planning.predictive_inputs import (
     predictive_inputs,
     read_sizes,
 )
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json
 
 # ------------------------------------------------------------------------------
 # Choice of the fit from which predictions are made; a model that the diagnosis refuted is not used silently.
@@ -64,16 +64,15 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 # After any other verdict there is no prediction, unless the user insists with `--anyway`.
 
 
-def choose_fit(folder: Path, anyway: bool = False) -> tuple[Mapping[str, Any], tuple[str, ...]]:
-    """Choose the fit of a results folder to predict from. Returns its content, heading (over all predicted from it)."""
+def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[str, ...]]:
+    """Choose the fit of a results folder to predict from. Returns it, and the heading over all predicted from it."""
     results = Results(folder)
-    in_use = read_json(results.fit)
-    diagnosis = read_diagnosis(results)
+    in_use, diagnosis = read_fit(results), read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return in_use, (f"! {remark('fit_not_diagnosed', folder=folder)}",)
     if diagnosis.verdict == ADEQUATE:
         return in_use, ()
-    final = read_json(results.final_fit) if results.final_fit.exists() else None
+    final = FitSummary.from_json(read_json(results.final_fit)) if results.final_fit.exists() else None
     added = " + ".join(diagnosis.effects)
     if diagnosis.final_verdict == ADEQUATE and final is not None:
         return final, (str(remark("from_final_model", added=added)),)
@@ -111,7 +110,7 @@ class PredictionBasis:
 def read_basis(
     needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
     *,
-    cells: Mapping[str, str] | None = None,
+    cells: Mapping[str, str],
     sheet: Path | None = None,
     results: Path | None = None,
     anyway: bool = False,
@@ -123,13 +122,13 @@ def read_basis(
     the columns that were given; `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
     """
     fit: FitNumbers | None = None
-    user_effects: Mapping[str, Effect] | None = None
     heading: tuple[str, ...] = ()
     if results is not None:
-        content, heading = choose_fit(results, anyway)
-        fit, user_effects = _read_fit(results, content)
+        summary, heading = choose_fit(results, anyway)
+        with planning_errors():
+            fit = fit_numbers(summary, results.as_posix())
     if sheet is None:
-        planned = planned_trial(cells or {}, ExperimentSettings(), needed)
+        planned = planned_trial(cells, ExperimentSettings(), needed)
     else:
         planned = planned_sheet(sheet)
         said: dict[str, Any] = {"message": "is given in addition to a sheet", "remedy": "write it in the sheet"}
@@ -137,8 +136,7 @@ def read_basis(
             raise ExperimentError([Problem(column=option(name), value=text, **said) for name, text in cells.items()])
     if tail_slack is not None:
         planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
-    if user_effects is None:
-        user_effects = effects_of_plan(planned)
+    user_effects = effects_of_plan(planned) if fit is None else _effects_of_fit(fit)
     sizes = [read_sizes(text, user_effects) for text in effects]
     stated = StatedValues(
         **numbers,
@@ -155,21 +153,19 @@ def effects_of_plan(planned: PlannedTrials) -> Mapping[str, Effect]:
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def _read_fit(results: Path, content: Mapping[str, Any]) -> tuple[FitNumbers, Mapping[str, Effect]]:
-    """Read a fit of a results folder, and the user's own effects if its model contains any."""
-    with planning_errors():
-        fit = fit_numbers(FitSummary.from_json(content), results.as_posix())
+def _effects_of_fit(fit: FitNumbers) -> Mapping[str, Effect]:
+    """Read the user's own effects of the experiment that was fitted, if the model contains any."""
     own_names = [name for name in fit.fit.names if name not in catalogue()]
     if not own_names:
-        return fit, {}
-    experiment = Path(str(read_json(Results(results).provenance).get("experiment", "")))
+        return {}
+    experiment = Path(str(read_json(Results(Path(fit.source)).provenance).get("experiment", "")))
     user_effects = effects_of(experiment) if experiment.is_dir() else {}
     if not set(own_names) <= set(user_effects):
         raise ResultsError(
-            f"{results} was fitted with {', '.join(own_names)}, an effect of its experiment, which is no longer "
+            f"{fit.source} was fitted with {', '.join(own_names)}, an effect of its experiment, which is no longer "
             f"in {experiment}: put the folder back, or fit again"
         )
-    return fit, user_effects
+    return user_effects
 
 
 @contextmanager
