@@ -6,6 +6,7 @@ traceback.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import sys
@@ -26,6 +27,7 @@ app = new_app(
 
 def main() -> None:
     """Entry of the `vinetrack` command."""
+    gc.set_threshold(100_000, 50, 50)  # the usual 700, 10, 10 cost a twentieth of the processor time (measured)
     try:
         app()
     except SystemExit as ending:

@@ -23,6 +23,8 @@ from typing import Annotated, Any
 
 import typer
 
+from vinetrack.core.problems import ExperimentError, UserError, format_problems
+from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, write_json
 from vinetrack.experiment.schema import COLUMNS, CellError, Column, option, read_cell
 
 # ------------------------------------------------------------------------------
@@ -33,8 +35,6 @@ START, MORE = "Start here", "More"  # Panels of the help; the first lists the co
 
 def json_to_terminal(json_file: Path | None) -> bool:
     """Whether JSON is printed to the terminal instead of lines."""
-    from vinetrack.core.tables import STANDARD_OUTPUT
-
     return json_file == STANDARD_OUTPUT
 
 
@@ -65,9 +65,6 @@ def progress_line() -> Iterator[Callable[[str], None]]:
 @contextmanager
 def errors_as_sentences(log: Path | None) -> Iterator[None]:
     """Report every exception in a sentence and exit with status 1; messages and tracebacks go to the log."""
-    from vinetrack.core.problems import ExperimentError, UserError, format_problems
-    from vinetrack.core.tables import is_disk_full
-
     try:
         _log_to(log)
         yield
@@ -146,8 +143,6 @@ def command(
                         named["options"] = {**options, "cells": cells} if columns else options
                     answer = function(**named)
                 if answer is not None:
-                    from vinetrack.core.tables import write_json
-
                     lines, content, *failed = answer
                     for text in () if json_to_terminal(json_file) else lines:
                         _say(text)
