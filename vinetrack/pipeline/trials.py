@@ -105,9 +105,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
         reason, fault = TRIAL_NOT_ANALYSED, traceback.format_exc()
     row = _bare_row(name, "failed", reason, trial) if summary is None else dict(summary.row) | columns
     _write(results, name, summary, row, view)
-    _draw_trial(name, trial, results, settings.figures, kept)
-    if trial is not None and trial.video is not None:
-        _draw_strip(trial, results, measurement, reason, settings.figures, kept)
+    _draw(name, trial, measurement, reason, results, settings.figures, kept)
     return name, reason, fault
 
 
@@ -186,39 +184,40 @@ def _write(results: Results, name: str, summary: TrialResult | None, row: dict[s
     write_json(results.analysed(name), content | view)
 
 
-def _draw_trial(name: str, trial: Trial | None, results: Results, settings: FigureSettings, kept: Kept) -> None:
-    """Draw position, speed and steady windows of a trial, unless nothing in them changed."""
-    title, ratio = (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
+def _draw(
+    name: str, trial: Trial | None, measurement: Measurement | None, reason: str, results: Results,
+    settings: FigureSettings, kept: Kept,
+) -> None:  # fmt: skip
+    """Draw the motion of a trial, and the strip of a recording with its tracked edge, unless nothing changed."""
+    title, ratio = _described(name, trial)
+    shown = [path(name).read_bytes() for path in (results.track, results.kinematics, results.analysed)]
 
-    def draw() -> Figure:
+    def motion() -> Figure:
         return draw_trial(results, trial, name) or blank(f"{title}: no positions to draw.")
 
-    shown = [path(name).read_bytes() for path in (results.track, results.kinematics, results.analysed)]
-    kept.figure(("trial", title, ratio, *shown), partial(results.trial_figure, name), settings, draw)
+    def strip() -> Figure:
+        if measurement is None:
+            return blank(f"{name}: {reason}")
+        return draw_strip(name, measurement.tracking, measurement.m_per_px)
+
+    kept.figure(("trial", title, ratio, *shown), partial(results.trial_figure, name), settings, motion)
+    if trial is not None and trial.video is not None:
+        seen = (reason,) if measurement is None else (kept.tracked, measurement.m_per_px, trial.corrections)
+        kept.figure(("strip", name, *seen), partial(results.strip_figure, name), settings, strip)
+
+
+def _described(name: str, trial: Trial | None) -> tuple[str, float]:
+    """Title of the figure of a trial, and its travel ratio; `trial` is None if its row of the sheet is faulty."""
+    return (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
 
 
 def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | None:
     """Draw position, speed and steady windows of one trial; None if there are no positions."""
-    title, ratio = (name, 2.0) if trial is None else (describe_trial(trial), trial.travel_ratio)
+    title, ratio = _described(name, trial)
     windows = _frame(read_json(results.analysed(name))["windows"], STEADY_COLUMNS)
     return draw_trial_motion(
         title, read_result(results.track(name)), read_result(results.kinematics(name)), windows, ratio
     )
-
-
-def _draw_strip(
-    trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: FigureSettings, kept: Kept
-) -> None:
-    """Draw the strip of a recording with its tracked edge, unless nothing in it changed."""
-
-    def draw() -> Figure:
-        if measurement is None:
-            return blank(f"{trial.name}: {reason}")
-        return draw_strip(trial.name, measurement.tracking, measurement.m_per_px)
-
-    shown = (reason,) if measurement is None else (kept.tracked, measurement.m_per_px, trial.corrections)
-    inputs: tuple[object, ...] = ("strip", trial.name, *shown)
-    kept.figure(inputs, partial(results.strip_figure, trial.name), settings, draw)
 
 
 # ------------------------------------------------------------------------------
