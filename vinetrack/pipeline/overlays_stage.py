@@ -17,14 +17,22 @@ from vinetrack.core.problems import INTERNAL_ERROR, UserError
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, hand_corrected, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.units import number
-from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
 from vinetrack.experiment.sheet import closest_entry
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
 from vinetrack.figures.style import GREEN, render
 from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pipeline.stages import Job, map_unordered
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.results.folder_layout import (
+    Results,
+    ResultsError,
+    read_diagnosis,
+    read_fit,
+    read_json,
+    read_result,
+    read_source_experiment,
+)
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import axis_entry, axis_from_entry
 from vinetrack.video.frames import CONTAINERS, IMAGES, Recording, RecordingError, inspect_recording, iterate_frames
@@ -58,17 +66,14 @@ def draw_overlays(job: Job) -> list[str]:
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float = math.nan) -> Path:
     """Write the clip of one trial of a results folder with the settings of its run; return its path."""
-    results = Results(folder)
-    provenance = read_json(results.provenance)
-    read = read_experiment(experiment or Path(str(provenance["experiment"])))
-    filmed = [filmed_trial.name for filmed_trial in read.trials if filmed_trial.video is not None]
+    results, read = Results(folder), read_source_experiment(folder, experiment)
+    filmed = [one.name for one in read.trials if one.video is not None]
     if trial not in filmed:
         existing = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there are none"
         raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: {existing}")
-    settings = OverlaySettings(**(provenance.get("settings") or {}).get("overlays") or {})
-    if math.isfinite(seconds):
-        settings = settings.model_copy(update={"seconds": seconds})
-    return _write_overlay(read.trial(trial), results, settings)
+    of_run = read_json(results.provenance).get("settings") or {}
+    asked = {"seconds": seconds} if math.isfinite(seconds) else {}
+    return _write_overlay(read.trial(trial), results, OverlaySettings(**(of_run.get("overlays") or {}) | asked))
 
 
 def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
