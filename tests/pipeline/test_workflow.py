@@ -115,11 +115,11 @@ def test_results_lie_where_snakemake_puts_them_or_as_told(tmp_path, monkeypatch)
     folder = experiment(tmp_path / "week" / "my vines")
     monkeypatch.chdir(tmp_path)
     results = tmp_path / workflow.make_plan({"experiment": folder}, tmp_path).results
-    assert workflow.run_paths(folder, None) == workflow.RunPaths(folder, results)
-    assert workflow.run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "my vines"
+    assert workflow.run_paths(folder, None) == (folder, results)
+    assert workflow.run_paths(folder, tmp_path / "out")[1] == tmp_path / "out" / "my vines"
     given, command = folder.relative_to(tmp_path), "vinetrack run 'week/my vines'"
     for base, options in ((None, ""), (Path("out"), " --results out")):
-        results = workflow.run_paths(given, base).results
+        _, results = workflow.run_paths(given, base)
         for there in (results, Path(os.path.relpath(results))):
             assert workflow.command_for_results(given, there) == command + options
     elsewhere = workflow.command_for_results(given, Path("results/other"))
@@ -134,7 +134,7 @@ def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keep
     assert all(str(folder) in str(refused.value) for folder in (first, second))
     with pytest.raises(ExperimentError):
         planned(second, results=str(tmp_path / "out" / "vines"))
-    assert workflow.run_paths(first, tmp_path / "out").experiment == first
+    assert workflow.run_paths(first, tmp_path / "out")[0] == first
     moved = first.rename(tmp_path / "else") / "."
     assert planned(moved, results=str(tmp_path / "out" / "vines")).trials == ("a",)
 
@@ -143,14 +143,14 @@ def test_experiments_of_one_name_never_share_results_and_one_that_has_moved_keep
 def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path):
     experiment(tmp_path / "vines: ü & 'q'")
     folder = experiment(tmp_path / "vines: ü & 'q' #2 $(x);")
-    paths = workflow.RunPaths(folder, tmp_path / "out" / folder.name)
-    wrong = workflow.RunPaths(experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3,\n"), tmp_path)
+    paths = folder, tmp_path / "out" / folder.name
+    wrong = experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3,\n"), tmp_path
     with pytest.raises(ExperimentError, match="pressure_kPa"):
-        workflow.check_before_run(wrong, print)
+        workflow.check_before_run(*wrong, print)
     (folder / "trials.csv").write_text("nothing\n")
     with pytest.raises(workflow.RunError, match="trial"):
-        workflow.run_chain(paths, 1, print)
-    assert (paths.results / "logs" / "run.log").is_file()
+        workflow.run_chain(*paths, 1, print)
+    assert (paths[1] / "logs" / "run.log").is_file()
 
 
 @pytest.mark.slow
@@ -189,17 +189,17 @@ time.sleep(60)
 def test_a_run_that_lives_is_named_and_one_that_was_killed_is_not_in_the_way(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", BEGIN]
-    paths = workflow.RunPaths(tmp_path / "vines", tmp_path / "results" / "vines")
+    paths = tmp_path / "vines", tmp_path / "results" / "vines"
     with subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "begun\n"
         with pytest.raises(ExperimentError, match=f"process {other.pid}"):
-            workflow.begin_run(paths.results, paths.experiment)
+            workflow.begin_run(paths[1], paths[0])
         with pytest.raises(ExperimentError, match=f"process {other.pid}"):
-            workflow.run_chain(paths, 1, print)
+            workflow.run_chain(*paths, 1, print)
         other.kill()
-    assert not (paths.results / "logs").exists()
-    workflow.begin_run(paths.results, paths.experiment).release()
+    assert not (paths[1] / "logs").exists()
+    workflow.begin_run(paths[1], paths[0]).release()
 
 
 def test_files_never_finished_are_cleared_but_not_those_that_may_be_written_now(tmp_path):

@@ -63,9 +63,9 @@ def _run(folder: Path, cores: int, results: Path | None, verbose: bool, say: Say
 
     paths = run_paths(folder, results)
     with compilation_told(say):
-        check_before_run(paths, say)
-    run_chain(paths, cores, say, verbose)
-    to = Results(paths.results)
+        check_before_run(*paths, say)
+    run_chain(*paths, cores, say, verbose)
+    to = Results(paths[1])
     return run_lines(to.folder), {"results": to.folder, "report": to.report, "diagnosis": read_json(to.diagnosis)}
 
 

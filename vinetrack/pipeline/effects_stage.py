@@ -12,7 +12,7 @@ from vinetrack.core.tables import TableError, safe_join, write_text
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.model import check_needs, make_model
 from vinetrack.effects import Effect, EffectError, catalogue, explanation, find_effect, listing, own_effects, remember
-from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis
 
@@ -61,25 +61,21 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
         raise ExperimentError([Problem(message=str(error), file="experiment.yaml", column="effects")]) from None
 
 
-def model_problems(experiment: Path) -> list[Problem]:
-    """Find problems of the effects that a readable experiment names in `model`, `candidates` or `effects`."""
-    try:
-        read = read_experiment(experiment, strict=False)
-    except ExperimentError:
-        return []
-    settings = read.settings
+def model_problems(experiment: Experiment) -> list[Problem]:
+    """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`."""
+    settings = experiment.settings
     if settings.model == BASE_EFFECTS and not settings.effects and not settings.candidates:
         return []
-    if not all((experiment / path).exists() for path in settings.effects):
+    if not all((experiment.folder / path).exists() for path in settings.effects):
         return []
     column = "effects"
     try:
-        user_effects = effects_of(experiment)
+        user_effects = effects_of(experiment.folder)
         column = "candidates"
         for name in settings.candidates or ():
             find_effect(name, user_effects)
         column = "model"
-        check_needs(make_model(settings.model, user_effects), *read.trials)
+        check_needs(make_model(settings.model, user_effects), *experiment.trials)
     except EffectError as error:
         return [Problem(message=str(error).rstrip("."), file="experiment.yaml", column=column)]
     return []

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
 from vinetrack.core.tables import is_readable, write_text
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from vinetrack.video.survey import Keep
 
 Say = Callable[[str], None]
-Made = TypeVar("Made")
 
 # ------------------------------------------------------------------------------
 # The folders of a run: that of the experiment, and that of its results, which belong to one experiment only.
@@ -46,19 +45,13 @@ def find_experiment(folder: Path) -> Path:
     """Return `folder` if it exists."""
     if folder.exists():
         return folder
-    parent = folder.absolute().parent
-    while not parent.is_dir():
-        parent = parent.parent
-    folders = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
-    missing = folder.absolute().relative_to(parent).parts[0]
-    close = difflib.get_close_matches(missing, folders, 1, 0.5)
-    experiments = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
-    if close:
-        remedy = f"did you mean {os.path.relpath(parent / close[0])}?"
-    elif experiments:
-        remedy = f"existing experiments are {', '.join(os.path.relpath(parent / name) for name in experiments)}"
-    else:
-        remedy = f"the nearest existing folder is {os.path.relpath(parent)}"
+    parent = next(above for above in folder.absolute().parents if above.is_dir())
+    names = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
+    close = difflib.get_close_matches(folder.absolute().relative_to(parent).parts[0], names, 1, 0.5)
+    experiments = [name for name in names if (parent / name / "trials.csv").is_file()][:3]
+    shown = ", ".join(os.path.relpath(parent / name) for name in close or experiments or [""])
+    others = "existing experiments are" if experiments else "the nearest existing folder is"
+    remedy = f"did you mean {shown}?" if close else f"{others} {shown}"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
 
 
@@ -294,7 +287,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     )
 
 
-def or_exit(function: Callable[..., Made], *given: Any) -> Made:
+def or_exit(function: Callable[..., Any], *given: Any) -> Any:
     """Call a function for the Snakefile; print its problems instead of a traceback and exit with status 1."""
     try:
         return function(*given)
@@ -354,11 +347,12 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     from vinetrack.video.survey import Surveyor, axis_notes, direction_notes, facts_entry, facts_rows
 
     surveyor = Surveyor(keep)
-    problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor), *model_problems(folder)]
+    problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor)]
     try:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError:
         return CheckReport(tuple(problems), (), (), ())
+    problems += model_problems(experiment)
     facts = {trial.name: recording_facts for trial, recording_facts in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
     entries = [facts[trial.name] for trial in trials]
@@ -397,32 +391,23 @@ class RunError(UserError):
     """A run that failed; the message names the stage and the reason."""
 
 
-@dataclass(frozen=True)
-class RunPaths:
-    """The experiment folder and the results folder of a run, both absolute."""
-
-    experiment: Path
-    results: Path
-
-
-def run_paths(folder: Path, base: Path | None) -> RunPaths:
-    """Return the folders of a run."""
+def run_paths(folder: Path, base: Path | None) -> tuple[Path, Path]:
+    """Return the experiment folder and the results folder of a run, both absolute."""
     experiment = Path(os.path.normpath(find_experiment(folder).absolute()))
-    name = experiment.name or "experiment"
-    results = (base or Path("results")).absolute() / name
+    results = (base or Path("results")).absolute() / (experiment.name or "experiment")
     refuse_shared_results(results, experiment)
-    return RunPaths(experiment, results)
+    return experiment, results
 
 
-def check_before_run(paths: RunPaths, say: Say) -> None:
+def check_before_run(experiment: Path, results: Path, say: Say) -> None:
     """Print the problems of an experiment before its run."""
     from vinetrack.experiment.folder import read_experiment
 
-    if find_ground_truth(paths.experiment, PACKAGE.parent):
+    if find_ground_truth(experiment, PACKAGE.parent):
         return  # The recordings of the demonstration do not exist yet: the run makes them.
-    report = check_folder(paths.experiment, Kept(paths.results).track)
+    report = check_folder(experiment, Kept(results).track)
     errors = [problem for problem in report.problems if problem.severity == "error"]
-    trials = {trial.name for trial in read_experiment(paths.experiment).trials}
+    trials = {trial.name for trial in read_experiment(experiment).trials}
     faulty_trials = {problem.trial for problem in errors}  # "" stands for the experiment as a whole
     if errors and ("" in faulty_trials or trials <= faulty_trials):
         raise ExperimentError(report.problems)
@@ -430,18 +415,18 @@ def check_before_run(paths: RunPaths, say: Say) -> None:
         say(line)
 
 
-def run_chain(paths: RunPaths, cores: int, say: Say, verbose: bool = False) -> None:
+def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bool = False) -> None:
     """Run Snakemake on an experiment; show a progress bar on a terminal, a line per stage elsewhere, or all it says."""
-    if paths.results.is_dir():
-        _locked(paths.results).release()  # refused, if another running process writes there
-    log = paths.results / "logs" / "run.log"
+    if results.is_dir():
+        _locked(results).release()  # refused, if another running process writes there
+    log = results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # Snakemake parses values of --config as YAML, where ` #2` in the name of a folder would be a comment.
     config_file = log.with_name("run.json")
-    write_text(config_file, json.dumps({"experiment": str(paths.experiment), "results": str(paths.results)}))
+    write_text(config_file, json.dumps({"experiment": str(experiment), "results": str(results)}))
     command = [
         sys.executable, "-m", "snakemake", "--snakefile", str(PACKAGE / "pipeline" / "Snakefile"),
-        "--directory", str(paths.results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--configfile",
+        "--directory", str(results), "--cores", str(cores), "--rerun-incomplete", "--nolock", "--configfile",
         str(config_file), *([] if verbose else ["--quiet", "all"]),
     ]  # fmt: skip
     # Its standard output is what the stages say, since Snakemake itself is quiet; in a process of its own it stops its
