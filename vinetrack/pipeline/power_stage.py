@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.problems import ExperimentError
 from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL
 from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.terminal import Progress, progress, waiting
@@ -41,7 +41,7 @@ from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
 from vinetrack.pipeline.effects_stage import effects_of
-from vinetrack.pipeline.predict_stage import effects_of_plan
+from vinetrack.pipeline.predict_stage import effects_of_plan, refusal
 from vinetrack.pipeline.stages import map_unordered
 from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 from vinetrack.results.folder_layout import Results, measured_trials, read_diagnosis, read_source_experiment
@@ -202,9 +202,10 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     if math.isfinite(request.reach):
         for text, (name, value) in zip(request.effects, asked, strict=True):
             if name in power.not_testable:
-                raise _refusal("cannot be tested with the columns of these trials", text, str(power.not_testable[name]))
+                why = str(power.not_testable[name])
+                raise refusal("--effect", text, "cannot be tested with the columns of these trials", why)
             if not math.isfinite(value):
-                raise _refusal("needs a size", text, "write the size to detect, such as leak=0.5")
+                raise refusal("--effect", text, "needs a size", "write the size to detect, such as leak=0.5")
             with waiting(f"searching for trials that detect {name}"):
                 plan = further_trials(design, power[name], value, request.reach, limits)
             power = replace(power, further=(*power.further, plan))
@@ -221,20 +222,16 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
         candidates = sorted([*known, *power.not_testable])
         close = difflib.get_close_matches(name, candidates, 1, 0.6)
         remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(candidates)}"
-        in_model = name in power.model
-        message = "is in the model already" if in_model else "is not a candidate for these trials"
-        raise _refusal(message, name, remedy)
+        message = "is in the model already" if name in power.model else "is not a candidate for these trials"
+        raise refusal("--effect", name, message, remedy)
     if not size:
         return name, math.nan
     unit, factor = display_unit(known[name].unit)
     try:
         return name, float(size) / factor
     except ValueError:
-        raise _refusal("is not a size", text, f"write a number in {unit or 'the unit of the parameter'}") from None
-
-
-def _refusal(message: str, value: str, remedy: str) -> ExperimentError:
-    return ExperimentError([Problem(message=message, column="--effect", value=value, remedy=remedy)])
+        remedy = f"write a number in {unit or 'the unit of the parameter'}"
+        raise refusal("--effect", text, "is not a size", remedy) from None
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:

@@ -317,11 +317,12 @@ def read_si_range(column: str, text: str, name: str = "") -> tuple[float, float]
     try:
         low, high = read_range(COLUMNS[column], text if ":" in text else (text, text))
     except CellError as error:
-        raise _refusal(name or option(column), text, error.message, error.remedy, error.allowed) from None
+        raise refusal(name or option(column), text, error.message, error.remedy, error.allowed) from None
     return COLUMNS[column].to_si(low), COLUMNS[column].to_si(high)
 
 
-def _refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
+def refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
+    """The error that refuses the value of an option."""
     return ExperimentError([Problem(message=message, column=name, value=text, allowed=allowed, remedy=remedy)])
 
 
@@ -353,11 +354,11 @@ def design_vine(
     )
     max_films = 12  # Largest number of films (chosen)
     if not 0 < len(room.films_m) <= max_films:
-        raise _refusal("--films-um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}")
+        raise refusal("--films-um", films, f"names {len(room.films_m)} films", f"name 1 to {max_films}")
     thickest_m = max(room.films_m)
     if thickest_m > room.diameter_m[0] / 4:
         message = f"begins below four times the thickest film, {1e6 * thickest_m:g} µm"
-        raise _refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
+        raise refusal("--diameter-mm", diameter, message, f"begin at {4e3 * thickest_m:g} mm or more")
     with planning_errors(), waiting("looking for the fastest vine"):
         choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     _refuse_standstill(room, choices)
@@ -391,7 +392,7 @@ def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
     if highest_Pa < 0.995 * room.pressure_Pa:
         message += f": their walls may carry at most {highest_Pa / 1e3:.3g} kPa"
         remedy = "raise --burst-fraction, or allow thicker films or smaller diameters"
-    raise _refusal("--pressure-kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
+    raise refusal("--pressure-kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
