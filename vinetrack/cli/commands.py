@@ -144,7 +144,7 @@ def _propose(results: Path, to: Path | None, experiment: Path | None, report: Sa
 @command()
 def _compare(results: Path) -> Answer:
     """Compare model and measurement of every condition, with the scatter of replicates."""
-    from vinetrack.pipeline.model_stage import comparison_lines
+    from vinetrack.pipeline.workflow import comparison_lines
     from vinetrack.results.folder_layout import Results, read_result
 
     return comparison_lines(results), read_result(Results(results).comparison).to_dict("records")

@@ -18,7 +18,6 @@ import numpy as np
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.core.terminal import table as aligned
 from vinetrack.diagnosis.drift import drift_groups
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
@@ -45,25 +44,13 @@ from vinetrack.inference.fit_result import CHECK_COLUMNS, Fit, TrialFit, check_d
 from vinetrack.inference.fit_summary import FitSummary, summary_of
 from vinetrack.inference.solving import assemble
 from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
-from vinetrack.narrative.diagnosis_text import (
-    added_in_words,
-    sentences_of,
-    table_lines,
-)
-from vinetrack.narrative.verdict_text import settled_rows, verdict_line, verdict_sentence, verdict_table
+from vinetrack.narrative.diagnosis_text import added_in_words
+from vinetrack.narrative.verdict_text import settled_rows, verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
+from vinetrack.pipeline.workflow import comparison_lines, diagnosis_lines
 from vinetrack.planning.predictive_inputs import pressure_problems
-from vinetrack.results.folder_layout import (
-    Results,
-    ResultsError,
-    empty_table,
-    measured_trials,
-    read_diagnosis,
-    read_fit,
-    read_json,
-    read_result,
-)
+from vinetrack.results.folder_layout import Results, empty_table, measured_trials, read_json, read_result
 from vinetrack.tracks.frame_timing import mean_speed
 
 if TYPE_CHECKING:
@@ -151,33 +138,6 @@ def _reason(error: Exception) -> str:
         return str(error)
     log.exception("no fit or no diagnosis could be made")
     return INTERNAL_ERROR
-
-
-def comparison_lines(folder: Path) -> list[str]:
-    """Return `comparison.csv` as aligned lines for the terminal, or the reason why it is empty."""
-    results = Results(folder)
-    fit, table = read_fit(results), read_result(results.comparison)
-    if fit.refused:
-        return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"]
-    columns = {  # column: heading, unit, factor, decimals
-        "rms_position_m": ("rms position", "mm", 1e3, 3),
-        "replicate_floor_m": ("replicates", "mm", 1e3, 3),
-        "ratio": ("ratio", "", 1, 1),
-        "rms_final_velocity_m_s": ("rms final speed", "m/s", 1, 3),
-        "worst_at_s": ("worst at", "ms", 1e3, 1),
-        "worst_at_m": ("", "mm", 1e3, 1),
-    }
-    body = [
-        [str(row["condition"])]
-        + [
-            f"{factor * row[name]:.{decimals}f}" if np.isfinite(row[name]) else "–"
-            for name, (_, _, factor, decimals) in columns.items()
-        ]
-        for row in table.to_dict("records")
-    ]
-    headings, units, *_ = zip(*columns.values(), strict=True)
-    lines = aligned(body, ("condition", *headings), ("", *units), align="<>>>>>>")
-    return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)]
 
 
 # ------------------------------------------------------------------------------
@@ -323,16 +283,3 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report) 
     if len(new):
         write_csv(results.ladder, pd.concat([history, new], ignore_index=True) if len(history) else new)
     return added_in_words(before, after, table, moved((before, after), ("", name)))
-
-
-def diagnosis_lines(folder: Path, brief: bool = False) -> list[str]:
-    """Return the verdict of a results folder in one line, then its reasons, one sentence per line; a few if `brief`."""
-    diagnosis = read_diagnosis(Results(folder))
-    if diagnosis is None:
-        raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
-    if not diagnosis.verdict:
-        return [diagnosis.explanation]
-    lines = [verdict_line(diagnosis), *table_lines(diagnosis, notes=not brief)]
-    if not brief:
-        lines += [f"  {line}" for line in sentences_of(diagnosis.explanation)]
-    return [*lines, *(f"! {note}" for note in diagnosis.notes[: 1 if brief else None])]

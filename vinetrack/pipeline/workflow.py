@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
 from vinetrack.core.tables import is_readable, write_text
-from vinetrack.core.terminal import waiting
+from vinetrack.core.terminal import table, waiting
 from vinetrack.figures.registry import figures_of
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_result
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -454,14 +455,53 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
         raise RunError("\n".join([*explanation, f"The run stopped; the logs of its stages are in {log.parent}."]))
 
 
+# ------------------------------------------------------------------------------
+# What results say in the terminal; the stage of the model, which says the same, takes longer to load.
+
+
 def run_lines(results: Path) -> list[str]:
     """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last."""
-    from vinetrack.pipeline.model_stage import diagnosis_lines
-    from vinetrack.results.folder_layout import Results, read_result
-
     trials = read_result(Results(results).trials)
     failed = trials[trials["status"] == "failed"]
     lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
     lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
     verdict, *reasons = diagnosis_lines(results, brief=True)
     return [*lines, f"Report: {Results(results).report}", *reasons, verdict]
+
+
+def diagnosis_lines(folder: Path, brief: bool = False) -> list[str]:
+    """Return the verdict of a results folder in one line, then its reasons, one sentence per line; a few if `brief`."""
+    from vinetrack.narrative.diagnosis_text import sentences_of, table_lines
+    from vinetrack.narrative.verdict_text import verdict_line
+
+    diagnosis = read_diagnosis(Results(folder))
+    if diagnosis is None:
+        raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
+    if not diagnosis.verdict:
+        return [diagnosis.explanation]
+    lines = [verdict_line(diagnosis), *table_lines(diagnosis, notes=not brief)]
+    if not brief:
+        lines += [f"  {line}" for line in sentences_of(diagnosis.explanation)]
+    return [*lines, *(f"! {note}" for note in diagnosis.notes[: 1 if brief else None])]
+
+
+def comparison_lines(folder: Path) -> list[str]:
+    """Return `comparison.csv` as aligned lines for the terminal, or the reason why it is empty."""
+    results = Results(folder)
+    fit, compared = read_fit(results), read_result(results.comparison)
+    if fit.refused:
+        return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"]
+    columns = (  # heading, unit, column, factor, decimals
+        ("rms position", "mm", "rms_position_m", 1e3, 3),
+        ("replicates", "mm", "replicate_floor_m", 1e3, 3),
+        ("ratio", "", "ratio", 1, 1),
+        ("rms final speed", "m/s", "rms_final_velocity_m_s", 1, 3),
+        ("worst at", "ms", "worst_at_s", 1e3, 1),
+        ("", "mm", "worst_at_m", 1e3, 1),
+    )
+    cells = [compared["condition"].tolist()]
+    for _, _, name, factor, decimals in columns:
+        cells.append([f"{factor * v:.{decimals}f}" if math.isfinite(v) else "–" for v in compared[name].tolist()])
+    headings, units, *_ = zip(*columns, strict=True)
+    lines = table(zip(*cells, strict=True), ("condition", *headings), ("", *units), align="<>>>>>>")
+    return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)]
