@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,18 +52,21 @@ log = logging.getLogger(__name__)
 def draw_campaign(job: Job) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
     job.say("drawing figures")
+    shares = [list(campaign_figures())[first :: job.threads] for first in range(job.threads)]
     work = partial(_drawn, folder=job.results, trials=job.experiment.trials, settings=job.settings.figures)
-    return [f"{sum(map_unordered(work, list(campaign_figures()), job.threads))} figures."]
+    return [f"{sum(map_unordered(work, shares, job.threads))} figures."]
 
 
-def _drawn(name: str, folder: Path, trials: tuple[Trial, ...], settings: FigureSettings) -> bool:
-    """Draw a figure of the whole experiment; whether it has content."""
-    tables = FigureTables(folder, trials)
-    for form in ("png", "svg", "pdf"):
-        tables.results.figure(name, f".{form}").unlink(missing_ok=True)
-    if picture := draw(name, tables):
-        _write(picture, partial(tables.results.figure, name), settings)
-    return picture is not None
+def _drawn(names: Sequence[str], folder: Path, trials: tuple[Trial, ...], settings: FigureSettings) -> int:
+    """Draw figures of the whole experiment from tables that are read once; how many have content."""
+    tables, count = FigureTables(folder, trials), 0
+    for name in names:
+        for form in ("png", "svg", "pdf"):
+            tables.results.figure(name, f".{form}").unlink(missing_ok=True)
+        if picture := draw(name, tables):
+            _write(picture, partial(tables.results.figure, name), settings)
+            count += 1
+    return count
 
 
 def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
