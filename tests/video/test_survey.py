@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -194,6 +195,13 @@ def test_the_rate_of_playback_is_refused_unless_it_is_said_to_be_that_of_capture
 
 FILMED = "capture_fps: 1069\ngrowth_angle_deg: 0\ncalibration: {kind: mm_per_px, mm_per_px: 0.24}\n"
 RIGHT = "12,100,140,36,3"
+
+
+def test_a_missing_scale_is_said_with_what_to_do(tmp_path):
+    opened = {Trial(name="a", pressure_Pa=3e4): SimpleNamespace(width=96, height=40)}
+    (problem,), _ = module._scale_problems(SimpleNamespace(calibration=None, axis=None), tmp_path, opened)
+    assert (problem.code, problem.column) == ("missing", "calibration")
+    assert "is missing" in problem.reason
 
 
 @pytest.mark.slow

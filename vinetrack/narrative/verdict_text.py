@@ -159,7 +159,8 @@ def verdict_line(diagnosis: Diagnosis) -> str:
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence; what contradicts the sheet in its place, since any verdict rests on it."""
     told = _told(diagnosis, spaced_name)
-    return f"{told[0].upper()}{told[1:]}."
+    begins_with_name = diagnosis.contradicted_columns or diagnosis.odd_trials
+    return f"{told if begins_with_name else told[0].upper() + told[1:]}."
 
 
 def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:

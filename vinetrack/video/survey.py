@@ -467,7 +467,7 @@ def _scale_problems(
         none = len(unscaled) == len(opened)
         lacking = "no recording has a scale" if none else f"{len(unscaled)} recordings have no scale"
         remedy = "give it here, or mm_per_px in the sheet"
-        problems.append(Problem(f"is missing: {lacking}", file=SETTINGS, column="calibration", remedy=remedy))
+        problems.append(Problem("missing", f"is missing: {lacking}", "calibration", file=SETTINGS, remedy=remedy))
     image = getattr(settings.calibration, "image", None)
     if unscaled and settings.calibration is not None and (image is None or (folder / image).exists()):
         place: dict[str, Any] = {"file": SETTINGS, "column": "calibration" if image is None else "calibration.image"}
