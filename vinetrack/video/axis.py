@@ -11,14 +11,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinetrack.core.records import Bools, Floats, Trial
-from vinetrack.experiment.schema import SHORTEST_AXIS_PX
+from vinetrack.experiment.schema import SHORTEST_AXIS_PX, SMALLEST_POINT_SPACING_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import collecting_path, monotone_path_sums
 from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures, changed_pixels, order_tolerance
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+Point = tuple[float, float]
 
 # Least share of all change that one front explains where nothing else of weight moves (chosen)
 LEAST_FRONT_SHARE = 0.45
@@ -27,34 +34,64 @@ MOST_TURN_DEG = 8.0  # Largest angle by which a given axis is turned onto the mo
 
 @dataclass(frozen=True)
 class Axis:
-    """A line in the picture along which a vine grows: `from_px` and `to_px` are (x, y), pixel centres at integers.
-    `width_px` is the width of what moves along it, NaN where unknown.
+    """A path in the picture along which a vine grows, from `from_px` through `via_px` to `to_px`: (x, y), pixel centres
+    at integers. It is straight where `via_px` is empty, else a natural cubic spline over the centripetal parameter
+    (steps of the square root of the distance between neighbours; Lee 1989), which neither overshoots nor loops between
+    unevenly spaced points; beyond its ends it continues straight. `width_px` is the width of what moves along it, NaN
+    where unknown; `direction` and `normal` are those of the chord.
     """
 
-    from_px: tuple[float, float]
-    to_px: tuple[float, float]
+    from_px: Point
+    to_px: Point
     width_px: float = float("nan")
+    via_px: tuple[Point, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.bends and np.min(np.hypot(*np.diff(self.through_px, axis=0).T)) < SMALLEST_POINT_SPACING_PX:
+            raise RecordingError(
+                f"two neighbouring points of the growth axis are less than {SMALLEST_POINT_SPACING_PX} pixels apart",
+                "leave out one",
+            )
         if self.length_px < SHORTEST_AXIS_PX:
             raise RecordingError(
                 f"the growth axis is shorter than {SHORTEST_AXIS_PX} pixels", "move from_px and to_px apart"
             )
 
     @property
-    def length_px(self) -> float:
-        """Distance between the ends."""
-        return float(np.hypot(self.to_px[0] - self.from_px[0], self.to_px[1] - self.from_px[1]))
+    def bends(self) -> bool:
+        """Whether it is a curve."""
+        return bool(self.via_px)
 
     @property
-    def bends(self) -> bool:
-        """Whether it is a curve; see `curved_axis`."""
-        return False
+    def through_px(self) -> tuple[Point, ...]:
+        """All points that it passes through, in order."""
+        return (self.from_px, *self.via_px, self.to_px)
+
+    @cached_property
+    def _table(self) -> tuple[CubicSpline, Floats, Floats]:
+        """The spline of a curve, and its parameter and arc length at the samples."""
+        from scipy.interpolate import CubicSpline
+
+        points = np.array(self.through_px)
+        spacing = np.hypot(*np.diff(points, axis=0).T)
+        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(spacing))])
+        spline = CubicSpline(knots, points, bc_type="natural")
+        # 8: samples per pixel over which the arc length is summed (derived)
+        counts = np.ceil(8 * spacing).astype(int) + 1
+        parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], counts, strict=True)]
+        parameter = np.concatenate([*parts, knots[-1:]])
+        return spline, parameter, length_along(spline(parameter))
+
+    @property
+    def length_px(self) -> float:
+        """Arc length between the ends."""
+        return float(self._table[2][-1]) if self.bends else math.dist(self.from_px, self.to_px)
 
     @property
     def direction(self) -> Floats:
-        """Unit vector of growth (x, y), shape (2,)."""
-        return np.subtract(self.to_px, self.from_px) / self.length_px
+        """Unit vector of growth (x, y) from end to end, shape (2,)."""
+        chord = np.subtract(self.to_px, self.from_px)
+        return chord / np.hypot(*chord)
 
     @property
     def normal(self) -> Floats:
@@ -62,25 +99,86 @@ class Axis:
         along = self.direction
         return np.array([-along[1], along[0]])
 
+    @cached_property
+    def least_radius_px(self) -> float:
+        """Radius where it bends most sharply; infinite for a straight line."""
+        if not self.bends:
+            return math.inf
+        spline, parameter, _ = self._table
+        first, second = spline(parameter, 1), spline(parameter, 2)
+        speed = np.hypot(*first.T)
+        bend = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
+        return float(1 / max(float(bend.max()), 1e-12))
+
     @property
     def largest_half_px(self) -> float:
-        """Half the width of the widest strip along the axis whose normals do not cross."""
-        return math.inf
+        """Half the width of the widest strip along it whose normals do not cross."""
+        # 0.9: largest half width of a strip, as a part of the least radius (derived)
+        return 0.9 * self.least_radius_px
+
+    @cached_property
+    def _angles_rad(self) -> Floats:
+        """Direction at many equal steps, unwrapped, positive from x towards y."""
+        direction = self.direction_at(np.linspace(0.0, self.length_px, 400))
+        return np.unwrap(np.arctan2(*direction.T[::-1]))
+
+    @property
+    def turn_rad(self) -> float:
+        """Angle by which the direction turns between the ends, positive from x towards y."""
+        return float(self._angles_rad[-1] - self._angles_rad[0])
+
+    @property
+    def total_turn_rad(self) -> float:
+        """Angle by which the direction turns in all, to either side."""
+        return float(np.abs(np.diff(self._angles_rad)).sum())
 
     def direction_at(self, along_px: Floats) -> Floats:
         """Unit vectors of growth at places along the axis. Shape (..., 2)."""
-        return np.broadcast_to(self.direction, (*np.shape(along_px), 2))
-
-    def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
-        """Find where points of the picture lie along and across the axis, px. Shapes: picture_px (n, 2) → (n,) each."""
-        from_start = np.asarray(picture_px, dtype=float) - self.from_px
-        return from_start @ self.direction, from_start @ self.normal
+        if not self.bends:
+            return np.broadcast_to(self.direction, (*np.shape(along_px), 2))
+        spline, parameter, arc = self._table
+        slope = spline(np.interp(np.asarray(along_px, float), arc, parameter), 1)
+        return np.asarray(slope / np.linalg.norm(slope, axis=-1, keepdims=True))
 
     def points(self, along_px: Floats, across_px: Floats | float = 0.0) -> Floats:
-        """Return picture coordinates of points given along and across the axis. Shape (..., 2)."""
+        """Return picture coordinates of points given along the axis and across it, on its normal. Shape (..., 2)."""
         along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
-        start = np.asarray(self.from_px, dtype=float)
-        return start + along[..., None] * self.direction + across[..., None] * self.normal
+        unit = self.direction_at(along)
+        normal = np.stack([-unit[..., 1], unit[..., 0]], axis=-1)
+        if self.bends:
+            spline, parameter, arc = self._table
+            on_axis, past = spline(np.interp(along, arc, parameter)), along - np.clip(along, 0.0, arc[-1])
+        else:
+            on_axis, past = np.asarray(self.from_px, dtype=float), along
+        return np.asarray(on_axis + past[..., None] * unit + across[..., None] * normal)
+
+    def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
+        """Find where points of the picture lie along and across the axis, px, by their nearest place on it. Shapes:
+        picture_px (n, 2) → (n,) each.
+        """
+        points = np.asarray(picture_px, dtype=float)
+        if not self.bends:
+            return (points - self.from_px) @ self.direction, (points - self.from_px) @ self.normal
+        from scipy.spatial import KDTree
+
+        spline, parameter, arc = self._table
+        _, nearest = KDTree(spline(parameter)).query(np.where(np.isfinite(points), points, 0.0))
+        # Between the samples of the table, and beyond the ends, along the tangent
+        offset = points - spline(parameter[nearest])
+        along = arc[nearest] + np.sum(offset * self.direction_at(arc[nearest]), axis=-1)
+        unit, offset = self.direction_at(along), points - self.points(along)
+        return along, unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
+
+
+def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float = float("nan")) -> Axis:
+    """Lay the growth axis through points: a straight line through two, a smooth curve through more."""
+    points = [(float(x), float(y)) for x, y in through_px]
+    return Axis(points[0], points[-1], width_px, tuple(points[1:-1]))
+
+
+def length_along(path: Floats) -> Floats:
+    """Cumulative length along a path from its first point. Shapes: path (n, 2) → (n,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def find_axis(small: SmallPictures, grows: bool = True) -> Axis:

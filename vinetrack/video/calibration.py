@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Correction, Floats, Track, join_flags
 from vinetrack.experiment.settings import Calibration, Charuco, Checkerboard, MmPerPx, TwoPoints
-from vinetrack.video.axis import Axis
-from vinetrack.video.curved_axis import CurvedAxis, length_along
+from vinetrack.video.axis import Axis, length_along
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 from vinetrack.video.strip import SLOW_PX
 
@@ -496,7 +495,7 @@ class PlaneCalibration:
 
     def along_path(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
         """Return the scale along an axis that may be a curve: of the arc length in the plane, not of its chord."""
-        if not isinstance(axis, CurvedAxis):
+        if not axis.bends:
             return self.along(axis.from_px, axis.to_px)
         # 4.0: length of the chords over which a curve is summed in the plane (derived)
         along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / 4.0) + 2)
@@ -506,8 +505,7 @@ class PlaneCalibration:
         rel_sigma = math.hypot(rel_sigma, off_px * abs(axis.turn_rad) / axis.length_px)
 
         def position_m(picture_px: Floats) -> Floats:
-            nearest = axis.nearest_px(picture_px)
-            return np.asarray(np.interp(nearest, along_px, path_m))
+            return np.interp(axis.along_and_across(picture_px)[0], along_px, path_m)
 
         return AxisScale(float(path_m[-1]) / axis.length_px, rel_sigma, position_m)
 

@@ -1,164 +1,30 @@
-"""A growth axis that bends: a smooth curve through points of the picture, with positions as arc length along it.
+"""Find the curve along which a vine grew, from the region of pixels that changed.
 
-The curve is a natural cubic spline over the centripetal parameter (steps of the square root of the distance between
-neighbours; Lee 1989), which neither overshoots nor loops between unevenly spaced points. Beyond its ends it continues
-straight.
+A pixel that the vine covers changes once. The region of such pixels is a band; its smoothed middle, from the end that
+changed first to the end that changed last, is the path. The curve is used only where its front share is far larger than
+that of the best straight line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vinetrack.core.records import Bools, Floats
-from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, along_axis, find_axis, front_share, share_on_front
+from vinetrack.video.axis import (
+    LEAST_FRONT_SHARE,
+    Axis,
+    along_axis,
+    axis_through,
+    find_axis,
+    front_share,
+    share_on_front,
+)
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
-
-    from vinetrack.video.edge import Outline
-
-
-Point = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class CurvedAxis(Axis):
-    """A curve in the picture along which a vine grows, from `from_px` through `via_px` to `to_px`: (x, y), px.
-    `direction` and `normal` are those of its chord; `points` follows the curve.
-    """
-
-    via_px: tuple[Point, ...] = ()
-
-    def __post_init__(self) -> None:
-        points = np.array(self.through_px)
-        if np.min(np.hypot(*np.diff(points, axis=0).T)) < SMALLEST_POINT_SPACING_PX:
-            raise RecordingError(
-                f"two neighbouring points of the growth axis are less than {SMALLEST_POINT_SPACING_PX} pixels apart",
-                "leave out one",
-            )
-        super().__post_init__()
-
-    @property
-    def bends(self) -> bool:
-        """Whether it is a curve."""
-        return True
-
-    @property
-    def through_px(self) -> tuple[Point, ...]:
-        """All points that the curve passes through, in order."""
-        return (self.from_px, *self.via_px, self.to_px)
-
-    @cached_property
-    def _table(self) -> tuple[CubicSpline, Floats, Floats]:
-        """The spline, and its parameter and arc length at the samples."""
-        from scipy.interpolate import CubicSpline
-
-        points = np.array(self.through_px)
-        spacing = np.hypot(*np.diff(points, axis=0).T)
-        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(spacing))])
-        spline = CubicSpline(knots, points, bc_type="natural")
-        # 8: samples per pixel over which the arc length is summed (derived)
-        counts = np.ceil(8 * spacing).astype(int) + 1
-        parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], counts, strict=True)]
-        parameter = np.concatenate([*parts, knots[-1:]])
-        steps = np.hypot(*np.diff(spline(parameter), axis=0).T)
-        return spline, parameter, np.concatenate([[0.0], np.cumsum(steps)])
-
-    @property
-    def length_px(self) -> float:
-        """Arc length between its ends."""
-        return float(self._table[2][-1])
-
-    @cached_property
-    def least_radius_px(self) -> float:
-        """Radius where the curve bends most sharply; infinite for a straight line."""
-        spline, parameter, _ = self._table
-        first, second = spline(parameter, 1), spline(parameter, 2)
-        speed = np.hypot(*first.T)
-        bend = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
-        return float(1 / max(float(bend.max()), 1e-12))
-
-    @property
-    def largest_half_px(self) -> float:
-        """Half the width of the widest strip along the curve whose normals do not cross."""
-        # 0.9: largest half width of a strip, as a part of the least radius (derived)
-        return 0.9 * self.least_radius_px
-
-    @cached_property
-    def _angles_rad(self) -> Floats:
-        """Direction at many equal steps, unwrapped, positive from x towards y."""
-        direction = self.direction_at(np.linspace(0.0, self.length_px, 400))
-        return np.unwrap(np.arctan2(*direction.T[::-1]))
-
-    @property
-    def turn_rad(self) -> float:
-        """Angle by which the direction turns between the ends, positive from x towards y."""
-        return float(self._angles_rad[-1] - self._angles_rad[0])
-
-    @property
-    def total_turn_rad(self) -> float:
-        """Angle by which the direction turns in all, to either side."""
-        return float(np.abs(np.diff(self._angles_rad)).sum())
-
-    def direction_at(self, along_px: Floats) -> Floats:
-        """Unit vectors of growth at places along the curve. Shape (..., 2)."""
-        spline, parameter, arc = self._table
-        slope = spline(np.interp(np.asarray(along_px, float), arc, parameter), 1)
-        return np.asarray(slope / np.linalg.norm(slope, axis=-1, keepdims=True))
-
-    def points(self, along_px: Floats, across_px: Floats | float = 0.0) -> Floats:
-        """Return picture coordinates of points given along the curve and across it, on its normal. Shape (..., 2)."""
-        along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
-        spline, parameter, arc = self._table
-        unit = self.direction_at(along)
-        past_end = along - np.clip(along, 0.0, self.length_px)
-        normal = np.stack([-unit[..., 1], unit[..., 0]], axis=-1)
-        on_curve = spline(np.interp(along, arc, parameter))
-        return np.asarray(on_curve + past_end[..., None] * unit + across[..., None] * normal)
-
-    def nearest_px(self, picture_px: Floats) -> Floats:
-        """Find the arc length of the places on the curve nearest to points of the picture. Shapes: picture_px (n, 2) →
-        (n,).
-        """
-        from scipy.spatial import KDTree
-
-        spline, parameter, arc = self._table
-        points = np.asarray(picture_px, dtype=float)
-        _, nearest = KDTree(spline(parameter)).query(np.where(np.isfinite(points), points, 0.0))
-        # Between the samples of the table, and beyond the ends, along the tangent.
-        along = arc[nearest]
-        offset = points - spline(parameter[nearest])
-        return np.asarray(along + np.sum(offset * self.direction_at(along), axis=-1))
-
-    def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
-        """Find where points of the picture lie along and across the curve, by their nearest place on it. Returns arc
-        length from `from_px` and distance on the normal, shape (n,) each, px. Shapes: picture_px (n, 2).
-        """
-        points = np.asarray(picture_px, dtype=float)
-        along = self.nearest_px(points)
-        unit, offset = self.direction_at(along), points - self.points(along)
-        return along, unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
-
-
-def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float = float("nan")) -> Axis:
-    """Lay the growth axis through points: a straight line through two, a smooth curve through more."""
-    points = [(float(x), float(y)) for x, y in through_px]
-    if len(points) == 2:
-        return Axis(points[0], points[1], width_px)
-    return CurvedAxis(points[0], points[-1], width_px, tuple(points[1:-1]))
-
-
-def length_along(path: Floats) -> Floats:
-    """Cumulative length along a path from its first point. Shapes: path (n, 2) → (n,)."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def axis_entry(axis: Axis) -> dict[str, Any]:
@@ -166,7 +32,7 @@ def axis_entry(axis: Axis) -> dict[str, Any]:
     mapping of JSON types.
     """
     entry: dict[str, Any] = {"from_px": axis.from_px, "to_px": axis.to_px}
-    return entry | ({"via_px": axis.via_px} if isinstance(axis, CurvedAxis) else {})
+    return entry | ({"via_px": axis.via_px} if axis.bends else {})
 
 
 def axis_from_entry(entry: Mapping[str, Any]) -> Axis:
@@ -180,7 +46,7 @@ def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple
     """Say why a curve cannot be used in a picture, and the remedy; None where it can, or where it is a straight line.
     Returns the end of a sentence that begins with "the axis", and the remedy; or None.
     """
-    if not isinstance(axis, CurvedAxis):
+    if not axis.bends:
         return None
     places = axis.points(np.linspace(0.0, axis.length_px, int(axis.length_px) + 2))
     if (places < -0.5).any() or (places > np.array(size_px) - 0.5).any():
@@ -192,50 +58,6 @@ def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple
             "give fewer points or a smaller width",
         )
     return None
-
-
-STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
-CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
-
-
-def outline_stretches(axis: Axis) -> int:
-    """Number of stretches in which the sides of a tube are found."""
-    return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
-
-
-def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
-    """Move a curve onto the middle of the tube, and measure how far that lies from it. Returns the curve, with the
-    tube's width, or the given one where the tube's middle makes none that a strip can be cut along; and the distance.
-    """
-    # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
-    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
-    # Middle of the tube at the knots, by Gaussian-weighted local lines; level beyond the outermost stretches
-    places, middles, offsets = sides.places_px, sides.middles_px, np.empty(len(knots))
-    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
-    for k, place in enumerate(np.clip(knots, places[0], places[-1])):
-        # 1.0: standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
-        away = (places - place) / (1.0 * spacing)
-        weight = np.exp(-0.5 * away**2)
-        design = np.column_stack([np.ones(len(places)), away])
-        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
-        offsets[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
-    through = axis.points(knots, offsets)
-    separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
-    try:
-        curve = axis_through(through[np.append(True, separate)], 2 * sides.half_px)
-    except RecordingError:
-        return axis, 0.0
-    if not isinstance(curve, CurvedAxis) or sides.half_px > curve.largest_half_px:
-        return axis, 0.0
-    return curve, float(np.abs(offsets).max())
-
-
-# ------------------------------------------------------------------------------
-# Find the curve along which a vine grew, from the region of pixels that changed.
-#
-# A pixel that the vine covers changes once. The region of such pixels is a band; its smoothed middle, from the end
-# that changed first to the end that changed last, is the path. The curve is used only where its front share is far
-# larger than that of the best straight line.
 
 
 def find_growth_axis(small: SmallPictures) -> Axis:
@@ -270,7 +92,7 @@ def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
     return share_on_front(along, band) if (np.abs(along.y) < band).any() else 0.0
 
 
-def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | None:
+def find_curve(small: SmallPictures, band: Band | None = None) -> Axis | None:
     """Find the smoothed middle of the band that changed, from its first change to its last."""
     band = band or _changed_band(small)
     path = None if band is None else _centreline(band)
@@ -300,7 +122,7 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | N
         axis = axis_through(knots, axis.width_px)
     except RecordingError:
         return None
-    if not isinstance(axis, CurvedAxis) or curve_problem(axis, axis.width_px / 2, size):
+    if not axis.bends or curve_problem(axis, axis.width_px / 2, size):
         return None
     return axis
 

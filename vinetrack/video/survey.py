@@ -24,15 +24,9 @@ from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import AxisSettings, Calibration, ExperimentSettings
 from vinetrack.tracks.frame_timing import mean_speed
-from vinetrack.video.axis import Axis, askew_trials, slope_deg
+from vinetrack.video.axis import Axis, askew_trials, axis_through, slope_deg
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.curved_axis import (
-    CurvedAxis,
-    axis_entry,
-    axis_through,
-    curve_problem,
-    find_growth_axis,
-)
+from vinetrack.video.curved_axis import axis_entry, curve_problem, find_growth_axis
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.small_pictures import SmallPictures, read_event
@@ -97,7 +91,7 @@ def measure_recording(
     tracking = track() if keep is None else keep(inputs, track)
     rel_sigma, position_m = math.nan, None
     if calibration is not None:
-        bent = isinstance(tracking.axis, CurvedAxis) and math.isfinite(tracking.tube_width_sigma_px)
+        bent = tracking.axis.bends and math.isfinite(tracking.tube_width_sigma_px)
         along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
     tracking = in_metres(tracking, trial, m_per_px, position_m)
@@ -270,7 +264,7 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
     steep_deg = 60.0  # Angle between growth and the picture's rows above which growth runs up or down (chosen)
     upright, level = [], []
     for fact, trial in zip(facts, trials, strict=True):
-        if fact.axis is None or isinstance(fact.axis, CurvedAxis) or trial.travel_ratio == 1:
+        if fact.axis is None or fact.axis.bends or trial.travel_ratio == 1:
             continue
         right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
         slope_deg = math.degrees(math.atan2(down, right))

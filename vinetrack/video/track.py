@@ -11,16 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, centred_on_motion, find_axis, front_share
+from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, axis_through, centred_on_motion, find_axis, front_share
 from vinetrack.video.calibration import corrected_by_hand
-from vinetrack.video.curved_axis import (
-    CENTRED_PX,
-    CurvedAxis,
-    curve_problem,
-    find_growth_axis,
-    outline_stretches,
-    recentred_curve,
-)
+from vinetrack.video.curved_axis import curve_problem, find_growth_axis
 from vinetrack.video.edge import Outline, outline, track_edge
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
 from vinetrack.video.images import capture_exposure, capture_rate
@@ -41,49 +35,65 @@ from vinetrack.video.strip import Positions, Strip, cut_strip, snap_to_grid
 # Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
 
 
+STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
+CENTRED_PX = 0.5  # Largest distance from the tube's middle at which an axis is left unchanged (measured)
+
+
 def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
     """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too.
     An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
     passes along its middle. None where no single front passes along the axis, or along the middle of what it leaves.
     """
-    # Most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
-    most_recuts = 3
     if front_share(small, axis) < LEAST_FRONT_SHARE:
         return None
     # 0.08: part of its width by which an axis may slope for the strip to be cut along whole rows or columns (chosen)
     strip = first = cut_strip(luma, snap_to_grid(axis, 0.08 * axis.width_px), 0.65 * axis.width_px + 3)
-    tube = outline(strip, outline_stretches(axis))
+    parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
     try:
-        for _ in range(2 * most_recuts if axis.bends else most_recuts):
-            before, strip = strip, recentred_strip(luma, strip, tube)
-            if strip is before:
+        tube = outline(strip, parts)
+        # 6, 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
+        for _ in range(6 if axis.bends else 3):
+            centred, distance_px = axis_of_tube(strip.axis, tube)
+            room_px = (strip.values.shape[1] - 1) / 2 - tube.half_px - 3
+            if distance_px < CENTRED_PX and 0 <= room_px < 0.3 * tube.half_px + 6:
                 break
-            tube = outline(strip, outline_stretches(axis))
+            strip = cut_strip(luma, snap_to_grid(centred), tube.half_px * 1.15 + 5, strip if axis.bends else None)
+            tube = outline(strip, parts)
         off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
     except (RecordingError, ValueError):
         return None
     return None if off_tube else (strip, tube)
 
 
-def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
-    """Cut the strip anew about the tube's centreline; the same strip where it is centred already. The ends of a given
-    axis keep their places along it: only the position across is corrected.
+def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
+    """Move an axis onto the middle of a tube, with the tube's width, and measure how far that lies from it. The ends
+    keep their places along it: only the position across is corrected. A curve stays as it is where the tube's middle
+    makes none that a strip can be cut along.
     """
-    shift, slope, half = tube.shift_px, tube.slope, tube.half_px
-    room = (strip.values.shape[1] - 1) / 2 - half - 3
-    if isinstance(strip.axis, CurvedAxis):
-        curve, distance = recentred_curve(strip.axis, tube)
-        if distance < CENTRED_PX and 0 <= room < 0.3 * half + 6:
-            return strip
-        return cut_strip(luma, curve, half * 1.15 + 5, strip)
-    tilt = slope * strip.axis.length_px
-    middle = shift + tilt / 2
-    # 0.8: tilt of the axis over its length, or shift, that is left uncorrected (chosen)
-    if abs(middle) + abs(tilt) / 2 < 0.8 and 0 <= room < 0.3 * half + 6:
-        return strip
-    ends = strip.axis.points(np.array([0.0, strip.axis.length_px]), np.array([shift, shift + tilt]))
-    start, stop = ((float(x), float(y)) for x, y in ends)
-    return cut_strip(luma, snap_to_grid(Axis(start, stop, 2 * half)), half * 1.15 + 5, strip)
+    if not axis.bends:
+        ends_px = np.array([0.0, axis.length_px])
+        offsets = tube.shift_px + tube.slope * ends_px
+        return axis_through(axis.points(ends_px, offsets), 2 * tube.half_px), float(np.abs(offsets).max())
+    # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
+    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
+    # Middle of the tube at the knots, by Gaussian-weighted local lines; level beyond the outermost stretches
+    places, middles, offsets = tube.places_px, tube.middles_px, np.empty(len(knots))
+    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
+    for k, place in enumerate(np.clip(knots, places[0], places[-1])):
+        away = (places - place) / spacing
+        weight = np.exp(-0.5 * away**2)
+        design = np.column_stack([np.ones(len(places)), away])
+        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
+        offsets[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
+    through = axis.points(knots, offsets)
+    separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
+    try:
+        curve = axis_through(through[np.append(True, separate)], 2 * tube.half_px)
+    except RecordingError:
+        return axis, 0.0
+    if not curve.bends or tube.half_px > curve.largest_half_px:
+        return axis, 0.0
+    return curve, float(np.abs(offsets).max())
 
 
 # ------------------------------------------------------------------------------
@@ -275,7 +285,7 @@ def track_pixels(
     random_px = np.hypot(np.maximum(random_px, followed.bands_sigma_px), quality.departure_px)
     slow_px = np.hypot(np.broadcast_to(followed.slow_px, random_px.shape), STABILISED_PX if strip.stabilised else 0.0)
     # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
-    slow_px = np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad if isinstance(strip.axis, CurvedAxis) else 0.0)
+    slow_px = np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad)
     errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
     notes, ending = _notes(frames, number, luma, trial, strip, followed, quality, axis_given)
     notes += left_out
@@ -336,7 +346,7 @@ def _notes(
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
-    if isinstance(strip.axis, CurvedAxis) and not axis_given:
+    if strip.axis.bends and not axis_given:
         notes.append(
             f"{name}: the vine bends by {np.degrees(strip.axis.total_turn_rad):.0f}° in all, and positions are those "
             "along a curve that was found: look at its overlay, and draw the curve (column `axis`) if the edge is not "
