@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,8 +24,6 @@ from vinetrack.kinematics.velocity import correlated
 
 # ------------------------------------------------------------------------------
 # Least squares over windows of raw positions with AR(1) noise: speed, drift and their standard errors.
-
-Bounds = Callable[[Indices, Indices], tuple[Floats, Floats]]
 
 
 class WindowMoments:
@@ -85,43 +82,6 @@ class WindowMoments:
 def _ar1_sd(weights: Floats, rho: float) -> float:
     """Standard deviation of Σ w_i e_i for AR(1) noise e of unit variance."""
     return math.sqrt(max(float(weights @ correlated(weights, rho)), 0.0))
-
-
-def _range_maximum(values: Floats) -> Callable[[Indices, Indices], Floats]:
-    """A function for the largest value from `first` to `last`, shape (n_ranges,) each, in constant time (sparse table:
-    Bender and Farach-Colton 2000).
-    """
-    rows, span = [np.asarray(values, dtype=float)], 1
-    while 2 * span <= rows[0].size:
-        row = np.full_like(rows[0], -np.inf)
-        row[:-span] = np.maximum(rows[-1][:-span], rows[-1][span:])
-        rows.append(row)
-        span *= 2
-    table = np.array(rows)
-
-    def maximum(first: Indices, last: Indices) -> Floats:
-        level = np.frexp((last - first + 1).astype(float))[1] - 1
-        return np.maximum(table[level, first], table[level, last - (1 << level) + 1])
-
-    return maximum
-
-
-def speed_bounds(low: Floats, high: Floats, span: int) -> Bounds:
-    """Return a function for the highest lower and the lowest upper limit of the speeds in a window. Each speed takes
-    `span` frames from its point on. Shapes: low, high (n − span,).
-    """
-    highest_low, lowest_high = _range_maximum(low), _range_maximum(-high)
-
-    def bounds(first: Indices, last: Indices) -> tuple[Floats, Floats]:
-        fits = last - first >= span
-        stop = np.minimum(np.where(fits, last - span, first), low.size - 1)
-        start = np.minimum(first, stop)
-        return (
-            np.where(fits, highest_low(start, stop), -np.inf),
-            np.where(fits, -lowest_high(start, stop), np.inf),
-        )
-
-    return bounds
 
 
 @dataclass(frozen=True)
@@ -218,7 +178,7 @@ def gated_window(track: Track, kinematics: Kinematics, limits: SteadySettings, *
         return Window("gated", False, why)
     inside = slice(first, last + 1)
     latest = _before_the_end(track, position_m, first, last, length_m) - first
-    steady, nearest = _Search(time_s[inside], position_m[inside], kinematics, inside, latest, drift_limit).longest()
+    steady, nearest = _longest_steady(time_s[inside], position_m[inside], kinematics, inside, latest, drift_limit)
     if steady is None:
         return Window("gated", False, nearest)
     window = judge(time_s, position_m, kinematics, first + steady[0], first + steady[1], "gated")
@@ -294,88 +254,62 @@ def _before_the_end(track: Track, position_m: Floats, first: int, last: int, len
     return max(first + int(beyond[0]) - 1, first + 2) if beyond.size else last
 
 
-class _Search:
-    """Search over all windows between two points, each evaluated in constant time from cumulative sums."""
+def _longest_steady(
+    time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, latest: int, drift_limit: float
+) -> tuple[tuple[int, int] | None, str]:
+    """First and last point of the longest steady window up to `latest`, or the reason why there is none; of several
+    the one whose speed changes least. Windows shrink by half a per cent of the motion at a time. Shapes: time_s,
+    position_m (n,), the moving points.
+    """
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-    def __init__(
-        self, time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, latest: int, drift_limit: float
-    ) -> None:
-        self.n, self.latest, self.limit = time_s.size, latest, drift_limit  #: no window contains points after `latest`
-        noise_m, rho = kinematics.noise_m, kinematics.noise_correlation
-        self.moments = WindowMoments(time_s, position_m, noise_m, rho)
-        self.width, self.velocity = kinematics.window_points[inside], kinematics.lead_velocity_m_s[inside]
-        allowance = BAND_SIGMAS * kinematics.lead_velocity_sigma_m_s[inside]
-        self.bounds = [speed_bounds(self.velocity - allowance, self.velocity + allowance, 0)]
-        # Chords of the raw positions over 1, 2, 4 … frames. Nothing is smoothed in them, so a window may extend right
-        # up to the start-up or the end of growth without being affected by those.
-        span = 1
-        while span <= max(1, (self.n - 1) // 2):
-            gap_s = time_s[span:] - time_s[:-span]
-            speed = (position_m[span:] - position_m[:-span]) / gap_s
-            error = BAND_SIGMAS * noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
-            self.bounds.append(speed_bounds(speed - error, speed + error, span))
-            span *= 2
-
-    def longest(self) -> tuple[tuple[int, int] | None, str]:
-        """First and last point of the longest steady window, or the reason why there is none."""
-        # 56: starts and ends tried in the first pass; the best is then refined point by point (chosen)
-        stride = max(1, math.ceil(self.n / 56))
-        edges = np.arange(0, self.n, stride)
-        best, score = self._best(edges, np.union1d(edges, [self.n - 1]))
-        if best is None:
-            return None, score
-        while stride > 1:
-            reach, stride = stride, max(1, stride // 6)
-            near = np.unique(np.append(np.arange(-reach, reach + 1, stride), 0))
-            starts = np.unique(np.clip(best[0] + near, 0, self.n - 1))
-            ends = np.unique(np.clip(best[1] + near, 0, self.n - 1))
-            better, _ = self._best(starts, ends)
-            best = better or best
-        return best, ""
-
-    def _best(self, starts: Indices, ends: Indices) -> tuple[tuple[int, int] | None, str]:
-        first, last = (grid.ravel() for grid in np.meshgrid(starts, ends, indexing="ij"))
-        long_enough = (last - first + 1 >= 3) & (last <= self.latest)
-        first, last = first[long_enough], last[long_enough]
-        points = last - first + 1
-        # 0.02: shortest window, as a fraction of the motion (chosen)
-        keep = points >= np.maximum(max(3, 0.02 * self.n), self.width[(first + last) // 2] / 2 + 2)
-        first, last, points = first[keep], last[keep], points[keep]
-        if first.size == 0:
-            return None, "fewer points move than one smoothing window holds"
-        mean, drift, drift_sigma = self.moments.drift(first, last)
-        worst = np.abs(drift) + 1.96 * drift_sigma
+    n, noise_m, rho = time_s.size, kinematics.noise_m, kinematics.noise_correlation
+    moments = WindowMoments(time_s, position_m, noise_m, rho)
+    velocity, width = kinematics.lead_velocity_m_s[inside], kinematics.window_points[inside]
+    # Speeds that must lie within the band, by the points that each spans: those smoothed, and chords of the raw
+    # positions over 1, 2, 4 … frames. Nothing is smoothed in a chord, so that a window may extend right up to the
+    # start-up or the end of growth without being affected by those.
+    speeds = {0: (velocity, BAND_SIGMAS * kinematics.lead_velocity_sigma_m_s[inside])}
+    for span in (1 << k for k in range(max(1, (n - 1) // 2).bit_length())):
+        gap_s = time_s[span:] - time_s[:-span]
+        chord = (position_m[span:] - position_m[:-span]) / gap_s
+        speeds[span] = chord, BAND_SIGMAS * noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
+    nearest, least = "fewer points move than one smoothing window holds", math.inf
+    # 0.02, 200: shortest window, as a fraction of the motion, and number of lengths that are tried (chosen)
+    for length in range(min(n, latest + 1), max(3, math.ceil(0.02 * n)) - 1, -max(1, n // 200)):
+        first = np.arange(latest + 2 - length)
+        last = first + length - 1
+        allowed = length >= width[(first + last) // 2] / 2 + 2
+        mean, drift, sigma = moments.drift(first, last)
+        worst = np.where(allowed & (mean > 0), np.abs(drift) + 1.96 * sigma, np.inf)
         # 1 / 3: where the speed falls by more than this part of the limit, a window may be that short (chosen)
-        share = np.where(drift < -(1 / 3) * self.limit, 0.0, SHORTEST_SHARE)
-        steady = (mean > 0) & (worst <= self.limit) & (points >= share * self.n)
-        for bounds in self.bounds:
-            index = np.flatnonzero(steady)
-            if index.size == 0:
-                break
-            low, high = bounds(first[index], last[index])
-            inside = (low <= (1 + BAND * self.limit) * mean[index]) & (high >= (1 - BAND * self.limit) * mean[index])
-            steady[index[~inside]] = False
-        if not steady.any():
-            return None, self._nearest(first, last, mean, drift, drift_sigma)
-        index = np.flatnonzero(steady)
-        winner = index[np.lexsort((worst[index], -points[index]))[0]]
-        return (int(first[winner]), int(last[winner])), ""
-
-    def _nearest(self, first: Indices, last: Indices, mean: Floats, drift: Floats, sigma: Floats) -> str:
-        worst = np.where(mean > 0, np.abs(drift) + 1.96 * sigma, np.inf)
+        long_enough = (length >= SHORTEST_SHARE * n) | (drift < -(1 / 3) * drift_limit)
+        steady = (worst <= drift_limit) & long_enough
+        for span, (speed, error) in speeds.items():
+            if span < length and steady.any():
+                size, at = length - span, first + (length - span) // 2
+                highest_low = maximum_filter1d(speed - error, size)[at]
+                lowest_high = minimum_filter1d(speed + error, size)[at]
+                steady &= highest_low <= (1 + BAND * drift_limit) * mean
+                steady &= lowest_high >= (1 - BAND * drift_limit) * mean
+        if steady.any():
+            start = int(np.argmin(np.where(steady, worst, np.inf)))
+            return (start, start + length - 1), ""
         near = int(np.argmin(worst))
-        count, change, error = last[near] - first[near] + 1, 100 * drift[near], 196 * sigma[near]
-        if worst[near] > self.limit:
-            why = f"changes by {change:.2g} ± {error:.2g} % across it"
-        elif count < SHORTEST_SHARE * self.n:
-            why = f"is less than {100 * SHORTEST_SHARE:g} % of the motion"
-        else:
-            band = self.velocity[first[near] : last[near] + 1] / mean[near]
-            why = f"contains speeds from {100 * band.min():.0f} to {100 * band.max():.0f} % of its mean"
-        return (
-            f"no window is shown to be steady within ±{100 * self.limit:g} %: the nearest,"
-            f" {count} of {self.n} moving points, {why}"
-        )
+        if worst[near] < least:
+            least = worst[near]
+            if least > drift_limit:
+                why = f"changes by {100 * drift[near]:.2g} ± {196 * sigma[near]:.2g} % across it"
+            elif not long_enough[near]:
+                why = f"is less than {100 * SHORTEST_SHARE:g} % of the motion"
+            else:
+                band = velocity[near : near + length] / mean[near]
+                why = f"contains speeds from {100 * band.min():.0f} to {100 * band.max():.0f} % of its mean"
+            nearest = (
+                f"no window is shown to be steady within ±{100 * drift_limit:g} %: the nearest,"
+                f" {length} of {n} moving points, {why}"
+            )
+    return None, nearest
 
 
 def _percent(window: Window) -> str:
