@@ -22,15 +22,12 @@ LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chos
 FLOOR_PX = 0.04  # Standard error that no check shows
 
 REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while it stays this near to its level (chosen)
-# Distance from the curve through its neighbours, in standard errors and in px, from which a point is an outlier
-# (chosen)
-OUTLIER_SIGMAS, OUTLIER_PX = 6.0, 1.0
 
 
 @dataclass(frozen=True)
 class PointQuality:
     """Flag of every frame, its capture period with missing frames counted in, and sentences for a person. `flag`,
-    `slot`, `without_edge` and `departure_px` have shape (n_frames,).
+    `slot` and `without_edge` have shape (n_frames,).
     """
 
     flag: NDArray[np.str_]
@@ -40,7 +37,6 @@ class PointQuality:
     last_moving: int
     left_picture: int | None
     without_edge: Bools
-    departure_px: Floats
 
 
 def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, is_body: bool = False) -> Floats:
@@ -121,10 +117,6 @@ def assess_points(
     if repeats.any():
         count, first_repeat = int(repeats.sum()), number[repeats][0]
         notes.append(f"{count} frames repeat the one before them and are dropped, first frame {first_repeat}")
-    # Distance of outlying points from where their neighbours lead; 0 of all others
-    inside, at_start = _off_parabola(y, sigma_px, first, last), _hidden_at_start(y, sigma_px, first)
-    departure_px = np.maximum(np.maximum(inside, at_start), _flying_on(y, sigma_px, first, last))
-    is_outlier = departure_px > 0
     without_edge = no_edge & (np.arange(n) < first_outside)
     flags = [
         join_flags(
@@ -134,7 +126,7 @@ def assess_points(
             "duplicate" if repeats[i] else "",
             "gap" if missing.gap[i] else "",
             "retimed" if missing.retimed[i] else "",
-            "doubtful" if (unsure[i] or is_outlier[i]) and not no_edge[i] else "",
+            "doubtful" if unsure[i] and not no_edge[i] else "",
         )
         for i in range(n)
     ]
@@ -144,50 +136,8 @@ def assess_points(
         notes.append(f"the leading edge is lost in {count} moving frames, first frame {first_lost}")
     return PointQuality(
         np.array(flags, dtype=np.str_), missing.slot, tuple(notes), first, last,
-        first_outside if first_outside < n else None, without_edge, departure_px,
+        first_outside if first_outside < n else None, without_edge,
     )  # fmt: skip
-
-
-def _off_parabola(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
-    """Distance of each moving point from the parabola through two neighbours on either side, where it is an outlier."""
-    distance_px = np.zeros(len(y))
-    for i in range(max(first, 2), min(last, len(y) - 1) - 1):  # an abrupt stop is no outlier
-        around = y[[i - 2, i - 1, i + 1, i + 2]]
-        if not np.all(np.isfinite(around)) or not np.isfinite(y[i]):
-            continue
-        expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
-        bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
-        # 1.4: standard deviation of a point minus the parabola through its four neighbours, for equal errors
-        sigma = 1.4 * float(np.max(sigma_px[i - 2 : i + 3]))
-        distance = abs(y[i] - expected)
-        distance_px[i] = distance if distance > max(OUTLIER_SIGMAS * sigma, OUTLIER_PX, bend) else 0.0
-    return distance_px
-
-
-def _hidden_at_start(y: Floats, sigma_px: Floats, first: int) -> Floats:
-    """Distance of the points at rest where the first step is too long: something hid the tip, which was further on."""
-    distance_px = np.zeros(len(y))
-    for i in range(max(first - 1, 1), min(first + 2, len(y) - 2)):
-        step, later_step = y[i] - y[i - 1], 0.5 * (y[i + 2] - y[i])
-        # 1.2, 0.5: A first step this many times the mean of the next two (chosen)
-        too_long = step > 1.2 * later_step + max(sigma_px[i], 0.5)
-        if np.isfinite(step - later_step) and too_long:
-            distance_px[:i] = np.maximum(distance_px[:i], step - 0.5 * later_step)
-    return distance_px
-
-
-def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
-    """Distance of the last points from the line through the two before: an object flies on where growth has ended."""
-    distance_px = np.zeros(len(y))
-    for i in range(max(first + 4, last - 2), last + 1):
-        before = y[i - 4 : i]
-        excess = y[i] - 2 * before[-1] + before[-2]
-        roughness = float(np.max(np.abs(np.diff(before, 2))))
-        # 0.5, 4.0: A last step that exceeds the extrapolated one by this part of a step (chosen)
-        limit = max(OUTLIER_SIGMAS * sigma_px[i], 2 * OUTLIER_PX, 0.5 * (before[-1] - before[-2]), 4.0 * roughness)
-        if np.isfinite(excess) and excess > limit:
-            distance_px[i : last + 1] = np.maximum(distance_px[i : last + 1], excess)
-    return distance_px
 
 
 # ------------------------------------------------------------------------------

@@ -274,15 +274,13 @@ def track_pixels(
         repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
     )  # fmt: skip
     if quality.last_moving < 0:
-        lost = ~(total_px < LOST_SIGMA_PX) | ~(np.hypot(total_px, quality.departure_px) < LOST_SIGMA_PX)
         # 0.5: fraction of frames without an edge above which it is too vague, not at rest (chosen)
-        if np.mean(lost) > 0.5:
+        if np.mean(~(total_px < LOST_SIGMA_PX)) > 0.5:
             what = "something moves, but its edge is too vague to be followed"
             raise RecordingError(what, "film it nearer, with more light or contrast, or at more frames a second", name)
         raise RecordingError("nothing moves along the axis", "check the recording, or give the axis", name)
-    # Random, with the disagreement of bands and the distance of outliers; and shared by neighbouring frames: of edge,
-    # stabilisation and path.
-    random_px = np.hypot(np.maximum(random_px, followed.bands_sigma_px), quality.departure_px)
+    # Random, with the disagreement of bands; and shared by neighbouring frames: of edge, stabilisation and path.
+    random_px = np.maximum(random_px, followed.bands_sigma_px)
     slow_px = np.hypot(np.broadcast_to(followed.slow_px, random_px.shape), STABILISED_PX if strip.stabilised else 0.0)
     # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
     slow_px = np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad)
