@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools, Floats, Indices
+from vinetrack.core.records import Bools, Floats
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
@@ -43,7 +43,6 @@ from vinetrack.video.edge_state import (
     search_edges,
     seen_exposure,
 )
-from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.point_quality import growth_end
 from vinetrack.video.strip import SLOW_PX, Positions, Strip
 
@@ -112,26 +111,6 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: Bools) -> 
             else:
                 out[t] = replacement
             edge[t] = float(out[t, 0])
-    return _repair_strays(strip, state, out, moving, bad_misfit)
-
-
-def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: Indices, bad_misfit: float) -> Floats:
-    """Replace bad fits that stray from the parabola through two neighbours on each side by the best fit near it. A good
-    fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
-    """
-    out = fit.copy()
-    for t in moving[2:-2]:
-        around = out[[t - 2, t - 1, t + 1, t + 2], 0]
-        expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
-        bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
-        distance = abs(out[t, 0] - expected)
-        if not np.isfinite(distance) or out[t, 2] <= bad_misfit or distance < max(1.5, bend):
-            continue
-        reach = max(2.0, 0.3 * distance)
-        replacement = _best_between(strip, state, int(t), expected - reach, expected + reach, 9)
-        # 1.4: ratio by which the misfit of a fit that agrees with its neighbours may exceed the other (chosen)
-        if replacement is not None and replacement[2] < 1.4 * out[t, 2]:
-            out[t] = replacement
     return out
 
 
@@ -465,11 +444,8 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = initial_state(strip, path, exposure)
-    # Mean absolute difference of each frame from the one before it
-    change = mean_changes(strip.values, 2) if len(strip.values) > 1 else np.ones(1)
-    change = np.concatenate([change[:1], change[: len(strip.values) - 1]])
     for iteration in range(3):
-        before, path = path, _path_from_appearance(strip, state, passed, change)
+        before, path = path, _path_from_appearance(strip, state, passed)
         # 1.0: two paths are the same if they nowhere differ by more than this (derived)
         if iteration > 0 and np.abs(before - path).max() <= 1.0:
             break
@@ -569,7 +545,7 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
     return float(row + outwards * excess[row] / (excess[row] - min(excess[row + outwards], 0.0)))
 
 
-def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
+def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int]) -> Floats:
     """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
     # Distance, in standard deviations, at which the difference of a pixel from film or background is clipped
     # (chosen)
@@ -585,12 +561,7 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
 
     evidence = np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
-    # Each frame counts by how much it differs from the one before it, 0.05 (chosen) to 1: while the tip rests behind a
-    # closed door that looks like film, a hundred frames carry no more information than one.
-    usual, floor = float(np.median(change[moving_frames(state.edge)])), float(np.quantile(change, 0.05))
-    frame_weights = np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
-    path = ky.dividing_path(evidence * frame_weights[:, None])
-    return np.clip(path - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
+    return np.clip(ky.dividing_path(evidence) - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
 
 def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
