@@ -14,7 +14,7 @@ from vine_truth import CAPTURE_FPS, Vine, ar1, record
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial, plain_track, with_flag
 from vinetrack.tracks import position_noise as module
-from vinetrack.tracks.frame_timing import correct_frames, count_missing, frames_surely_missing
+from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 from vinetrack.tracks.position_noise import (
     ar1_noise,
     detect_smoothing,
@@ -402,12 +402,3 @@ def test_noise_that_grows_along_the_way_is_told_from_a_dropped_frame():
         assert not with_flag(correct_frames(track).flag, "retimed").any()
         found += "retimed" in flags(correct_frames(dropped(track, 80))).get(80, "")
     assert found >= 36
-
-
-def test_a_step_of_no_whole_number_is_reported_and_changes_nothing():
-    """Twenty frames that move 10 px each, but for one step of 17 px before the tenth."""
-    number, steps = np.arange(20), np.where(np.arange(20) == 10, 17.0, 10.0)
-    out = count_missing(np.cumsum(steps), np.full(20, 0.1), number, number, np.zeros(20, dtype=bool), (0, 19))
-    assert list(np.flatnonzero(out.gap)) == [10]
-    assert not out.retimed.any()
-    np.testing.assert_array_equal(out.slot, np.arange(20))

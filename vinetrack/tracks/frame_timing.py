@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vinetrack.core.records import Bools, Floats, Indices, Track, join_flags, with_flag
+from vinetrack.core.records import Floats, Indices, Track, join_flags, with_flag
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, local_noise, position_noise, reject_outliers
 
 # Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
@@ -72,7 +72,7 @@ def _correct_timing(track: Track) -> Track:
     out = track
     # `gap` on the first row after each spacing of two frames or more that nothing has marked yet
     for before in np.flatnonzero((np.rint(frames) > 1) & ~with_flag(track.flag[1:], "gap")):
-        missing = frames_are(int(np.rint(frames[before])) - 1)
+        missing = _frames_are(int(np.rint(frames[before])) - 1)
         note = f"{missing} missing before {track.time_s[before + 1]:.5g} s, as the times say"
         out = _mark(out, int(before) + 1, "gap", note)
     noise_m, rho = _noise(out)
@@ -135,7 +135,7 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: floa
     return track
 
 
-def frames_are(frames: int) -> str:
+def _frames_are(frames: int) -> str:
     """A number of frames as the beginning of a sentence, with its verb."""
     return "1 frame is" if frames == 1 else f"{frames} frames are"
 
@@ -299,7 +299,9 @@ def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:
         note = f"the frame at {at_s:.5g} s is an inserted copy: left out, later times moved back by one frame"
         return _mark(replace(track, time_s=time_s), fault.row, "duplicate", note)
     time_s[fault.row :] += fault.missing * step_s
-    note = f"{frames_are(fault.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
+    note = (
+        f"{_frames_are(fault.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
+    )
     return _mark(replace(track, time_s=time_s), fault.row, "gap;retimed", note)
 
 
@@ -308,65 +310,6 @@ def _mark(track: Track, row: int, flags: str, note: str) -> Track:
     flag = track.flag.astype("<U80")
     flag[row] = join_flags(str(flag[row]), flags)
     return replace(track, flag=flag, notes=(*track.notes, note))
-
-
-# ------------------------------------------------------------------------------
-# Count missing frames of a recording from single steps of its edge, before positions are in metres.
-#
-# The threshold is that of `frame_timing`, which examines tracks of any source and what remains undecided here.
-
-
-@dataclass(frozen=True)
-class MissingFrames:
-    """Missing frames of a recording; all arrays of shape (n_frames,). `slot` counts capture periods from the first
-    frame, missing ones included; `gap` marks frames before which some are missing or may be, `retimed` those from which
-    `slot` was corrected.
-    """
-
-    slot: Indices
-    gap: Bools
-    retimed: Bools
-    notes: tuple[str, ...]
-
-
-def count_missing(
-    edge_px: Floats, sigma_px: Floats, slot: Indices, number: Indices, repeated: Bools, moving: tuple[int, int]
-) -> MissingFrames:
-    """Count in the frames that steps of the motion show to be missing. A step is compared with two on each side, which
-    must agree and be clear of the stated errors. Arrays have shape (n_frames,).
-    """
-    n = len(edge_px)
-    gap, retimed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    gap[1:] = np.diff(slot) > np.diff(number)
-    counted, notes = slot.copy(), []
-    step = np.full(n, np.nan)
-    step[1:] = np.diff(edge_px) / np.maximum(np.diff(slot), 1)
-    first, last = moving
-    for i in range(max(first, 1) + 2, min(last, n - 1) - 1):
-        around = step[[i - 2, i - 1, i + 1, i + 2]]
-        near = step[[i - 1, i + 1]]
-        if not np.all(np.isfinite(around)) or not np.isfinite(step[i]) or repeated[i - 2 : i + 3].any():
-            continue
-        median_step = float(np.median(around))
-        # Steps below 2 px cannot show a missing frame.
-        least_step = max(2.0, CLEAR_STEP_SIGMAS * float(np.max(sigma_px[i - 1 : i + 1])))
-        # 0.35: range of the four steps, as a part of their median, above which the motion is not steady (chosen)
-        if median_step < least_step or np.ptp(around) > 0.35 * median_step:
-            continue
-        ratio = step[i] / float(near.mean())
-        if ratio <= DROP_RATIO:
-            continue
-        gap[i] = True
-        whole = round(ratio)
-        # A long step this near to a whole number of steps, and no more than so many, is counted in.
-        retimed[i] = abs(ratio - whole) < 0.2 and whole <= 4
-        if retimed[i]:
-            counted[i:] += whole - 1
-            where = f"before frame {number[i]} (the step there is too long)"
-            notes.append(f"{frames_are(whole - 1)} missing {where}: later times moved on")
-        else:
-            notes.append(f"a step of {ratio:.1f} times its neighbours before frame {number[i]}: frames may be missing")
-    return MissingFrames(counted, gap, retimed, tuple(notes))
 
 
 def mean_speed(track: Track) -> float:

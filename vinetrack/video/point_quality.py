@@ -1,4 +1,4 @@
-"""Quality of each point of a track: release, end, lost and doubtful points, repeated and missing frames.
+"""Quality of each point of a track: release, end, lost and doubtful points, repeated frames.
 
 Works on positions alone, in pixels by frame, from any tracker.
 """
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
-from vinetrack.tracks.frame_timing import count_missing
 from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.strip import Strip
 
@@ -26,12 +25,9 @@ REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while i
 
 @dataclass(frozen=True)
 class PointQuality:
-    """Flag of every frame, its capture period with missing frames counted in, and sentences for a person. `flag`,
-    `slot` and `without_edge` have shape (n_frames,).
-    """
+    """Flag of every frame, and sentences for a person. `flag` and `without_edge` have shape (n_frames,)."""
 
     flag: NDArray[np.str_]
-    slot: Indices
     notes: tuple[str, ...]
     first_moving: int
     last_moving: int
@@ -100,17 +96,16 @@ def _first_moving_point(y: Floats, tolerance: float) -> int:
 
 
 def assess_points(
-    edge_px: Floats, sigma_px: Floats, slot: Indices, number: Indices, *, unsure: Bools, repeated: Bools, end_px: float
+    edge_px: Floats, sigma_px: Floats, number: Indices, *, unsure: Bools, repeated: Bools, end_px: float
 ) -> PointQuality:
-    """Flag every frame, and correct the times for missing frames. Arrays have shape (n_frames,)."""
+    """Flag every frame. Arrays have shape (n_frames,)."""
     n = len(edge_px)
     no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
     outside = np.flatnonzero(np.isfinite(edge_px) & (edge_px >= end_px))
     first_outside = int(outside[0]) if len(outside) else n
     y = np.where(no_edge | (np.arange(n) >= first_outside), np.nan, edge_px)
     first, last = moving_range(y, sigma_px)
-    missing = count_missing(y, sigma_px, slot, number, repeated, (first, last))
-    notes = list(missing.notes)
+    notes = []
     if first_outside < n:
         notes.append(f"the leading edge leaves the picture at frame {number[first_outside]}; later frames are not used")
     repeats = repeated & (np.arange(n) > first) & (np.arange(n) <= last)
@@ -124,8 +119,6 @@ def assess_points(
             "after_end" if i > last >= 0 or i >= first_outside else "",
             "lost" if without_edge[i] else "",
             "duplicate" if repeats[i] else "",
-            "gap" if missing.gap[i] else "",
-            "retimed" if missing.retimed[i] else "",
             "doubtful" if unsure[i] and not no_edge[i] else "",
         )
         for i in range(n)
@@ -135,7 +128,7 @@ def assess_points(
         count, first_lost = int(lost_in_motion.sum()), number[lost_in_motion][0]
         notes.append(f"the leading edge is lost in {count} moving frames, first frame {first_lost}")
     return PointQuality(
-        np.array(flags, dtype=np.str_), missing.slot, tuple(notes), first, last,
+        np.array(flags, dtype=np.str_), tuple(notes), first, last,
         first_outside if first_outside < n else None, without_edge,
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
 from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
+from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, axis_through, centred_on_motion, find_axis, front_share
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import curve_problem, find_growth_axis
@@ -51,8 +52,8 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
     parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
     try:
         tube = outline(strip, parts)
-        # 6, 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
-        for _ in range(6 if axis.bends else 3):
+        # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
+        for _ in range(3):
             centred, distance_px = axis_of_tube(strip.axis, tube)
             room_px = (strip.values.shape[1] - 1) / 2 - tube.half_px - 3
             if distance_px < CENTRED_PX and 0 <= room_px < 0.3 * tube.half_px + 6:
@@ -270,7 +271,7 @@ def track_pixels(
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
     total_px = np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
     quality = assess_points(
-        followed.edge_px, total_px, frames.slot[rows], number, unsure=followed.unsure,
+        followed.edge_px, total_px, number, unsure=followed.unsure,
         repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
     )  # fmt: skip
     if quality.last_moving < 0:
@@ -394,11 +395,9 @@ def _assemble(
     edge[rows] = np.where(quality.without_edge, np.nan, followed.edge_px)
     noise[rows], slow[rows] = np.where(quality.without_edge, np.nan, errors_px)
     flag[rows] = quality.flag
-    # What was dropped among the tracked frames delays those between and after them too.
-    delay = np.concatenate([[0], quality.slot - frames.slot[rows]])[np.searchsorted(rows, np.arange(n), "right")]
     # Frames before and after the event were not decoded, since nothing moves in them; they have rows as well.
     before, after = frames.slots_before, frames.slots_after
-    slot = np.concatenate([before, frames.slot + delay, after + delay[-1]])
+    slot = np.concatenate([before, frames.slot, after])
     flag = np.concatenate([np.full(len(before), "before_release"), flag, np.full(len(after), "after_end")])
     edge, noise, slow = np.pad([edge, noise, slow], ((0, 0), (len(before), len(after))), constant_values=np.nan)
     time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
@@ -411,8 +410,8 @@ def _assemble(
 def in_metres(
     tracking: Tracking, trial: Trial, m_per_px: float, position_m: Callable[[Floats], Floats] | None = None
 ) -> Tracking:
-    """A tracking in pixels with hand corrections, positions and errors in metres, and notes on its end where that is
-    not the end of the vine. Shapes: position_m (n, 2).
+    """A tracking in pixels with hand corrections, positions and errors in metres, times corrected for dropped and
+    inserted frames, and notes on its end where that is not the end of the vine. Shapes: position_m (n, 2).
     """
     ending, length_px = tracking.ending, trial.length_m / m_per_px
     notes = [*tracking.track.notes]
@@ -434,4 +433,4 @@ def in_metres(
         lead_position_sigma_m=track.lead_position_sigma_m * local_m_per_px,
         lead_position_systematic_m=None if slow_px is None else slow_px * local_m_per_px,
     )
-    return replace(tracking, track=track)
+    return replace(tracking, track=correct_frames(track))
