@@ -15,14 +15,14 @@ from vinetrack.core.records import FLAGS, Correction, Track, Trial, with_flag
 from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import preset
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.video import track
+from vinetrack.video import edge
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.edge import BANDS, leap_error_px
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.point_quality import PointQuality, calibrated_sigma, ending_of, moving_range
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import cut_strip
+from vinetrack.video.strip import Look, cut_strip
 from vinetrack.video.track import Tracking, follow, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
@@ -271,10 +271,9 @@ def tube() -> np.ndarray:
 def test_without_a_front_along_axis_and_middle_only_the_arrival_is_followed(monkeypatch, on_axis, beside):
     """Shares of the fronts along the axis and along any other, above the least."""
     share = {True: LEAST_FRONT_SHARE + on_axis, False: LEAST_FRONT_SHARE + beside}
-    monkeypatch.setattr(track, "front_share", lambda _, axis: share[axis is AXIS])
+    monkeypatch.setattr(edge, "front_share", lambda _, axis: share[axis is AXIS])
     luma = tube()
-    trial = Trial(name="t", capture_fps=1000.0, m_per_px=1.0)
-    _, positions, _ = follow(luma, trial, AXIS, 0.1, SmallPictures(luma))
+    positions = follow(Look(luma, AXIS, SmallPictures(luma), 2.0, 0.1))
     assert positions.is_edge is (min(on_axis, beside) >= 0)
     moving = slice(14, 60)
     assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[moving].max() < 3

@@ -9,17 +9,30 @@ point is fixed on the body.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.strip import SLOW_PX, Positions, Strip
+from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip
 
 SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
 
 
 POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
+
+
+class BodyTracker:
+    """Follows a body, which moves as a whole."""
+
+    def follow(self, look: Look) -> Positions | None:
+        """Register the body of a strip against itself; None where the travel ratio says that a tube everts."""
+        if look.travel_ratio != 1:
+            return None
+        strip = cut_strip(look.luma, look.axis, 0.75 * look.axis.width_px + 12)
+        return replace(track_body(strip), exposure_frames=look.exposure_frames)
 
 
 def track_body(strip: Strip) -> Positions:
@@ -62,8 +75,8 @@ def track_body(strip: Strip) -> Positions:
             "what is followed hops between several bodies that move along the axis: give the axis, with a smaller width"
         )
     return Positions(
-        edge_px=np.where(unseen, np.nan, place[:, 0]), sigma_px=error, unsure=~inside | (match < POOR_MATCH),
-        blur_px=float(half), reach_px=float(half), slow_px=SLOW_PX, end=end,
+        strip=strip, edge_px=np.where(unseen, np.nan, place[:, 0]), sigma_px=error,
+        unsure=~inside | (match < POOR_MATCH), blur_px=float(half), reach_px=float(half), slow_px=SLOW_PX, end=end,
     )  # fmt: skip
 
 

@@ -12,14 +12,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts
+from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, axis_through, front_share
 from vinetrack.video.edge_state import (
     ASSUMED_EXPOSURE,
     EARLY_FIT_ROUNDS,
@@ -43,8 +46,10 @@ from vinetrack.video.edge_state import (
     search_edges,
     seen_exposure,
 )
+from vinetrack.video.frames import RecordingError
 from vinetrack.video.point_quality import growth_end
-from vinetrack.video.strip import SLOW_PX, Positions, Strip
+from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.strip import SLOW_PX, Look, Positions, Strip, cut_strip, snap_to_grid
 
 # ------------------------------------------------------------------------------
 # Repair of edge fits that break the motion, and errors of the edge by its bands.
@@ -474,6 +479,19 @@ def track_edge(strip: Strip, exposure_frames: float, tube: Outline) -> Positions
     return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
 
 
+class EdgeTracker:
+    """Follows the leading edge of a tube."""
+
+    def follow(self, look: Look) -> Positions | None:
+        """Follow the edge through a strip centred on the tube; None where no tube grows along the axis."""
+        if (outlined := tube_strip(look.luma, look.axis, look.small)) is None:
+            return None
+        strip, tube = outlined
+        return replace(
+            track_edge(strip, look.exposure_frames, tube), width_px=tube.width_px, width_sigma_px=tube.width_sigma_px
+        )
+
+
 @dataclass(frozen=True)
 class Outline:
     """Outline of the tube that the front leaves behind: its centreline and width, px. `shift_px` and `slope` (px per
@@ -543,6 +561,71 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
     if not 0 <= row + outwards < len(excess) or excess[row] <= 0:
         return float(row)
     return float(row + outwards * excess[row] / (excess[row] - min(excess[row + outwards], 0.0)))
+
+
+# ------------------------------------------------------------------------------
+# Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
+
+
+STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
+CENTRED_PX = 0.5  # Largest distance from the tube's middle at which an axis is left unchanged (measured)
+
+
+def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
+    """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too.
+    An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
+    passes along its middle. None where no single front passes along the axis, or along the middle of what it leaves.
+    """
+    if front_share(small, axis) < LEAST_FRONT_SHARE:
+        return None
+    # 0.08: part of its width by which an axis may slope for the strip to be cut along whole rows or columns (chosen)
+    strip = first = cut_strip(luma, snap_to_grid(axis, 0.08 * axis.width_px), 0.65 * axis.width_px + 3)
+    parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
+    try:
+        tube = outline(strip, parts)
+        # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
+        for _ in range(3):
+            centred, distance_px = axis_of_tube(strip.axis, tube)
+            room_px = (strip.values.shape[1] - 1) / 2 - tube.half_px - 3
+            if distance_px < CENTRED_PX and 0 <= room_px < 0.3 * tube.half_px + 6:
+                break
+            strip = cut_strip(luma, snap_to_grid(centred), tube.half_px * 1.15 + 5, strip if axis.bends else None)
+            tube = outline(strip, parts)
+        off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
+    except (RecordingError, ValueError):
+        return None
+    return None if off_tube else (strip, tube)
+
+
+def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
+    """Move an axis onto the middle of a tube, with the tube's width, and measure how far that lies from it. The ends
+    keep their places along it: only the position across is corrected. A curve stays as it is where the tube's middle
+    makes none that a strip can be cut along.
+    """
+    if not axis.bends:
+        ends_px = np.array([0.0, axis.length_px])
+        offsets = tube.shift_px + tube.slope * ends_px
+        return axis_through(axis.points(ends_px, offsets), 2 * tube.half_px), float(np.abs(offsets).max())
+    # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
+    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
+    # Middle of the tube at the knots, by Gaussian-weighted local lines; level beyond the outermost stretches
+    places, middles, offsets = tube.places_px, tube.middles_px, np.empty(len(knots))
+    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
+    for k, place in enumerate(np.clip(knots, places[0], places[-1])):
+        away = (places - place) / spacing
+        weight = np.exp(-0.5 * away**2)
+        design = np.column_stack([np.ones(len(places)), away])
+        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
+        offsets[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
+    through = axis.points(knots, offsets)
+    separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
+    try:
+        curve = axis_through(through[np.append(True, separate)], 2 * tube.half_px)
+    except RecordingError:
+        return axis, 0.0
+    if not curve.bends or tube.half_px > curve.largest_half_px:
+        return axis, 0.0
+    return curve, float(np.abs(offsets).max())
 
 
 def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int]) -> Floats:
@@ -641,7 +724,7 @@ def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, p
         slow_px = np.hypot(everywhere_px, 1.0 / np.maximum(local_contrast, 1.0))
     slow = np.hypot(slow, slow_px)
     return Positions(
-        edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden), blur_px=state.blur,
+        strip=strip, edge_px=edge, sigma_px=sigma, unsure=np.asarray(odd | uncertain | hidden), blur_px=state.blur,
         reach_px=3 * state.blur + 1, slow_px=slow, exposure_frames=exposure, extra_sigma_px=extra,
         bands_sigma_px=bands,
     )  # fmt: skip

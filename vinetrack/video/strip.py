@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.core.threads import FEWEST_PICTURES, in_parts, njit
 from vinetrack.video.axis import Axis
+from vinetrack.video.small_pictures import SmallPictures
 
 BAND_GAP_PX = 5  # Rows left out between tube and background, to allow for sway and blur (chosen)
 SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
@@ -47,13 +48,15 @@ class Strip:
 
 @dataclass(frozen=True, kw_only=True)
 class Positions:
-    """Positions along a strip by frame, px, from any of the trackers; arrays of shape (n_frames,). `edge_px` is where
+    """Positions along a `strip` by frame, px, from any of the trackers; arrays of shape (n_frames,). `edge_px` is where
     the edge, or the body, is at mid-exposure, NaN where it is not seen, `sigma_px` its standard error from the fit
     alone; `extra_sigma_px` is what is added to that in all, `bands_sigma_px` the part of it that differs from frame to
     frame, `slow_px` what neighbouring frames share. `reach_px` is how far from the end of the strip the last place is
-    that can be seen; `end` the last frame of a body's motion, and whether it turns back there.
+    that can be seen; `end` the last frame of a body's motion, and whether it turns back there; `width_px` that of a
+    tube, with its standard error.
     """
 
+    strip: Strip
     edge_px: Floats
     sigma_px: Floats
     unsure: Bools
@@ -67,6 +70,28 @@ class Positions:
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan
     is_edge: bool = True
+    width_px: float = math.nan
+    width_sigma_px: float = math.nan
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a tracker looks at: pictures, shape (n_frames, height, width), the axis, the same pictures shrunk, and what
+    is known of the trial.
+    """
+
+    luma: NDArray[Any]
+    axis: Axis
+    small: SmallPictures
+    travel_ratio: float
+    exposure_frames: float
+
+
+class Tracker(Protocol):
+    """One way to follow what moves along an axis."""
+
+    def follow(self, look: Look) -> Positions | None:
+        """Follow it; None where it is not what this tracker knows."""
 
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:

@@ -27,10 +27,11 @@ from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.video.axis import Axis, askew_trials, axis_through, slope_deg
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.curved_axis import axis_entry, curve_problem, find_growth_axis
+from vinetrack.video.edge import tube_strip
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.track import FEWEST_FRAMES, Tracking, in_metres, track_pixels, tube_strip
+from vinetrack.video.track import FEWEST_FRAMES, Tracking, in_metres, track_pixels
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment

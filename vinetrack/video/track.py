@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
-from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, axis_through, centred_on_motion, find_axis, front_share
+from vinetrack.video.axis import Axis, centred_on_motion, find_axis
+from vinetrack.video.body import BodyTracker
 from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.curved_axis import curve_problem, find_growth_axis
-from vinetrack.video.edge import Outline, outline, track_edge
+from vinetrack.video.edge import EdgeTracker
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, odd_frames, repeated_frames
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.kymograph import END_FRAMES, column_after_leap, dividing_path
@@ -30,128 +30,58 @@ from vinetrack.video.point_quality import (
     ending_of,
 )
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.strip import Positions, Strip, cut_strip, snap_to_grid
+from vinetrack.video.strip import Look, Positions, Tracker, cut_strip
 
 # ------------------------------------------------------------------------------
-# Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
+# Follow what moves along an axis, by frame: a body, the edge of a tube, or else the arrival of whatever comes.
 
 
-STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
-CENTRED_PX = 0.5  # Largest distance from the tube's middle at which an axis is left unchanged (measured)
-
-
-def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
-    """Cut the strip about the tube that grows along an axis, centred on the tube, whose outline in it is returned too.
-    An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
-    passes along its middle. None where no single front passes along the axis, or along the middle of what it leaves.
+class ArrivalTracker:
+    """Follows the tip of a vine that bends, sweeps or slides along walls, to about a pixel, as the column up to which
+    the scene has changed. Its film does not stay in place, so that a tracker of a straight front would follow the
+    sweep.
     """
-    if front_share(small, axis) < LEAST_FRONT_SHARE:
-        return None
-    # 0.08: part of its width by which an axis may slope for the strip to be cut along whole rows or columns (chosen)
-    strip = first = cut_strip(luma, snap_to_grid(axis, 0.08 * axis.width_px), 0.65 * axis.width_px + 3)
-    parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
+
+    def follow(self, look: Look) -> Positions:
+        """Follow whatever comes, of any width and direction."""
+        width_px = min(4 * look.axis.width_px, 0.3 * max(look.luma.shape[1:]))
+        strip = cut_strip(look.luma, look.axis, width_px)
+        min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
+        values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
+        values += strip.offset[:, None, None].astype(np.float32)
+        first = np.median(values[:END_FRAMES], axis=0)
+        # 4.0: change, in units of the noise, that counts (chosen)
+        threshold = 4.0 * max(strip.noise, 3.0)
+        changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
+        smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
+        evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
+        ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
+        if len(ever) < 10:
+            raise ValueError("nothing moves along the axis")
+        evidence[:, : ever[0]] = 0.0
+        path = dividing_path(evidence)
+        edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
+        smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+        # 0.8, 1.0: random and slow error of an arrival (measured)
+        return Positions(
+            strip=strip, edge_px=smoothed, sigma_px=np.full(len(edge), 0.8), unsure=np.zeros(len(edge), dtype=bool),
+            blur_px=1.0, reach_px=2.0, slow_px=1.0, exposure_frames=look.exposure_frames, is_edge=False,
+        )  # fmt: skip
+
+
+# Asked in turn: the first that knows what moves follows it. Another tracker is a class in a file of its own and a name
+# here.
+TRACKERS: tuple[Tracker, ...] = (BodyTracker(), EdgeTracker(), ArrivalTracker())
+
+
+def follow(look: Look) -> Positions:
+    """Follow what moves along an axis by the first tracker that knows it."""
     try:
-        tube = outline(strip, parts)
-        # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
-        for _ in range(3):
-            centred, distance_px = axis_of_tube(strip.axis, tube)
-            room_px = (strip.values.shape[1] - 1) / 2 - tube.half_px - 3
-            if distance_px < CENTRED_PX and 0 <= room_px < 0.3 * tube.half_px + 6:
-                break
-            strip = cut_strip(luma, snap_to_grid(centred), tube.half_px * 1.15 + 5, strip if axis.bends else None)
-            tube = outline(strip, parts)
-        off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
-    except (RecordingError, ValueError):
-        return None
-    return None if off_tube else (strip, tube)
-
-
-def axis_of_tube(axis: Axis, tube: Outline) -> tuple[Axis, float]:
-    """Move an axis onto the middle of a tube, with the tube's width, and measure how far that lies from it. The ends
-    keep their places along it: only the position across is corrected. A curve stays as it is where the tube's middle
-    makes none that a strip can be cut along.
-    """
-    if not axis.bends:
-        ends_px = np.array([0.0, axis.length_px])
-        offsets = tube.shift_px + tube.slope * ends_px
-        return axis_through(axis.points(ends_px, offsets), 2 * tube.half_px), float(np.abs(offsets).max())
-    # 40.0: distance of the knots of a curve that is moved onto the middle of a tube (chosen)
-    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / 40.0) + 1))
-    # Middle of the tube at the knots, by Gaussian-weighted local lines; level beyond the outermost stretches
-    places, middles, offsets = tube.places_px, tube.middles_px, np.empty(len(knots))
-    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
-    for k, place in enumerate(np.clip(knots, places[0], places[-1])):
-        away = (places - place) / spacing
-        weight = np.exp(-0.5 * away**2)
-        design = np.column_stack([np.ones(len(places)), away])
-        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
-        offsets[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
-    through = axis.points(knots, offsets)
-    separate = np.hypot(*np.diff(through, axis=0).T) > SMALLEST_POINT_SPACING_PX
-    try:
-        curve = axis_through(through[np.append(True, separate)], 2 * tube.half_px)
-    except RecordingError:
-        return axis, 0.0
-    if not curve.bends or tube.half_px > curve.largest_half_px:
-        return axis, 0.0
-    return curve, float(np.abs(offsets).max())
-
-
-# ------------------------------------------------------------------------------
-# Follow what moves along an axis, by frame: the edge of a tube, a body, or else the arrival of whatever comes.
-
-
-def follow(
-    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, small: SmallPictures
-) -> tuple[Strip, Positions, tuple[float, float]]:
-    """Follow a body (travel ratio 1) or the edge of a tube; where there is no tube, the arrival of whatever comes.
-    Returns the strip, centred on what moves along the axis, the positions along it, and the tube's width with its
-    standard error, px, NaN where there is none.
-    """
-    no_width = math.nan, math.nan
-    try:
-        if trial.travel_ratio == 1:
-            from vinetrack.video.body import track_body
-
-            strip = cut_strip(luma, axis, 0.75 * axis.width_px + 12)
-            return strip, replace(track_body(strip), exposure_frames=exposure_frames), no_width
-        if (outlined := tube_strip(luma, axis, small)) is not None:
-            strip, tube = outlined
-            return strip, track_edge(strip, exposure_frames, tube), (tube.width_px, tube.width_sigma_px)
-        # Of any width and direction
-        strip = cut_strip(luma, axis, min(4 * axis.width_px, 0.3 * max(luma.shape[1:])))
-        return strip, replace(track_arrival(strip), exposure_frames=exposure_frames), no_width
+        return next(found for tracker in TRACKERS if (found := tracker.follow(look)) is not None)
     except RecordingError:
         raise
     except ValueError as error:
         raise RecordingError(str(error)) from error
-
-
-def track_arrival(strip: Strip) -> Positions:
-    """Track the tip of a vine that bends, sweeps or slides along walls, to about a pixel, as the column up to which the
-    scene has changed. Its film does not stay in place, so that a tracker of a straight front would follow the sweep.
-    """
-    min_changed_rows = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
-    values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
-    values += strip.offset[:, None, None].astype(np.float32)
-    first = np.median(values[:END_FRAMES], axis=0)
-    # 4.0: change, in units of the noise, that counts (chosen)
-    threshold = 4.0 * max(strip.noise, 3.0)
-    changed = (np.abs(values - first) > threshold).sum(axis=1).astype(float)
-    smooth = np.apply_along_axis(np.convolve, 1, changed, np.ones(3) / 3, "same")
-    evidence = (min_changed_rows - np.minimum(smooth, 3 * min_changed_rows)).astype(np.float32)
-    ever = np.flatnonzero((smooth > min_changed_rows).mean(axis=0) > 0.05)
-    if len(ever) < 10:
-        raise ValueError("nothing moves along the axis")
-    evidence[:, : ever[0]] = 0.0
-    path = dividing_path(evidence)
-    edge = np.maximum(path, max(column_after_leap(path), float(ever[0]))) - 0.5
-    smoothed = np.convolve(np.pad(edge, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    # 0.8, 1.0: random and slow error of an arrival (measured)
-    return Positions(
-        edge_px=smoothed, sigma_px=np.full(len(edge), 0.8), unsure=np.zeros(len(edge), dtype=bool), blur_px=1.0,
-        reach_px=2.0, slow_px=1.0, is_edge=False,
-    )  # fmt: skip
 
 
 # ------------------------------------------------------------------------------
@@ -257,13 +187,13 @@ def track_pixels(
     try:
         small = SmallPictures(luma)
         axis = locate_axis(luma, small, axis, trial, diameter_px)
-        strip, followed, width_px = follow(luma, trial, axis, exposure_s * capture_fps, small)
+        followed = follow(Look(luma, axis, small, trial.travel_ratio, exposure_s * capture_fps))
     except RecordingError as error:
         raise RecordingError(error.what, error.remedy, name) from error
     # Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
     # The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
     # larger one counts.
-    edge_px = followed.edge_px
+    strip, edge_px = followed.strip, followed.edge_px
     # 0.3: step of a frame from which the frame counts for the roughness of the track (chosen)
     moving = np.gradient(edge_px) > 0.3 if len(edge_px) > 1 else np.ones(len(edge_px), bool)
     use, is_body = moving & np.isfinite(edge_px), trial.travel_ratio == 1
@@ -286,7 +216,7 @@ def track_pixels(
     # 0.04: slow error of a position along a curve, for each radian by which the curve turns (measured)
     slow_px = np.hypot(slow_px, 0.04 * strip.axis.total_turn_rad)
     errors_px = np.minimum(random_px, LOST_SIGMA_PX), np.minimum(slow_px, LOST_SIGMA_PX)
-    notes, ending = _notes(frames, number, luma, trial, strip, followed, quality, axis_given)
+    notes, ending = _notes(frames, number, luma, trial, followed, quality, axis_given)
     notes += left_out
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
@@ -296,7 +226,8 @@ def track_pixels(
     shake_px[number] = strip.shake_along(followed.edge_px)
     return Tracking(
         track, strip.axis, kymograph.astype(np.float32), pictures, followed.blur_px, followed.exposure_frames, shake_px,
-        *width_px, followed.seen_exposure_frames, followed.fast_px_per_frame, strip_frames=number, ending=ending,
+        followed.width_px, followed.width_sigma_px, followed.seen_exposure_frames, followed.fast_px_per_frame,
+        strip_frames=number, ending=ending,
     )  # fmt: skip
 
 
@@ -330,8 +261,8 @@ def _select_frames(frames: Frames, trial: Trial) -> tuple[Indices, list[str]]:
 
 
 def _notes(
-    frames: Frames, number: Indices, luma: NDArray[Any], trial: Trial, strip: Strip, followed: Positions,
-    quality: PointQuality, axis_given: bool,
+    frames: Frames, number: Indices, luma: NDArray[Any], trial: Trial, followed: Positions, quality: PointQuality,
+    axis_given: bool,
 ) -> tuple[list[str], Ending]:  # fmt: skip
     """Sentences about the track: its points, its end and its axis; and how it ends."""
     name = frames.recording.path.name
@@ -345,9 +276,10 @@ def _notes(
     else:
         whole = trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1
         ending = ending_of(luma, quality, followed.edge_px, name, number, whole, len(notes))
-    if strip.axis.bends and not axis_given:
+    axis = followed.strip.axis
+    if axis.bends and not axis_given:
         notes.append(
-            f"{name}: the vine bends by {np.degrees(strip.axis.total_turn_rad):.0f}° in all, and positions are those "
+            f"{name}: the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those "
             "along a curve that was found: look at its overlay, and draw the curve (column `axis`) if the edge is not "
             "on it"
         )
@@ -369,7 +301,7 @@ def locate_axis(luma: NDArray[Any], small: SmallPictures, axis: Axis | None, tri
     width_px = next(width for width in widths_px if np.isfinite(width))
     if not given:
         return replace(axis, width_px=width_px)
-    # A margin for an axis a few degrees off (derived); it is centred on the motion, here or by `tube_strip`.
+    # A margin for an axis a few degrees off (derived); it is centred on the motion, here or by the tracker of tubes.
     wide_px = width_px + 0.08 * axis.length_px
     if axis.bends:
         width_known = np.isfinite(axis.width_px) or np.isfinite(diameter_px)
