@@ -83,38 +83,6 @@ def monotone_path_sums(
     return out
 
 
-def mean_changes(pictures: NDArray[Any], step: int) -> NDArray[np.float64]:
-    """Mean absolute change from each picture to the next, of every `step`-th row and column. Shapes: pictures (n,
-    height, width) → (n - 1,).
-    """
-    sums = in_parts(
-        lambda first, last: _sums_of_changes(pictures[first : last + 1], step), len(pictures) - 1, FEWEST_PICTURES
-    )
-    height, width = (-(-size // step) for size in pictures.shape[1:])
-    return np.concatenate(sums) / (height * width)
-
-
-@njit(nogil=True)
-def _sums_of_changes(pictures: np.ndarray, step: int) -> np.ndarray:
-    """Sum the absolute changes of `mean_changes`."""
-    n, height, width = pictures.shape
-    out = np.zeros(n - 1)
-    for t in range(n - 1):
-        total = np.int64(0)
-        for y in range(0, height, step):
-            before, after = pictures[t, y], pictures[t + 1, y]
-            row_total = np.int64(0)
-            if step == 2:  # the usual case: with a constant step the compiler vectorises the sum
-                for x in range(0, width, 2):
-                    row_total += abs(np.int32(after[x]) - np.int32(before[x]))
-            else:
-                for x in range(0, width, step):
-                    row_total += abs(np.int32(after[x]) - np.int32(before[x]))
-            total += row_total
-        out[t] = total
-    return out
-
-
 WINDOW = 10  # Frames before and after a frame whose means are compared (chosen)
 PEAK_FRACTION = 0.15  # Part of the largest score of a column that its changes must exceed (chosen)
 # Number of frames at either end of the recording whose median shows the scene before and after growth (chosen)

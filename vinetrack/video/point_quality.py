@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
-from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.strip import Strip
 
 LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
@@ -182,7 +181,7 @@ def ending_of(
     remark, n, last = "", len(edge_px), quality.last_moving
     # 4: fewest frames of standstill at the end that are reported (chosen)
     if 0 <= last < n - 4 and quality.left_picture is None:
-        change = mean_changes(luma, 5)
+        change = np.abs(np.diff(luma[:, ::5, ::5].astype(np.int32), axis=0)).mean(axis=(1, 2))
         before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
         least, later = float(np.min(change)), float(np.median(change[last + 1 :]))
         resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]

@@ -154,16 +154,10 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: Indices, shift_px: Floats | 
         return np.ascontiguousarray(part if level else part.transpose(0, 2, 1))
     out = np.empty((len(luma), len(rows_px), n_along), luma.dtype)
     shifts = np.zeros((len(luma), 2)) if shift_px is None else shift_px
-    if axis.bends:
-        places = axis.points(np.arange(n_along, dtype=float)[None, :], rows_px[:, None].astype(float))
-        x, y = np.ascontiguousarray(np.moveaxis(places, 2, 0), dtype=np.float32)
-        for frame, cut, (dx, dy) in zip(luma, out, shifts.astype(np.float32), strict=True):
-            cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=cut, borderMode=cv2.BORDER_REPLICATE)
-        return out
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    for frame, cut, shift in zip(luma, out, shifts, strict=True):
-        matrix = np.column_stack([along, across, start + shift])  # from (along, row, 1) to x and y in the picture
-        cv2.warpAffine(frame, matrix, cut.shape[::-1], dst=cut, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    places = axis.points(np.arange(n_along, dtype=float)[None, :], rows_px[:, None].astype(float))
+    x, y = np.ascontiguousarray(np.moveaxis(places, 2, 0), dtype=np.float32)
+    for frame, cut, (dx, dy) in zip(luma, out, shifts.astype(np.float32), strict=True):
+        cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=cut, borderMode=cv2.BORDER_REPLICATE)
     return out
 
 
