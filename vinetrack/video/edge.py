@@ -568,7 +568,8 @@ def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
 
 
 STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
-CENTRED_PX = 0.5  # Largest distance from the tube's middle at which an axis is left unchanged (measured)
+# Largest distance from the tube's middle at which a line, which lies on whole rows, and a curve are left (measured)
+CENTRED_LINE_PX, CENTRED_CURVE_PX = 0.8, 0.3
 
 
 def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[Strip, Outline] | None:
@@ -585,11 +586,12 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
         tube = outline(strip, parts)
         # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
         for _ in range(3):
-            centred, distance_px = axis_of_tube(strip.axis, tube)
+            moved, distance_px = axis_of_tube(strip.axis, tube)
             room_px = (strip.values.shape[1] - 1) / 2 - tube.half_px - 3
-            if distance_px < CENTRED_PX and 0 <= room_px < 0.3 * tube.half_px + 6:
+            centred_px = CENTRED_CURVE_PX if axis.bends else CENTRED_LINE_PX
+            if distance_px < centred_px and 0 <= room_px < 0.3 * tube.half_px + 6:
                 break
-            strip = cut_strip(luma, snap_to_grid(centred), tube.half_px * 1.15 + 5, strip if axis.bends else None)
+            strip = cut_strip(luma, snap_to_grid(moved), tube.half_px * 1.15 + 5, strip if axis.bends else None)
             tube = outline(strip, parts)
         off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
     except (RecordingError, ValueError):
