@@ -32,23 +32,16 @@ class WindowMoments:
     """
 
     def __init__(self, time_s: Floats, position_m: Floats, noise_m: float, correlation: float) -> None:
-        self.noise_m = noise_m
+        self.noise_m, self.correlation = noise_m, correlation
         self.unit_s = max(float(time_s[-1] - time_s[0]), np.finfo(float).tiny) / 2
         self.u = u = (time_s - (time_s[0] + time_s[-1]) / 2) / self.unit_s
         y = position_m - position_m.mean()
         terms = np.array([np.ones_like(u), u, u**2, u**3, u**4, y, y * u, y * u**2])
         self.sums = np.pad(np.cumsum(terms, axis=1), ((0, 0), (1, 0)))
-        # Error of a curvature under AR(1) noise over that under white noise, by length of the window.
-        lengths = np.unique(np.rint(np.geomspace(3, max(time_s.size, 4), 24)).astype(int))
-        self.log_length, self.gain = np.log(lengths), np.empty(lengths.size)
-        for i, length in enumerate(lengths):
-            weights = np.linspace(-1, 1, length) ** 2
-            weights = weights - np.mean(weights)
-            self.gain[i] = _ar1_sd(weights, correlation) / float(np.sqrt(np.sum(weights**2)))
 
     def drift(self, first: Indices, last: Indices) -> tuple[Floats, Floats, Floats]:
-        """Fit a parabola to the positions in many windows at once. Returns mean lead speed, m/s; relative change of
-        speed from end to end; standard error of that. Shapes: first, last (n_windows,) → (n_windows,).
+        """Fit a parabola to the positions in many windows of one length at once. Returns mean lead speed, m/s; relative
+        change of speed from end to end; standard error of that. Shapes: first, last (n_windows,) → (n_windows,).
         """
         s = self.sums[:, last + 1] - self.sums[:, first]
         half, middle = (self.u[last] - self.u[first]) / 2, (self.u[first] + self.u[last]) / 2
@@ -74,7 +67,10 @@ class WindowMoments:
             # Speed goes from (slope − 2 curve) to (slope + 2 curve).
             drift = 4 * curve / slope
             curve_sigma = self.noise_m * np.sqrt(a11 / determinant)
-            gain = np.interp(np.log(last - first + 1), self.log_length, self.gain)
+            # Error of a curvature under AR(1) noise over that under white noise
+            weights = np.linspace(-1, 1, int(last[0] - first[0]) + 1) ** 2
+            weights -= np.mean(weights)
+            gain = _ar1_sd(weights, self.correlation) / float(np.linalg.norm(weights))
             sigma = 4 * curve_sigma * gain / np.abs(slope)
         return mean, drift, sigma
 
