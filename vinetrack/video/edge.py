@@ -582,8 +582,8 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
     # 0.08: part of its width by which an axis may slope for the strip to be cut along whole rows or columns (chosen)
     strip = first = cut_strip(luma, snap_to_grid(axis, 0.08 * axis.width_px), 0.65 * axis.width_px + 3)
     parts = max(12, round(axis.length_px / STRETCH_PX)) if axis.bends else 12
+    tube = outline(strip, parts)
     try:
-        tube = outline(strip, parts)
         # 3: most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
         for _ in range(3):
             moved, distance_px = axis_of_tube(strip.axis, tube)
@@ -591,7 +591,7 @@ def tube_strip(luma: NDArray[Any], axis: Axis, small: SmallPictures) -> tuple[St
             centred_px = CENTRED_CURVE_PX if axis.bends else CENTRED_LINE_PX
             if distance_px < centred_px and 0 <= room_px < 0.3 * tube.half_px + 6:
                 break
-            strip = cut_strip(luma, snap_to_grid(moved), tube.half_px * 1.15 + 5, strip if axis.bends else None)
+            strip = cut_strip(luma, snap_to_grid(moved), tube.half_px * 1.15 + 5, strip)
             tube = outline(strip, parts)
         off_tube = strip is not first and front_share(small, strip.axis) < LEAST_FRONT_SHARE
     except (RecordingError, ValueError):
