@@ -115,7 +115,7 @@ def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path():
     )
     by_change, _ = path_by_change(strip)
     assert np.abs(by_change - tip)[20:40].max() > 20
-    path, passed = initial_front_path(strip)
+    path, passed, _ = initial_front_path(strip)
     assert np.abs(path - tip)[18:60].max() <= 6
     assert abs(passed[0] - 40) <= 8
     assert abs(passed[1] - 290) <= 3

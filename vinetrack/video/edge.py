@@ -366,10 +366,11 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
 # leaves the smaller residual sum is used.
 
 
-def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
+def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int], NDArray[np.float32]]:
     """Find the initial path of the front, by change or by appearance, whichever leaves the smaller residual sum, and
     the columns that it leaves permanently changed; a payload may fly on beyond the end of the film. Returns column of
-    the front by frame, shape (n_frames,), px, first column passed, and the one behind the last.
+    the front by frame, shape (n_frames,), px; first column passed, and the one behind the last; and brightness of film
+    and background, shape (2, n_across, n_along).
     """
     candidates: list[tuple[Floats, tuple[int, int]]] = []
     errors: list[ValueError] = []
@@ -380,28 +381,26 @@ def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
             errors.append(error)
     if not candidates:
         raise errors[0]
-    path, passed = candidates[0]
-    if len(candidates) == 2:
-        columns = min(first for _, (first, _) in candidates), max(last for _, (_, last) in candidates)
-        by_change, by_looks = (_residual_of_path(strip, path, columns) for path, _ in candidates)
-        path, passed = candidates[int(by_looks < by_change)]
+    columns = min(first for _, (first, _) in candidates), max(last for _, (_, last) in candidates)
+    looks = [initial_state(strip, path, ASSUMED_EXPOSURE).appearance[:2] for path, _ in candidates]
+
+    def residual(path: Floats, look: NDArray[np.float32]) -> float:
+        """Residual sum of a path over those columns, with the film and background that follow from it."""
+
+        def residuals_of(first: int, last: int) -> Floats:
+            part = slice(first, last)
+            return ky.clipped_residual_sums(
+                strip.values[part], strip.scale[part], strip.offset[part], strip.noise, path[part], look, *columns
+            )
+
+        return float(np.concatenate(in_parts(residuals_of, len(strip.values), FEWEST_PICTURES)).sum())
+
+    best = int(np.argmin([residual(path, look) for (path, _), look in zip(candidates, looks, strict=True)]))
+    path, passed = candidates[best]
     end = growth_end(strip, path, passed)
     if end <= passed[0]:
         raise ValueError("what changes along the axis does not stay changed: nothing grows")
-    return path, (passed[0], end)
-
-
-def _residual_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> float:
-    """Residual sum of a path over some columns, with the film and background that follow from it."""
-    pictures = ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns)
-
-    def residuals_of(first: int, last: int) -> Floats:
-        part = slice(first, last)
-        return ky.clipped_residual_sums(
-            strip.values[part], strip.scale[part], strip.offset[part], strip.noise, path[part], pictures, *columns
-        )
-
-    return float(np.concatenate(in_parts(residuals_of, len(strip.values), FEWEST_PICTURES)).sum())
+    return path, (passed[0], end), looks[best]
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> tuple[Floats, tuple[int, int]]:
@@ -514,8 +513,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     and background gives the sides in `parts` stretches along the axis. This corrects a given axis that is, say, two
     degrees off and would cut the tube obliquely.
     """
-    path, passed = initial_front_path(strip)
-    film, background = ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *passed)
+    path, passed, look = initial_front_path(strip)
+    film, background = look[:, :, passed[0] : passed[1]]
     power = (film - background).astype(float) ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []

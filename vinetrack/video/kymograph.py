@@ -246,56 +246,12 @@ def _votes(
 
 
 @njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
-def mean_appearance(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int
-) -> np.ndarray:
-    """Return the mean brightness of each pixel in the 12 frames after (film) and before (background) the front passes.
-    Shapes: strip (n_frames, n_across, n_along); scale, offset, path (n_frames,) → (2, n_across, end − begin).
-    """
-    window, (n, rows, _) = 12, strip.shape  # frames that are averaged (derived)
-    front = np.empty(n + 1, np.int64)
-    for t in range(n):
-        front[t] = min(max(math.ceil(path[t]), begin), end)
-    front[n] = front[n - 1]
-    sums, counts = np.zeros((2, rows, end - begin), np.float32), np.zeros((2, end - begin), np.float32)
-    for t in range(n):
-        gain, level = np.float32(scale[t]), np.float32(offset[t])
-        for k in range(2):
-            # The frame of the passage and its neighbour are left out: they show the edge itself.
-            low, high = front[t + 1], front[min(t + window + 1, n)]
-            if k == 0:
-                low, high = begin if t <= window else front[t - window - 1], front[max(t - 1, 0)]
-            elif t + window + 1 >= n:
-                high = end
-            if high <= low:
-                continue
-            counts[k, low - begin : high - begin] += np.float32(1.0)
-            for u in range(rows):
-                values, row_sums = strip[t, u, low:high], sums[k, u, low - begin : high - begin]
-                for s in range(high - low):
-                    row_sums[s] += np.float32(values[s]) * gain + level
-    for k in range(2):
-        visible = np.flatnonzero(counts[k] > 0)
-        for s in range(end - begin):
-            source = s
-            if len(visible) and counts[k, s] == 0:
-                source = visible[np.argmin(np.abs(visible - s))]
-            share = 1 / max(counts[k, source], np.float32(1.0))
-            for u in range(rows):
-                if source <= s:
-                    sums[k, u, s] = sums[k, u, source] * (share if source == s else np.float32(1.0))
-                else:
-                    sums[k, u, s] = sums[k, u, source] * share
-    return sums
-
-
-@njit(nogil=True, fastmath=FASTMATH, error_model="numpy")
 def clipped_residual_sums(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, noise: float, path: np.ndarray, appearance: np.ndarray,
     begin: int, end: int,
 ) -> np.ndarray:  # fmt: skip
     """Sum the clipped squared residuals of a path: a frame against film behind it and background ahead of it. Shapes:
-    strip (n_frames, n_across, n_along); scale, offset, path (n_frames,); appearance (2, n_across, end − begin) →
+    strip (n_frames, n_across, n_along); scale, offset, path (n_frames,); appearance (2, n_across, n_along) →
     (n_frames,).
     """
     residual_clip = 3.0  # Residual, in units of the noise, at which residuals are clipped (chosen)
@@ -308,7 +264,7 @@ def clipped_residual_sums(
             row_total: Any = np.float32(0.0)
             for k in range(2):
                 low, high = (begin, front) if k == 0 else (front, end)
-                values, picture = strip[t, u, low:high], appearance[k, u, low - begin : high - begin]
+                values, picture = strip[t, u, low:high], appearance[k, u, low:high]
                 for s in range(high - low):
                     off = (np.float32(values[s]) * gain + level - picture[s]) * unit
                     row_total += min(off * off, largest_square)
