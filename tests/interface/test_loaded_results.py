@@ -166,7 +166,7 @@ def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):
         assert f"{1e3 * row.rms_position_m:.3f}" in line
         assert f"{1e3 * row.replicate_floor_m:.3f}" in line
     campaign = open_campaign(small_run)
-    assert dict(campaign.numbers) == {entry.name: entry.value for entry in loaded.fit.numbers}
+    assert campaign.stored.numbers == loaded.fit.numbers
     assert dict(campaign.floors_m) == compared.set_index("condition")["replicate_floor_m"].to_dict()
 
 
