@@ -30,7 +30,7 @@ from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, film_gain
 from vinetrack.diagnosis.missing_force import RankedLaw
-from vinetrack.diagnosis.replicates import LostFrames, with_lost_frames
+from vinetrack.diagnosis.replicates import with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, Diagnosis
 from vinetrack.diagnosis.selection import contradictions
 from vinetrack.effects import catalogue, own_effects
@@ -390,12 +390,11 @@ def test_missing_frames_are_said_first(depleted_pairs):
 
 
 def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted):
-    missing = LostFrames(("a", "b"))
-    result = with_lost_frames(depleted, missing)
+    result = with_lost_frames(depleted, {"a": False, "b": False})
     assert (result.verdict, result.effects) == (depleted.verdict, depleted.effects)
     assert result.notes[-1].code == "frames_perhaps_missing"
-    assert with_lost_frames(depleted, replace(missing, certain=("b",))).answer_set == (DROPPED_FRAMES,)
-    assert with_lost_frames(depleted, LostFrames()) is depleted
+    assert with_lost_frames(depleted, {"a": False, "b": True}).answer_set == (DROPPED_FRAMES,)
+    assert with_lost_frames(depleted, {}) is depleted
 
 
 @pytest.mark.slow

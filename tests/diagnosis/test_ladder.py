@@ -11,13 +11,14 @@ from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import diagnose, replicates, result, selection
+from vinetrack.diagnosis import diagnose, result, selection
 from vinetrack.diagnosis import ladder as ladder_module
 from vinetrack.diagnosis.between_trials import between_fits, confounded, differences, significant
-from vinetrack.diagnosis.drift import drift
+from vinetrack.diagnosis.drift import drift, per_trial_estimates
 from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
 from vinetrack.diagnosis.likelihood_ratio import Difference, robust_ratio
 from vinetrack.diagnosis.locate import locate
+from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.experiment.schema import with_names
@@ -78,8 +79,18 @@ def test_in_sample_error_and_floor_are_those_of_the_comparison(fits, pairs):
     errors = in_sample(fits[0])
     assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
     assert errors.floor[0] == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
+    # Laid on another model, replicates differ as much.
+    assert in_sample(fits[1]).floor[0] == pytest.approx(errors.floor[0], rel=0.03)
     assert (excess(5.0, 3.0), excess(1.0, 3.0)) == (4.0, 0.0)
     assert math.isnan(excess(1.0, math.nan))
+
+
+def test_replicates_that_differ_by_their_noise_alone_have_a_floor_of_that_size_however_fast_they_are():
+    """The fastest grow by 9 mm from frame to frame, and no two frames are taken at the same time since release."""
+    virtual = grown(sheet((2,), replicates=4), 72, damping_scatter=0.0, pressure_scatter=0.0)
+    found = fitted(pairs_of(virtual))
+    noise_m = np.median([trial.noise_m for trial in found.trials])
+    assert compare(found, pairs_of(virtual)).table["replicate_floor_m"].between(0.7 * noise_m, 1.3 * noise_m).all()
 
 
 @pytest.mark.slow
@@ -170,10 +181,10 @@ def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way_and_it_fail
 def test_every_trial_finds_the_b_it_was_grown_with():
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
-    values = replicates.per_trial_estimates(found, B, replicates.align_trials(found))
+    values = per_trial_estimates(found, B, align_trials(found))
     true = np.array([one.model.values[B] for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
-    away = np.log(values.value / true)
+    away = np.log(values.base / true) + values.deviation
     vines = np.array([trial.vine for trial in values.trials])
     for vine in set(vines):
         away[vines == vine] -= away[vines == vine].mean()

@@ -13,10 +13,10 @@ import vinetrack as vt
 from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
-from vinetrack.diagnosis.ladder import compare, position_errors, trajectory_table
-from vinetrack.diagnosis.replicates import OddTrial, align_replicates, odd_trials, replicates_of, with_odd_trials
+from vinetrack.diagnosis.ladder import compare, initial_fit, position_errors, trajectory_table
+from vinetrack.diagnosis.replicates import OddTrial, odd_trials, replicates_of, with_odd_trials
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.inference.fit_data import ImpreciseRest, prepare
+from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
@@ -35,59 +35,16 @@ def trial_fit(name: str, time_s: Floats, position_m: Floats, speed_m_s, release_
     )  # fmt: skip
 
 
-def grown(name: str, *, speed=1.0, noise_m=0.0, rest=30, clock_s=0.0, origin_m=0.0) -> TrialFit:
-    """A vine that speeds up as 1 − exp(−t / 20 ms) towards 2 m/s times `speed`, begun `clock_s` after its time 0."""
-    time_s = clock_s + STEP_S * np.arange(-rest, 151)
-    since_s = np.maximum(time_s - clock_s - 0.0004, 0.0)
-    noise = noise_m * np.random.default_rng(20000 + len(name)).standard_normal(time_s.size)
-    position_m = 2.0 * speed * (since_s - 0.02 * (1 - np.exp(-since_s / 0.02))) + origin_m + noise
-    return trial_fit(name, time_s, position_m, 1.9, clock_s, origin_m)
-
-
-@pytest.mark.parametrize("rest", [30, 0])
-def test_the_floor_is_the_same_for_every_model(rest):
-    """Also for one that puts trials 7 ms and 5 mm elsewhere and predicts them to grow half as fast."""
-    speeds = 1 + 0.02 * np.random.default_rng(20000).standard_normal(4)
-    trials = [grown("t" * (i + 1), speed=speed, noise_m=5e-5, rest=rest) for i, speed in enumerate(speeds)]
-    others = list(trials)
-    for i in (1, 3):
-        seen = trials[i].name, trials[i].time_s, trials[i].lead_position_m
-        others[i] = trial_fit(*seen, 0.9, trials[i].release_s + 7e-3, trials[i].origin_m + 5e-3)
-    one, other = (position_errors(each, replicates_of(each)) for each in (trials, others))
-    assert one["replicate_floor_m"] == other["replicate_floor_m"] > 0
-    assert one["replicate_floor_sigma_m"] == other["replicate_floor_sigma_m"]
-    assert one["rms_position_m"] != other["rms_position_m"]
-
-
-@pytest.mark.parametrize("rest", [30, 0])
-def test_equal_motions_with_clocks_and_origins_of_their_own_differ_by_nothing_nor_one_that_begins_in_motion(rest):
-    trials = [grown("a", rest=rest), grown("b", rest=rest, clock_s=0.31234, origin_m=0.1)]
-    # What is left is the curvature within half a frame beside the smoothed reference.
-    assert align_replicates(trials).floor_m < 2e-5
-    whole = grown("b", clock_s=0.2)
-    kept = whole.time_s > 0.2 + 0.015
-    late = trial_fit("b", whole.time_s[kept], whole.lead_position_m[kept], 1.9, whole.release_s, whole.origin_m)
-    aligned = align_replicates([grown("a"), late])
-    assert aligned.floor_m < 2e-5
-    assert aligned.release_s[1] - aligned.release_s[0] == pytest.approx(0.2, abs=5e-4)
-
-
-@pytest.mark.parametrize("vague", [True, False])
-def test_motions_of_different_speed_are_not_slid_to_where_they_agree(vague):
-    # Two motions 14 % apart in speed over 0.26 m: with the release at its best they are off by 0.14 · 0.26 m / √24 =
-    # 7 mm, less what the bend at the start makes up for. Without a rest the origin is free too: the little that they
-    # bend is then all that is left, but it is no tenth of a millimetre.
-    rest = ImpreciseRest(release_s=0.0, origin_m=0.0, sigma_m=3e-4) if vague else None
-    trials = [grown(name, speed=speed, rest=0) for name, speed in (("slow", 0.93), ("fast", 1.07))]
-    aligned = align_replicates([replace(trial, imprecise_rest=rest) for trial in trials])
-    both = aligned.present > 1
-    assert np.count_nonzero(both) > 0.79 * 151
-    assert aligned.floor_m > (5e-3 if vague else 1e-3)
+def grown(name: str, speed: float) -> TrialFit:
+    """A vine that speeds up as 1 − exp(−t / 20 ms) towards 2 m/s times `speed`."""
+    time_s = STEP_S * np.arange(-30, 151)
+    since_s = np.maximum(time_s, 0.0)
+    return trial_fit(name, time_s, 2.0 * speed * (since_s - 0.02 * (1 - np.exp(-since_s / 0.02))), 1.9, 0.0, 0.0)
 
 
 def test_its_error_is_that_of_a_standard_deviation_known_from_so_many_replicates():
     speeds = 1 + 0.02 * np.random.default_rng(20001).standard_normal((60, 3))
-    aligned = [align_replicates([grown(f"t{i}", speed=v) for i, v in enumerate(three)]) for three in speeds]
+    aligned = [replicates_of([grown(f"t{i}", speed=v) for i, v in enumerate(three)]) for three in speeds]
     floors_m = np.array([one.floor_m for one in aligned])
     # σ/√(2ν) with ν = 2 is half of σ; the scatter of a standard deviation of ν = 2 is 0.52 of its mean.
     assert floors_m.std() / floors_m.mean() == pytest.approx(0.52, abs=0.12)
@@ -106,7 +63,7 @@ def by_hand(name: str, misfit_m: np.ndarray | float, rest: int = 20, end_s: floa
 
 
 def errors_of(*trials: TrialFit) -> dict[str, float]:
-    return position_errors(trials, replicates_of(trials))
+    return position_errors(replicates_of(trials))
 
 
 def test_the_error_of_position_is_that_of_the_growth_trials_count_alike_and_one_alone_has_no_floor():
@@ -130,7 +87,7 @@ def test_the_floor_is_the_scatter_of_single_trials_for_any_number_of_them(n_tria
 
 def test_the_band_is_that_of_the_replicates():
     trials = [by_hand("a", np.full(100, 1e-3)), by_hand("b", np.full(100, -1e-3))]
-    table = trajectory_table(trials, replicates_of(trials))
+    table = trajectory_table(replicates_of(trials))
     last = table[table["trial"] == "a"].iloc[-1]
     columns = ["model_position_m", "replicates_mean_m", "lead_position_m"]
     assert last[columns].tolist() == pytest.approx([SPEED_M_S * 0.1, SPEED_M_S * 0.1, SPEED_M_S * 0.1 + 1e-3])
@@ -220,6 +177,13 @@ def adequate(campaign):
     return diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
 
 
+def test_a_fit_that_is_there_is_not_made_again(campaign, monkeypatch):
+    there = initial_fit(vt.base_model(), campaign, [vt.effects.tail_friction], profile=False)
+    monkeypatch.setattr("vinetrack.diagnosis.diagnose.initial_fit", lambda *_, **__: pytest.fail("it is made again"))
+    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False, fitted=there)
+    assert result.fits[0].numbers == there.numbers
+
+
 @pytest.mark.slow
 def test_an_odd_trial_of_an_adequate_campaign_is_a_note(adequate):
     assert adequate.verdict == "adequate"
@@ -267,7 +231,7 @@ def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(c
 def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
     """Normal scatter of 24 trials of six vines; the curves take a third of the degrees of freedom."""
     given = {"middle_speed": lambda data: data.speed, "_force_N": lambda trial, _: trial.force_N}
-    given |= {"_stated_Pa": lambda _: math.nan, "_implied_pressure_Pa": lambda *_: math.nan, "CHANCE": 1e-2}
+    given |= {"_stated_Pa": lambda _: math.nan, "CHANCE": 1e-2}
     for name, value in given.items():
         monkeypatch.setattr(f"vinetrack.diagnosis.replicates.{name}", value)
     draw, campaigns_with_odd = np.random.default_rng(20050), 0
@@ -275,7 +239,9 @@ def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
         log_speed = draw.uniform(0, 1.5, 24)
         force_N = np.exp(0.37 * log_speed + 0.05 * draw.standard_normal(24))
         named = [{"name": str(k), "vine": str(k % 6), "condition": str(k)} for k in range(24)]
-        trials = [SimpleNamespace(travel_ratio=2, force_N=force_N[k], **names) for k, names in enumerate(named)]
+        trials = [
+            SimpleNamespace(travel_ratio=2, area_m2=1.0, force_N=force_N[k], **names) for k, names in enumerate(named)
+        ]
         data = [SimpleNamespace(speed=math.exp(log_speed[k]), trial=trial) for k, trial in enumerate(trials)]
         campaigns_with_odd += bool(odd_trials(data))
     assert campaigns_with_odd <= 6

@@ -15,7 +15,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,227 +23,37 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.force_inversion import FittedMotion, acceleration_sensitivities, motions_of
-from vinetrack.diagnosis.ladder import in_sample
 from vinetrack.diagnosis.replicates import (
     LEAST_BETWEEN_TRIAL_SD,
     AlignedTrials,
-    PerTrialEstimates,
     Scatter,
-    Stretches,
     align_trials,
-    find_scatter,
-    first_that_counts,
-    per_trial_estimates,
-    scatter_sensitivities,
-    stretch_covariance,
+    orthogonal_part,
+    replicate_scatter,
+    residual_courses,
 )
-from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
-from vinetrack.inference.fit import fit_subset, rest_is_seen
+from vinetrack.inference.fit import fit_subset
 from vinetrack.inference.fit_data import FitError, FitTrial
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number, TrialFit
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, FreeParameter, Number
 from vinetrack.inference.robust_covariance import robust_covariance
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
 
 if TYPE_CHECKING:
     import pandas as pd
 
-
-# ------------------------------------------------------------------------------
-# Residuals of trials averaged over stretches of the growth, and the scatter of replicates in them.
-#
-# See `vinetrack.diagnosis.replicates`.
+log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ResidualCourse:
-    """One trial's residuals, their response to between-trial scatter, and the coordinates along the growth. From the
-    first motion on; arrays have shape (n_points,), `scatter_response` (n_points, 2).
-    """
-
-    trial: Trial
-    residual_m: Floats
-    scatter_response: Floats
-    time_s: Floats
-    lead_position_m: Floats
-    lead_velocity_m_s: Floats
-    noise_variance_m2: float
-    origin_variance_m2: float
-
-
-def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], tuple[TrialFit, ...]]:
-    """Residuals of every trial of a fit, and the trials as predicted with their own release and origin. Returns
-    courses, predicted.
-    """
-    predicted = in_sample(fit).trials
-    response = scatter_sensitivities(align_trials(fit))
-    return [_course(*members) for members in zip(predicted, response, fit.predictor.data, strict=True)], predicted
-
-
-def courses_by_condition(courses: Sequence[ResidualCourse]) -> dict[str, list[ResidualCourse]]:
-    """Courses by name of condition, in order."""
-    names = dict.fromkeys(course.trial.condition for course in courses)
-    return {name: [course for course in courses if course.trial.condition == name] for name in names}
-
-
-def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
-    """Estimate the scatter of replicates from stretches of time that all trials of a condition were recorded in."""
-    groups = courses_by_condition(courses).values()
-    return find_scatter(fit, [common_stretches(members, "time_s", common_edges(members)) for members in groups])
-
-
-def _course(trial: TrialFit, response: Floats, trial_data: FitTrial) -> ResidualCourse:
-    noise_variance_m2 = trial_data.mean_noise_m**2 * (1 + trial_data.correlation) / (1 - trial_data.correlation)
-    begin = first_that_counts(trial)
-    growth = trial.predicted_position_m - trial.origin_m
-    return ResidualCourse(
-        trial=trial.trial,
-        residual_m=trial.residual_m[begin:],
-        scatter_response=response[begin:],
-        time_s=trial.time_s[begin:] - trial.release_s,
-        lead_position_m=growth[begin:],
-        lead_velocity_m_s=trial.predicted_velocity_m_s[begin:],
-        noise_variance_m2=noise_variance_m2,
-        origin_variance_m2=noise_variance_m2 / max(trial_data.n_rest, 1),
-    )
-
-
-def common_edges(members: Sequence[ResidualCourse]) -> Floats:
-    """Edges of stretches of time that every replicate was recorded in. Shape (n_stretches + 1,)."""
-    start = max(float(member.time_s[0]) for member in members)
-    end = min(float(member.time_s[-1]) for member in members)
-    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
-    # 2: least frames of a stretch: a shorter recording is cut into fewer (derived)
-    count = max(min(MAX_STRETCHES, frames // 2), 1)
-    return np.linspace(start, max(end, start), count + 1)
-
-
-def stretch_means(course: ResidualCourse, along: str, edges: Floats) -> tuple[Floats, Floats]:
-    """Means of [residual, scatter response] in each stretch, NaN where there is no frame, and the numbers of frames.
-    Shapes: edges (n_stretches + 1,) → (n_stretches, 3).
-    """
-    values, at = np.column_stack([course.residual_m, course.scatter_response]), getattr(course, along)
-    stretch = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
-    inside = (at >= edges[0]) & (at <= edges[-1])
-    total, count = np.zeros((edges.size - 1, values.shape[1])), np.zeros(edges.size - 1)
-    np.add.at(total, stretch[inside], values[inside])
-    np.add.at(count, stretch[inside], 1.0)
-    return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], math.nan), count
-
-
-def common_stretches(members: Sequence[ResidualCourse], along: str, edges: Floats) -> Stretches:
-    """The stretches in which all members have frames. Shapes: edges (n_stretches + 1,)."""
-    parts = [stretch_means(member, along, edges) for member in members]
-    all_means = np.array([means for means, _ in parts])
-    reached = np.isfinite(all_means).all(axis=(0, 2))
-    noise = np.mean([_noise(course, count[reached]) for course, (_, count) in zip(members, parts, strict=True)], axis=0)
-    return Stretches(all_means[:, reached, 0], all_means[:, reached, 1:].mean(axis=0), noise)
-
-
-def _noise(course: ResidualCourse, count: Floats) -> Floats:
-    """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
-    return np.asarray(np.diag(course.noise_variance_m2 / np.maximum(count, 1.0)) + course.origin_variance_m2)
-
-
-def stretch_variances(course: ResidualCourse, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
-    """Variances of the means of one trial's stretches. Shape (n_stretches,)."""
-    means, count = part
-    single = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(course, count))
-    return np.diag(stretch_covariance(scatter, single))
-
-
-# ------------------------------------------------------------------------------
-# Tests of whether per-trial estimates of a parameter vary with a condition: linear trend and differences.
-
+FALSE_ALARM_LEVEL = 0.01  # Family-wise probability that any drift is called significant where nothing drifts (chosen)
 FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine the scatter of estimates (chosen)
-
-
 LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scatter of pressure and B (chosen)
-
+HALVES = (0.25, 0.75)  # Midpoints of the halves of the growth, as fractions of it (defined)
 
 # Conditions on which a parameter should not depend, as fields of a trial
 COVARIATES = tuple(COLUMNS[name].field for name in (*LIMITED["range"], *RIG))
-
-
-@dataclass(frozen=True)
-class BlockedDeviations:
-    """Deviations of coordinate x and estimate d from the weighted means of their block, and the scatter of replicates.
-    `variance` is that scatter relative to the estimates' own variances, with `dof` degrees of freedom; `chi2` is the
-    sum of squares between groups, with `groups` degrees of freedom.
-    """
-
-    x: Floats
-    d: Floats
-    weight: Floats
-    variance: float
-    dof: int
-    chi2: float
-    groups: int
-
-
-def blocked_deviations(
-    estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]
-) -> BlockedDeviations | None:
-    """Deviations from the mean of each vine (or of all), and the scatter of replicates; None without enough trials.
-    Shapes: x, levels, chosen (n_trials,).
-    """
-    conditions = np.array([trial.condition for trial in estimates.trials])
-    blocks = (
-        np.array([trial.vine for trial in estimates.trials])
-        if estimates.per_vine
-        else np.full(len(estimates.trials), "")
-    )
-    weight = 1 / estimates.variance
-    from_replicates = np.zeros(len(estimates.trials))
-    for condition in dict.fromkeys(conditions[np.isfinite(estimates.deviation)]):
-        k = np.flatnonzero((conditions == condition) & np.isfinite(estimates.deviation))
-        from_replicates[k] = estimates.deviation[k] - np.average(estimates.deviation[k], weights=weight[k])
-    known = np.isfinite(estimates.deviation)
-    dof = int(known.sum()) - len(set(conditions[known]))
-    xs, ds = x[chosen].copy(), estimates.deviation[chosen].copy()
-    w, block = weight[chosen], blocks[chosen]
-    for name in dict.fromkeys(block):
-        k = block == name
-        xs[k] -= np.average(xs[k], weights=w[k])
-        ds[k] -= np.average(ds[k], weights=w[k])
-    if not np.sum(w * xs**2) > 0:
-        return None
-    if dof >= FEWEST_DEGREES:
-        variance = float(np.sum(weight[known] * from_replicates[known] ** 2)) / dof
-    else:
-        dof = ds.size - len(set(block)) - 1
-        if dof < FEWEST_DEGREES:
-            return None
-        residual = ds - xs * np.sum(w * xs * ds) / np.sum(w * xs**2)
-        variance = float(np.sum(w * residual**2)) / dof
-    pairs = list(dict.fromkeys(zip(block, levels[chosen], strict=True)))
-    chi2 = 0.0
-    for name, level in pairs:
-        k = (block == name) & (levels[chosen] == level)
-        chi2 += float(np.sum(w[k]) * np.average(ds[k], weights=w[k]) ** 2)
-    return BlockedDeviations(xs, ds, w, max(variance, LEAST_SCATTER**2), dof, chi2, len(pairs) - len(set(block)))
-
-
-def constancy_p_value(deviations: BlockedDeviations) -> tuple[float, float]:
-    """F test of whether the groups have the same mean: its p-value, and that as a normal deviate. Returns
-    p, z : float.
-    """
-    from scipy.stats import f as fisher
-
-    if deviations.groups < 1:
-        return 1.0, 0.0
-    p = float(fisher.sf(deviations.chi2 / deviations.groups / deviations.variance, deviations.groups, deviations.dof))
-    return p, normal_deviate(p)
-
-
-def normal_deviate(p: float) -> float:
-    """The normal deviate with this two-sided p-value."""
-    from scipy.stats import norm
-
-    return float(norm.isf(max(p, 1e-300) / 2))
-
 
 DRIFT_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "from_level", "to_level", "change", "change_sigma"),
@@ -253,201 +63,6 @@ GROUP_COLUMNS = (
     *("parameter", "vine", "symbol", "unit", "against", "level", "value", "sigma", "ratio", "ratio_sigma"),
     "n_trials",
 )
-
-
-@dataclass(frozen=True)
-class ConstancyTest:
-    """A row of the table of drifts with its p-value, and the rows of its groups."""
-
-    row: dict[str, object]
-    p: float
-    groups: list[dict[str, object]]
-
-
-def _tested(
-    parameter: PerTrialEstimates | Number,
-    vine: str,
-    against: str,
-    levels: tuple[float, float],
-    change: tuple[float, float],
-    *,
-    p: float,
-    z: float,
-    dof: float,
-    n_trials: int,
-    relative: bool = False,
-    z_constancy: float = math.nan,
-    groups: Sequence[dict[str, object]] = (),
-    **told: object,
-) -> ConstancyTest:
-    """A test as a row of the table: levels from and to, the change between them and its standard error; `told` is what
-    the sentence about it needs besides.
-    """
-    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
-    numbers = (*levels, *change, relative, z, z if math.isnan(z_constancy) else z_constancy, dof, n_trials)
-    row = dict(zip(DRIFT_COLUMNS, (*of_parameter, *numbers), strict=False))
-    return ConstancyTest({**row, "sentence": remark("drifts", row=row, **told)}, p, list(groups))
-
-
-def _group(
-    parameter: PerTrialEstimates | Number,
-    vine: str,
-    against: str,
-    level: float,
-    value: tuple[float, float],
-    ratio: tuple[float, float],
-    n_trials: int,
-) -> dict[str, object]:
-    """A row of the table of groups: value and ratio to the common value, each with its standard error."""
-    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
-    return dict(zip(GROUP_COLUMNS, (*of_parameter, level, *value, *ratio, n_trials), strict=True))
-
-
-# ------------------------------------------------------------------------------
-# Tests of whether B changes along the growth, and whether the fitted yield pressure agrees with the sheet.
-#
-# B is estimated for the first and second half of the growth of each trial. The scatter of pressure and B between
-# trials is the same in both halves and cancels in their difference. An effect that builds up along the growth shows
-# here even where n and the yield pressure absorb it in every comparison between trials.
-
-
-HALVES = (0.25, 0.75)  # Midpoints of the halves, as fractions of the growth (defined)
-
-
-def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
-    """Test B for a change along the growth, for every vine and for all."""
-    if aligned.predictor.damping_column < 0:
-        return
-    halves = _halves(fit, aligned, estimates.trial_effects)
-    vines = np.array([trial.vine for trial in estimates.trials])
-    # 3.0: deviation of ln B of a half (chosen)
-    usable = (np.abs(halves) <= 3.0).all(axis=1)
-    names = list(dict.fromkeys(vines[usable]))
-    for vine in [*names, *([""] if len(names) > 1 else [])]:
-        chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
-        test = _difference_test(fit, estimates, halves, str(vine), chosen)
-        if test is not None:
-            yield test
-
-
-def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> Floats:
-    """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2), linearised about each
-    trial's own B. About the common B, the between-trial scatter would enter in second order.
-    """
-    motions = motions_of(fit, trial_effects)
-    data = aligned.predictor.data
-    columns = aligned.predictor.linearise(np.empty(0), trial_effects)
-    origin_fixed = rest_is_seen(data)
-    middles_m = [
-        0.5
-        * float(np.max(np.interp(trial_data.time_s - trial_effects[i, RELEASE], motion.time_s, motion.lead_position_m)))
-        for i, (trial_data, motion) in enumerate(zip(data, motions, strict=True))
-    ]
-    pushes = [_pushes(*pair) for pair in zip(motions, middles_m, strict=True)]
-    deviation = np.full((len(data), 2), math.nan)
-    for i, sensitivities in enumerate(acceleration_sensitivities(fit, trial_effects, motions, pushes)):
-        others = columns[i][:, [RELEASE]] if origin_fixed[i] else columns[i][:, [RELEASE, ORIGIN]]
-        if aligned.predictor.has_damping_deviation[i] and np.all(np.ptp(sensitivities, axis=0) > 0):
-            design = np.column_stack([sensitivities, others])
-            deviation[i] = np.linalg.lstsq(design, columns[i][:, -1], rcond=1e-9)[0][:2]
-    return np.asarray(deviation + trial_effects[:, [DAMPING_DEVIATION]])
-
-
-def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
-    """Derivative of the tail's acceleration by ln B in each half of the growth, m/s², shape (n_times, 2)."""
-    step = 1e-3  # Relative step of a finite difference (derived)
-    value = motion.model.values[DAMPING]
-    assert isinstance(value, float)
-    increased = motion.model.with_values({DAMPING: value * math.exp(step)})
-    y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    changed = evaluate(increased, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
-    push = (changed - motion.model_acceleration) / step
-    return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
-
-
-def _difference_test(
-    fit: Fit, estimates: PerTrialEstimates, halves: Floats, vine: str, chosen: np.ndarray
-) -> ConstancyTest | None:
-    """Student's t test of the mean difference of the halves; None without enough degrees of freedom. The groups of a
-    vine are its halves, among which the variance of their difference is divided equally.
-    """
-    from scipy.stats import t as student
-
-    rise = halves[chosen, 1] - halves[chosen, 0]
-    scatter, dof = _scatter(rise, [estimates.trials[i].condition for i in chosen])
-    if dof < FEWEST_DEGREES:
-        return None
-    # 2e-3: lower limit of the standard deviation of the rise of ln B in single trials (chosen)
-    sigma = max(scatter, 2e-3) / math.sqrt(rise.size)
-    mean = float(rise.mean())
-    p = float(2 * student.sf(abs(mean) / sigma, dof))
-    change, error = math.expm1(abs(mean)), math.exp(abs(mean)) * sigma
-    groups = []
-    if vine:
-        base = float(fit.model.parameters_for(vine)[fit.model.parameter_names.index(DAMPING)])
-        for half, level in enumerate(HALVES):
-            ratio = math.exp(float(halves[chosen, half].mean()))
-            with_error = ratio, ratio * sigma / math.sqrt(2)
-            value = base * with_error[0], base * with_error[1]
-            groups.append(_group(estimates, vine, "growth", level, value, with_error, int(chosen.size)))
-    return _tested(
-        estimates,
-        vine,
-        "growth",
-        HALVES if mean >= 0 else HALVES[::-1],
-        (change, error),
-        relative=True,
-        p=p,
-        z=normal_deviate(p),
-        dof=dof,
-        n_trials=int(chosen.size),
-        groups=groups,
-    )
-
-
-def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
-    """Standard deviation of replicates about their means, or of all trials without replicates; degrees of freedom."""
-    names = np.array(conditions)
-    deviations = values.copy()
-    for name in set(conditions):
-        deviations[names == name] -= values[names == name].mean()
-    dof = values.size - len(set(conditions))
-    if dof < FEWEST_DEGREES:
-        deviations, dof = values - values.mean(), values.size - 1
-    return math.sqrt(float(np.sum(deviations**2)) / max(dof, 1)), dof
-
-
-def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
-    """Compare fitted yield pressures with the sheet. With σ₀ that of the sheet and σ that of the fit with exact errors,
-    the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
-    fit adds to σ² for scatter and shared errors comes on top.
-    """
-    plain = np.diag(robust_covariance(fit.predictor, fit.solution)[0])
-    for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
-        variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2
-        if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:
-            continue
-        z = abs(number.value - free.start) / math.sqrt(variance)
-        yield _tested(
-            number,
-            number.vine,
-            "sheet",
-            (free.start, number.value),
-            (number.value - free.start, math.sqrt(variance)),
-            p=math.erfc(z / math.sqrt(2)),
-            z=z,
-            dof=math.inf,
-            n_trials=sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
-            stated_sigma_Pa=free.prior_sd,
-        )
-
-
-log = logging.getLogger(__name__)
-
-MOST_ITERATIONS = 15  # Maximum number of iterations of a refit (chosen)
-
-
-FALSE_ALARM_LEVEL = 0.01  # Family-wise probability that any drift is called significant where nothing drifts (chosen)
 
 
 @dataclass(frozen=True)
@@ -473,9 +88,8 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
 
     notes: list[Remark] = []
     scatter = scatter or replicate_scatter(fit, residual_courses(fit)[0])
-    tests = list(_tests(fit, scatter, notes))
+    tests = sorted(_tests(fit, scatter, notes), key=lambda tested: tested.p)
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
-    tests.sort(key=lambda tested: tested.p)
     rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
     groups = [group for test in tests for group in test.groups]
     return Drift(
@@ -498,181 +112,424 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
     return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
 
 
+@dataclass(frozen=True)
+class ConstancyTest:
+    """A row of the table of drifts with its p-value, and the rows of its groups."""
+
+    row: dict[str, object]
+    p: float
+    groups: Sequence[dict[str, object]]
+
+
 def _tests(fit: Fit, scatter: Scatter, notes: list[Remark]) -> Iterator[ConstancyTest]:
-    keys = [key for key in fit.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
-    aligned, damping = align_trials(fit), None
-    for key in keys:
+    aligned = align_trials(fit)
+    for key in fit.predictor.layout.keys:
+        if key in (YIELD_PRESSURE, EXPONENT):
+            continue
         try:
             estimates = per_trial_estimates(fit, key, aligned)
         except SimulationError:
             notes.append(remark("not_fitted_to_trials", key=key))
             continue
-        damping = estimates if key == DAMPING else damping
         for against in COVARIATES:
             yield from _against(estimates, against)
+        if key == DAMPING:
+            try:
+                yield from _along_growth(fit, estimates)
+            except SimulationError:
+                notes.append(remark("not_fitted_along_growth"))
     yield from _between_vines(fit, scatter)
     yield from against_the_sheet(fit)
-    if damping is not None:
-        try:
-            yield from along_growth(fit, aligned, damping)
-        except SimulationError:
-            notes.append(remark("not_fitted_along_growth"))
+
+
+def _tested(
+    parameter: FreeParameter | Number,
+    vine: str,
+    against: str,
+    levels: tuple[float, float],
+    change: tuple[float, float],
+    *,
+    p: float,
+    dof: float,
+    n_trials: int,
+    relative: bool = False,
+    p_constancy: float = math.nan,
+    groups: Sequence[dict[str, object]] = (),
+    **told: Any,
+) -> ConstancyTest:
+    """A test as a row of the table: levels from and to, the change between them and its standard error. `p` is the
+    p-value of a steady change, `p_constancy` that of any; `told` is what the sentence about it needs besides.
+    """
+    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
+    z, z_constancy = _normal_deviate(p), _normal_deviate(p if math.isnan(p_constancy) else p_constancy)
+    numbers = (*levels, *change, relative, z, z_constancy, dof, n_trials)
+    row = dict(zip(DRIFT_COLUMNS, (*of_parameter, *numbers), strict=False))
+    if not math.isnan(p_constancy):
+        told["steady"] = p <= p_constancy
+        p = min(1.0, 2 * min(p, p_constancy))
+    return ConstancyTest({**row, "sentence": remark("drifts", row=row, **told)}, p, groups)
+
+
+def _normal_deviate(p: float) -> float:
+    """The normal deviate with this two-sided p-value."""
+    from scipy.stats import norm
+
+    return float(norm.isf(max(p, 1e-300) / 2))
+
+
+def _group(
+    parameter: FreeParameter | Number,
+    vine: str,
+    against: str,
+    level: float,
+    value: tuple[float, float],
+    ratio: tuple[float, float],
+    n_trials: int,
+) -> dict[str, object]:
+    """A row of the table of groups: value and ratio to the common value, each with its standard error."""
+    of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
+    return dict(zip(GROUP_COLUMNS, (*of_parameter, level, *value, *ratio, n_trials), strict=True))
+
+
+# ------------------------------------------------------------------------------
+# Best-fit value of one parameter for each trial, with all other parameters at their common values.
+
+MAX_DEVIATION = 3.0  # Largest deviation from the common value, of ln B or in units of the parameter's scale (chosen)
+
+
+@dataclass(frozen=True)
+class PerTrialEstimates:
+    """Estimates of one parameter by trial; arrays of shape (n_trials,), SI, NaN where a trial does not depend on it.
+    `base` is the common value, `deviation` the difference of the best fit of the trial from it, of logarithms where the
+    parameter is `logarithmic`; `variance` is that from a typical scatter of pressure and B, up to a factor. At the best
+    fit, `trial_effects` have shape (n_trials, 4), and `columns` are the sensitivities, `nuisances` those of release and
+    origin among them.
+    """
+
+    number: FreeParameter
+    per_vine: bool
+    trials: tuple[Trial, ...]
+    base: Floats
+    deviation: Floats
+    variance: Floats
+    trial_effects: Floats
+    columns: list[Floats]
+    nuisances: list[list[int]]
+
+    @property
+    def vines(self) -> NDArray[np.str_]:
+        """Names of the vines of the trials."""
+        return np.array([trial.vine for trial in self.trials])
+
+    @property
+    def conditions(self) -> NDArray[np.str_]:
+        """Names of the conditions of the trials."""
+        return np.array([trial.condition for trial in self.trials])
+
+
+def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialEstimates:
+    """Fit the value of `key` to each trial by least squares of position, with its release free."""
+    data, common = aligned.predictor.data, fit.predictor.layout
+    place = common.index[:, common.keys.index(key)]
+    numbers = tuple(common.free[k] for k in place)
+    index = np.where(place >= 0, np.arange(len(data)), -1)[:, None]
+    layout = replace(aligned.predictor.layout, free=numbers, keys=(key,), index=index)
+    predictor = Predictor(layout, data, fit.predictor.host)
+    predictor.has_pressure_deviation[:] = False
+    base = layout.base[:, fit.model.parameter_names.index(key)]
+    start = np.array([number.to_scaled(value) for number, value in zip(numbers, base.tolist(), strict=True)])
+    theta, trial_effects = start.copy(), aligned.trial_effects.copy()
+    nuisances = [aligned.nuisances(i) for i in range(len(data))]
+    columns = predictor.linearise(theta, trial_effects)
+    # 5: Gauss–Newton steps (chosen)
+    for _ in range(5):
+        for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
+            step = np.linalg.lstsq(of_trial[:, [N_TRIAL_EFFECTS, *others]], of_trial[:, -1], rcond=1e-9)[0]
+            # 0.3, 2.0: largest step of ln B or in units of a parameter's scale, and of the release, frames (chosen)
+            theta[i] += np.clip(step[0], -0.3, 0.3)
+            trial_effects[i, RELEASE] += np.clip(step[1], -2.0 * data[i].frame_s, 2.0 * data[i].frame_s)
+            trial_effects[i, ORIGIN] += step[2] if len(step) > 2 else 0.0
+        theta = np.clip(theta, start - MAX_DEVIATION, start + MAX_DEVIATION)
+        columns = predictor.linearise(theta, trial_effects)
+    response, variance = np.empty(len(data)), np.empty(len(data))
+    for i, (of_trial, others) in enumerate(zip(columns, nuisances, strict=True)):
+        sensitivity = orthogonal_part(of_trial[:, N_TRIAL_EFFECTS], of_trial[:, others])
+        response[i] = max(float(np.sum(sensitivity**2)), 1e-300)
+        deviations = aligned.columns[i][:, [PRESSURE, DAMPING_DEVIATION]]
+        levers = sensitivity @ orthogonal_part(deviations, aligned.columns[i][:, others]) / response[i]
+        # (0.01, 0.03): typical standard deviations of pressure and ln B between trials (chosen)
+        scatter = float(np.sum((np.array((0.01, 0.03)) * levers) ** 2))
+        variance[i] = scatter + data[i].mean_noise_m ** 2 / response[i] + 1e-12
+    known = response > 1e-12 * np.array([np.ptp(each.lead_position_m) ** 2 * each.time_s.size for each in data])
+    known &= np.abs(theta - start) < 0.99 * MAX_DEVIATION
+    scale = np.array([1.0 if number.logarithmic else number.scale for number in numbers])
+    if key == DAMPING:
+        trial_effects[:, DAMPING_DEVIATION] = theta - start
+    return PerTrialEstimates(
+        number=numbers[0],
+        per_vine=any(number.key == key and number.vine for number in fit.numbers),
+        trials=tuple(trial_data.trial for trial_data in data),
+        base=base,
+        deviation=np.where(known, (theta - start) * scale, np.nan),
+        variance=variance * scale**2,
+        trial_effects=trial_effects,
+        columns=columns,
+        nuisances=nuisances,
+    )
+
+
+# ------------------------------------------------------------------------------
+# Tests of whether per-trial estimates of a parameter vary with a condition: linear trend and differences.
 
 
 def _against(estimates: PerTrialEstimates, against: str) -> Iterator[ConstancyTest]:
     """Tests of one parameter against one condition: each vine alone where the parameter is per vine, and all."""
     levels = np.array([float(getattr(trial, against)) for trial in estimates.trials])
-    usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
-    vines = np.array([trial.vine for trial in estimates.trials])
+    usable, vines = np.isfinite(levels) & np.isfinite(estimates.deviation), estimates.vines
     varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
-    if not varying:
-        if estimates.per_vine or np.unique(levels[usable]).size < 2:
-            return
-        choices = [("", usable)]
-    elif estimates.per_vine:
+    choices = [("", usable)]
+    if estimates.per_vine:
         choices = [(vine, usable & (vines == vine)) for vine in varying]
         choices += [("", usable & np.isin(vines, varying))] if len(varying) > 1 else []
-    else:
-        choices = [("", usable)]
     for vine, chosen in choices:
-        sums = blocked_deviations(estimates, _coordinate(against, levels), levels, chosen)
-        if sums is None:
-            continue
-        shown = [] if estimates.per_vine and not vine else _groups(estimates, against, levels, chosen, sums, vine)
-        yield _slope(estimates, against, levels[chosen], sums, vine, shown)
+        test = _trend(estimates, against, levels, vine, chosen)
+        if test is not None:
+            yield test
 
 
-def _coordinate(against: str, levels: Floats) -> Floats:
-    """The coordinate in which a trend is linear. Shapes: levels (n_trials,) → (n_trials,)."""
-    linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
-    return levels if linear else np.log(levels)
-
-
-def _slope(
-    estimates: PerTrialEstimates,
-    against: str,
-    levels: Floats,
-    sums: BlockedDeviations,
-    vine: str,
-    groups: list[dict[str, object]],
-) -> ConstancyTest:
+def _trend(
+    estimates: PerTrialEstimates, against: str, levels: Floats, vine: str, chosen: NDArray[np.bool_]
+) -> ConstancyTest | None:
+    """Student's t test of a linear trend of the chosen estimates, and Fisher's F test of whether all levels have the
+    same mean, about the mean of each vine or of all; None without enough trials. Shapes: levels, chosen (n_trials,).
+    """
+    from scipy.stats import f as fisher
     from scipy.stats import t as student
 
-    square = float(np.sum(sums.weight * sums.x**2))
-    slope = float(np.sum(sums.weight * sums.x * sums.d)) / square
-    sigma = math.sqrt(sums.variance / square)
-    low, high = float(levels.min()), float(levels.max())
-    reach = float(np.diff(_coordinate(against, np.array([low, high])))[0])
-    start, stop = (low, high) if slope >= 0 else (high, low)
+    linear = against in ("payload_kg", "growth_angle_rad") or not np.all(levels > 0)
+    coordinate = levels if linear else np.log(levels)
+    weight, blocks = 1 / estimates.variance, estimates.vines if estimates.per_vine else np.full(levels.size, "")
+    w, block, level = weight[chosen], blocks[chosen], levels[chosen]
+    x, d = (_centred(values[chosen], w, block) for values in (coordinate, estimates.deviation))
+    square = float(np.sum(w * x**2))
+    if not square > 0:
+        return None
+    slope = float(np.sum(w * x * d)) / square
+    variance, dof = _of_replicates(estimates.deviation, weight, estimates.conditions)
+    if dof < FEWEST_DEGREES:
+        dof = d.size - np.unique(block).size - 1
+        if dof < FEWEST_DEGREES:
+            return None
+        variance = float(np.sum(w * (d - x * slope) ** 2)) / dof
+    variance = max(variance, LEAST_SCATTER**2)
+    sigma = math.sqrt(variance / square)
+    p = float(2 * student.sf(abs(slope) / sigma, dof))
+    cells = [f"{name} {value!r}" for name, value in zip(block, level.tolist(), strict=True)]
+    between = len(set(cells)) - np.unique(block).size
+    means = d - _centred(d, w, np.array(cells))
+    chi2 = float(np.sum(w * means**2))
+    p_constancy = float(fisher.sf(chi2 / between / variance, between, dof)) if between else 1.0
+    ends = float(level.min()), float(level.max())
+    reach = float(np.ptp(coordinate[chosen]))
     change, error = abs(slope) * reach, sigma * reach
-    if estimates.logarithmic:
+    if estimates.number.logarithmic:
         change, error = math.expm1(change), math.exp(change) * error
-    p = float(2 * student.sf(abs(slope) / sigma, sums.dof))
-    p_groups, z_constancy = constancy_p_value(sums)
+    shown = not estimates.per_vine or vine
     return _tested(
-        estimates,
+        estimates.number,
         vine,
         against,
-        (start, stop),
+        ends if slope >= 0 else ends[::-1],
         (change, error),
-        relative=estimates.logarithmic,
-        p=min(1.0, 2 * min(p, p_groups)),
-        z=normal_deviate(p),
-        z_constancy=z_constancy,
-        dof=sums.dof,
-        n_trials=int(sums.x.size),
-        groups=groups,
-        steady=p <= p_groups,
+        relative=estimates.number.logarithmic,
+        p=p,
+        p_constancy=p_constancy,
+        dof=dof,
+        n_trials=d.size,
+        groups=_groups(estimates, against, levels, vine, chosen, variance) if shown else (),
     )
+
+
+def _centred(values: Floats, weight: Floats, groups: NDArray[np.str_]) -> Floats:
+    """Deviations from the weighted mean of each group. Shapes: values, weight, groups (n,) → (n,)."""
+    _, group = np.unique(groups, return_inverse=True)
+    return np.asarray(values - (np.bincount(group, weight * values) / np.bincount(group, weight))[group])
+
+
+def _of_replicates(values: Floats, weight: Floats, conditions: NDArray[np.str_]) -> tuple[float, int]:
+    """Variance of replicates about the mean of their condition, relative to 1/weight, and its degrees of freedom."""
+    known = np.isfinite(values)
+    dof = int(np.count_nonzero(known)) - np.unique(conditions[known]).size
+    apart = _centred(values[known], weight[known], conditions[known])
+    return float(np.sum(weight[known] * apart**2)) / max(dof, 1), dof
 
 
 def _groups(
     estimates: PerTrialEstimates,
     against: str,
     levels: Floats,
-    chosen: NDArray[np.bool_],
-    sums: BlockedDeviations,
     vine: str,
+    chosen: NDArray[np.bool_],
+    variance: float,
 ) -> list[dict[str, object]]:
     """Mean value of every group, with its standard error from the scatter of replicates."""
     rows = []
-    for level in np.unique(levels[chosen]):
+    for level in np.unique(levels[chosen]).tolist():
         k = np.flatnonzero(chosen & (levels == level))
         w, bases = 1 / estimates.variance[k], estimates.base[k]
-        mean = float(np.average(estimates.deviation[k], weights=w))
-        sigma = math.sqrt(sums.variance / float(np.sum(w)))
+        mean, sigma = float(np.average(estimates.deviation[k], weights=w)), math.sqrt(variance / float(np.sum(w)))
         base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
-        if estimates.logarithmic:
+        if estimates.number.logarithmic:
             ratio = math.exp(mean), math.exp(mean) * sigma
             value = base * ratio[0], base * ratio[1]
         else:
             value = base + mean, sigma
             ratio = (value[0] / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
-        rows.append(_group(estimates, vine, against, float(level), value, ratio, int(k.size)))
+        rows.append(_group(estimates.number, vine, against, level, value, ratio, k.size))
     return rows
 
 
+def _along_growth(fit: Fit, estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
+    """Test ln B for a change along the growth, for every vine and for all: Student's t test of the mean difference of
+    the halves, each fitted by itself. The scatter of pressure and B between trials is the same in both halves and
+    cancels. An effect that builds up along the growth shows here even where n and the yield pressure absorb it in every
+    comparison between trials. The groups of a vine are its halves, which share the variance of their difference.
+    """
+    from scipy.stats import t as student
+
+    halves, vines = _halves(fit, estimates), estimates.vines
+    usable = (np.abs(halves) <= MAX_DEVIATION).all(axis=1)
+    names = list(dict.fromkeys(vines[usable].tolist()))
+    for vine in [*names, *([""] if len(names) > 1 else [])]:
+        chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
+        rise = halves[chosen, 1] - halves[chosen, 0]
+        variance, dof = _of_replicates(rise, np.ones(rise.size), estimates.conditions[chosen])
+        if dof < FEWEST_DEGREES:
+            variance, dof = float(np.var(rise, ddof=1)) if rise.size > 1 else 0.0, rise.size - 1
+        if dof < FEWEST_DEGREES:
+            continue
+        # 2e-3: lower limit of the standard deviation of the rise of ln B in single trials (chosen)
+        mean, sigma = float(rise.mean()), max(math.sqrt(variance), 2e-3) / math.sqrt(rise.size)
+        groups = []
+        for level, half in zip(HALVES, halves[chosen].mean(axis=0).tolist(), strict=True):
+            ratio = math.exp(half), math.exp(half) * sigma / math.sqrt(2)
+            base = float(estimates.base[chosen[0]])
+            value = base * ratio[0], base * ratio[1]
+            groups.append(_group(estimates.number, vine, "growth", level, value, ratio, rise.size))
+        yield _tested(
+            estimates.number,
+            vine,
+            "growth",
+            HALVES if mean >= 0 else HALVES[::-1],
+            (math.expm1(abs(mean)), math.exp(abs(mean)) * sigma),
+            relative=True,
+            p=float(2 * student.sf(abs(mean) / sigma, dof)),
+            dof=dof,
+            n_trials=rise.size,
+            groups=groups if vine else (),
+        )
+
+
+def _halves(fit: Fit, estimates: PerTrialEstimates) -> Floats:
+    """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2), linearised about each
+    trial's own B. About the common B, the between-trial scatter would enter in second order.
+    """
+    motions = motions_of(fit, estimates.trial_effects)
+    pushes = list(map(_pushes, motions, fit.predictor.data, estimates.trial_effects[:, RELEASE]))
+    halves = np.full((len(motions), 2), math.nan)
+    responses = acceleration_sensitivities(fit, estimates.trial_effects, motions, pushes)
+    for i, (response, columns) in enumerate(zip(responses, estimates.columns, strict=True)):
+        if np.all(np.ptp(response, axis=0) > 0):
+            design = np.column_stack([response, columns[:, estimates.nuisances[i]]])
+            halves[i] = np.linalg.lstsq(design, columns[:, -1], rcond=1e-9)[0][:2]
+    return halves + estimates.trial_effects[:, [DAMPING_DEVIATION]]
+
+
+def _pushes(motion: FittedMotion, trial_data: FitTrial, release_s: float) -> Floats:
+    """Derivative of the tail's acceleration by ln B in each half of the growth, m/s², shape (n_times, 2)."""
+    step = 1e-3  # Relative step of a finite difference (derived)
+    y, v, value = motion.lead_position_m, motion.lead_velocity_m_s, motion.model.values[DAMPING]
+    assert isinstance(value, float)
+    increased = motion.model.with_values({DAMPING: value * math.exp(step)})
+    changed = evaluate(increased, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
+    push = ((changed - motion.model_acceleration) / step)[:, None]
+    first = (y < 0.5 * np.interp(trial_data.time_s - release_s, motion.time_s, y).max())[:, None]
+    return np.where(np.hstack([first, ~first]), push, 0.0)
+
+
+# ------------------------------------------------------------------------------
+# Parameters shared by all trials between vines, and the fitted yield pressure against the sheet.
+
+MOST_ITERATIONS = 15  # Maximum number of iterations of a refit (chosen)
+
+
 def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
-    """Test whether parameters shared by all trials differ between vines, each vine fitted alone."""
-    shared = [n.key for n in fit.numbers if not n.vine and n.key != YIELD_PRESSURE]
-    parts = list(_fit_vines(fit, scatter)) if shared else []
-    for key in shared:
-        estimates = [(vine, alone[key], len(alone.trials)) for vine, alone in parts]
-        estimates = [estimate for estimate in estimates if math.isfinite(estimate[1].sigma) and estimate[1].sigma > 0]
-        if len(estimates) > 1:
-            yield _compare_vines(fit[key], estimates)
+    """χ² test of parameters shared by all trials: each vine with several pressures is fitted alone, its between-trial
+    scatter that of replicates. The change is from the lowest to the highest value.
+    """
+    from scipy.stats import chi2 as chi_square
 
-
-def _fit_vines(fit: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
-    """Fits of each vine with several pressures alone; the between-trial scatter is that of replicates."""
+    shared = [number for number in fit.numbers if not number.vine and number.key != YIELD_PRESSURE]
     spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
     state = replace(fit.solution.state, spread=spread)
     rescaled = replace(fit, solution=replace(fit.solution, state=state))
-    for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
+    alone: dict[str, Fit] = {}
+    for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials) if shared else ():
         members = [trial for trial in fit.trials if trial.trial.vine == vine]
         if len({trial.trial.pressure_Pa for trial in members}) < 2:
             continue
         names = [trial.name for trial in members]
         try:
-            yield (
-                vine,
-                fit_subset(rescaled, names, hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS),
+            alone[vine] = fit_subset(
+                rescaled, names, hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS
             )
         except FitError:
             continue
+    for common in shared:
+        values = {vine: part[common.key] for vine, part in alone.items() if 0 < part[common.key].sigma < math.inf}
+        if len(values) < 2:
+            continue
+        precision = np.array([1 / number.sigma**2 for number in values.values()])
+        apart = _centred(np.array([number.value for number in values.values()]), precision, np.full(len(values), ""))
+        low, *_, high = ends = sorted(values.items(), key=lambda of_vine: of_vine[1].value)
+        scale = common.value or math.nan
+        yield _tested(
+            common,
+            "",
+            "vine",
+            (math.nan, math.nan),
+            (high[1].value - low[1].value, math.hypot(high[1].sigma, low[1].sigma)),
+            p=float(chi_square.sf(float(np.sum(precision * apart**2)), len(values) - 1)),
+            dof=math.inf,
+            n_trials=sum(len(alone[vine].trials) for vine in values),
+            ends=[ends[0], ends[-1]],
+            groups=[
+                _group(number, vine, "vine", math.nan, (number.value, number.sigma),
+                       (number.value / scale, number.sigma / scale), len(alone[vine].trials))
+                for vine, number in values.items()
+            ],
+        )  # fmt: skip
 
 
-def _compare_vines(common: Number, estimates: Sequence[tuple[str, Number, int]]) -> ConstancyTest:
-    """χ² test of the values of single vines against their mean; the change is from the lowest to the highest value."""
-    from scipy.stats import chi2 as chi_square
-
-    value, sigma = (np.array([getattr(number, name) for _, number, _ in estimates]) for name in ("value", "sigma"))
-    mean = float(np.average(value, weights=1 / sigma**2))
-    p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(estimates) - 1))
-    scale = common.value or math.nan
-    ordered = sorted(estimates, key=lambda estimate: estimate[1].value)
-    (_, low, _), (_, high, _) = ordered[0], ordered[-1]
-    return _tested(
-        common,
-        "",
-        "vine",
-        (math.nan, math.nan),
-        (high.value - low.value, math.hypot(high.sigma, low.sigma)),
-        p=p,
-        z=normal_deviate(p),
-        dof=math.inf,
-        n_trials=sum(count for _, _, count in estimates),
-        ends=[(vine, number) for vine, number, _ in (ordered[0], ordered[-1])],
-        groups=[
-            _group(
-                number,
-                vine,
-                "vine",
-                math.nan,
-                (number.value, number.sigma),
-                (number.value / scale, number.sigma / scale),
-                count,
-            )
-            for vine, number, count in estimates
-        ],
-    )
+def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
+    """Compare fitted yield pressures with the sheet. With σ₀ that of the sheet and σ that of the fit with exact errors,
+    the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
+    fit adds to σ² for scatter and shared errors comes on top.
+    """
+    plain = np.diag(robust_covariance(fit.predictor, fit.solution)[0])
+    for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
+        variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2
+        if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:
+            continue
+        pulled_Pa, sigma_Pa = number.value - free.start, math.sqrt(variance)
+        yield _tested(
+            number,
+            number.vine,
+            "sheet",
+            (free.start, number.value),
+            (pulled_Pa, sigma_Pa),
+            p=math.erfc(abs(pulled_Pa) / sigma_Pa / math.sqrt(2)),
+            dof=math.inf,
+            n_trials=sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
+            stated_sigma_Pa=free.prior_sd,
+        )

@@ -13,7 +13,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,7 @@ from vinetrack.core.notebook import plot
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.replicates import Replicates, align_replicates, first_that_counts, replicates_of
+from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_by_condition
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, catalogue, find_effect
@@ -82,22 +81,15 @@ def initial_fit(
 #
 # The prediction of a trial has its own release and origin, but no deviation of pressure and B, as for a trial that
 # was left out of the fit. The origin is the position at standstill; the release, and the origin where no standstill
-# was filmed, minimise the root mean square error. Replicates are aligned with their mean in the same way, without any
-# model, so that a model which lacks nothing has an error equal to the replicate floor, a ratio of 1.
+# was filmed, minimise the root mean square error. So laid on the model, replicates differ from their mean by their
+# scatter: of a model that lacks nothing the error is about the replicate floor, a ratio of 1.
 #
 # The two errors are those of the paper's Table II (Alvarez et al., 2025): of position over the whole growth, and of
 # the final speed of the leading edge.
 
 COMPARISON_COLUMNS = (
-    "model",
-    "condition",
-    "rms_position_m",
-    "rms_final_velocity_m_s",
-    "replicate_floor_m",
-    "ratio",
-    "worst_at_s",
-    "worst_at_m",
-    "replicate_floor_sigma_m",
+    *("model", "condition", "rms_position_m", "rms_final_velocity_m_s", "replicate_floor_m", "ratio", "worst_at_s"),
+    *("worst_at_m", "replicate_floor_sigma_m"),
 )
 FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at which the final speed is taken (chosen)
 
@@ -138,32 +130,35 @@ def compare(
     fitted = {trial.name for trial in fit.trials}
     chosen = [(trial, track) for trial, track in pairs_of(experiment, tracks)[0] if trial.name in fitted]
     predicted = predict_prepared(fit, prepared_pairs(chosen), from_rest=True)
-    measured = {trial.name: track for trial, track in chosen}
-    errors = _final_speed_errors(fit, predicted, measured, kinematics or {}, final_at_fraction)
+    final = _final_speed_errors(
+        fit, predicted, {trial.name: track for trial, track in chosen}, kinematics or {}, final_at_fraction
+    )
     rows, trajectories = [], {}
-    for condition in dict.fromkeys(trial.trial.condition for trial in predicted):
-        members = [trial for trial in predicted if trial.trial.condition == condition]
-        together = replicates_of(members)
-        known = [errors[trial.name] for trial in members if math.isfinite(errors[trial.name])]
+    for condition, together in replicates_by_condition(predicted).items():
+        known = [final[trial.name] for trial in together.trials if math.isfinite(final[trial.name])]
         rows.append(
             {
                 "model": "+".join(fit.model.names),
                 "condition": condition,
-                **position_errors(members, together),
+                **position_errors(together),
                 "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
-        trajectories[condition] = trajectory_table(members, together)
+        trajectories[condition] = trajectory_table(together)
     return Comparison(pd.DataFrame(rows, columns=list(COMPARISON_COLUMNS)), trajectories, tuple(predicted))
 
 
-def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[str, float]:
-    """Position errors of one condition in motion, with equal weight for every trial, however many its frames. Returns
-    columns of `comparison.csv`: m, s and ratios.
+def rms_of(trials: Iterable[TrialFit]) -> float:
+    """Root mean square position error in motion, m, with equal weight for every trial, however many its frames; NaN
+    without trials.
     """
     squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
-    rms_m = math.sqrt(float(np.mean(squares)))
-    floor_m = together.alignment.floor_m
+    return math.sqrt(float(np.mean(squares))) if squares else math.nan
+
+
+def position_errors(together: Replicates) -> dict[str, float]:
+    """Position errors of one condition: columns of `comparison.csv`, m, s and ratios."""
+    rms_m, floor_m = rms_of(together.trials), together.floor_m
     worst_at_s, worst_at_m = _worst(together)
     return {
         "rms_position_m": rms_m,
@@ -171,23 +166,21 @@ def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[st
         "ratio": rms_m / floor_m if floor_m > 0 else math.nan,
         "worst_at_s": worst_at_s,
         "worst_at_m": worst_at_m,
-        "replicate_floor_sigma_m": together.alignment.floor_sigma_m,
+        "replicate_floor_sigma_m": together.floor_sigma_m,
     }
 
 
 def _worst(together: Replicates) -> tuple[float, float]:
     """Time since release and growth where the smoothed mean residual of the replicates is largest."""
-    moving = (together.time_s >= together.begin_s) & (together.present > 0)
-    if not moving.any():
+    residual_m, time_s = together.mean_residual_m[together.moving], together.time_s[together.moving]
+    if not time_s.size:
         return math.nan, math.nan
-    residual_m, time_s = together.mean_residual_m[moving], together.time_s[moving]
     # 0.05: fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
-    half = int(0.05 * residual_m.size / 2)
+    half, places = int(0.05 * residual_m.size / 2), np.arange(residual_m.size)
     cumulative = np.concatenate([[0.0], np.cumsum(residual_m)])
-    low = np.maximum(np.arange(residual_m.size) - half, 0)
-    high = np.minimum(np.arange(residual_m.size) + half + 1, residual_m.size)
+    low, high = np.maximum(places - half, 0), np.minimum(places + half + 1, residual_m.size)
     worst = int(np.argmax(np.abs((cumulative[high] - cumulative[low]) / (high - low))))
-    return float(time_s[worst]), float((together.model_m[moving] + residual_m)[worst])
+    return float(time_s[worst]), float((together.model_m[together.moving] + residual_m)[worst])
 
 
 def _final_speed_errors(
@@ -195,7 +188,7 @@ def _final_speed_errors(
     predicted: Sequence[TrialFit],
     tracks: Mapping[str, Track],
     kinematics: Mapping[str, Kinematics],
-    at_fraction: float = FINAL_AT_FRACTION,
+    at_fraction: float,
 ) -> dict[str, float]:
     """Model minus measurement of the leading edge's final speed, m/s, by name of trial, both at the same position. A
     model that does not reach the position has stopped, and its speed there is 0. NaN where none was measured.
@@ -227,17 +220,16 @@ def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats
     return track.time_s[known] - release_s, track.pressure_Pa[known]
 
 
-def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.DataFrame:
+def trajectory_table(together: Replicates) -> pd.DataFrame:
     """Trials of one condition with the model, since release and from the origin.
     `replicates_mean_m` is the mean of the replicates at that time, `replicates_sigma_m` their standard deviation.
     """
     import pandas as pd
 
-    mean_m = together.model_m + together.mean_residual_m
-    sigma_m = np.sqrt(together.variance_m2)
+    mean_m, sigma_m = together.model_m + together.mean_residual_m, np.sqrt(together.variance_m2)
     step_s = float(np.diff(together.time_s)[0]) if together.time_s.size > 1 else 1.0
     parts = []
-    for trial in trials:
+    for trial in together.trials:
         time_s = trial.time_s - trial.release_s
         k = np.clip(np.rint((time_s - together.time_s[0]) / step_s).astype(int), 0, mean_m.size - 1)
         columns = {
@@ -252,16 +244,12 @@ def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.Dat
     return pd.concat(parts, ignore_index=True)
 
 
+# ------------------------------------------------------------------------------
+# The errors of every model of the ladder.
+
 LADDER_COLUMNS = (
-    "model",
-    "added",
-    "rms_in_sample_m",
-    "rms_left_out_m",
-    "rms_highest_pressure_m",
-    "floor_m",
-    "excess_left_out_m",
-    "floor_sigma_m",
-    "partial",
+    *("model", "added", "rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m"),
+    *("floor_sigma_m", "partial"),
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
@@ -280,64 +268,58 @@ class Errors:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square position error in motion, with equal weight for every trial; NaN without trials."""
-        squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in self.trials]
-        return math.sqrt(float(np.mean(squares))) if squares else math.nan
+        """Root mean square position error in motion, see `rms_of`."""
+        return rms_of(self.trials)
 
-    @cached_property
+    @property
     def floor(self) -> tuple[float, float]:
         """Replicate floor over all conditions with replicates, and its standard error, m; NaN where none has any. Root
         of the mean variance of the conditions, weighted by their numbers of trials; the standard error of a variance s²
         of ν degrees of freedom is s²√(2/ν).
         """
-        conditions = dict.fromkeys(trial.trial.condition for trial in self.trials)
-        squares, counts, degrees = [], [], []
-        for condition in conditions:
-            members = [trial for trial in self.trials if trial.trial.condition == condition]
-            alignment = align_replicates(members)
-            if math.isfinite(alignment.floor_m):
-                squares.append(alignment.floor_m**2)
-                counts.append(len(members))
-                degrees.append(alignment.degrees)
-        if not squares:
+        groups = [group for group in replicates_by_condition(self.trials).values() if math.isfinite(group.floor_m)]
+        if not groups:
             return math.nan, math.nan
-        share = np.array(counts) / np.sum(counts)
-        floor_m = math.sqrt(float(np.sum(share * squares)))
-        error_m2 = math.sqrt(float(np.sum((share * squares) ** 2 * 2 / np.array(degrees))))
+        counts = np.array([len(group.trials) for group in groups])
+        squares = counts / np.sum(counts) * [group.floor_m**2 for group in groups]
+        floor_m = math.sqrt(float(np.sum(squares)))
+        error_m2 = math.sqrt(float(np.sum(squares**2 * 2 / (counts - 1))))
         return floor_m, error_m2 / (2 * floor_m) if floor_m > 0 else 0.0
 
 
 def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
-    """Compute the errors of the initial model and of every enlarged one."""
+    """Compute the errors of the initial model and of every enlarged one, the last `partial` of them without a claim.
+    The floor is that of the initial model for all: replicates laid on another model scatter by the same within a few
+    per cent. `attrs["notes"]` are remarks about trials that could not be predicted.
+    """
     import pandas as pd
 
     rows: list[dict[str, object]] = []
     notes: list[Remark] = []
-    for enlarged, name in zip(fits, added, strict=True):
-        row, remarks = _ladder_row(enlarged, name)
-        row["partial"] = len(rows) >= len(fits) - partial
-        rows.append(row)
-        notes += [note for note in remarks if note not in notes]
+    inside = [in_sample(each) for each in fits]
+    floor_m, floor_sigma_m = inside[0].floor
+    for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
+        outside, highest = left_out(enlarged), highest_pressure(enlarged)
+        rows.append(
+            {
+                "model": "+".join(enlarged.model.names),
+                "added": name,
+                "rms_in_sample_m": inside[place].rms_m,
+                "rms_left_out_m": outside.rms_m,
+                "rms_highest_pressure_m": highest.rms_m,
+                "floor_m": floor_m,
+                "excess_left_out_m": excess(outside.rms_m, floor_m),
+                "floor_sigma_m": floor_sigma_m,
+                "partial": place >= len(fits) - partial,
+            }
+        )
+        for what, errors in (("conditions", outside), ("highest_pressure", highest)):
+            for reason, count in Counter(map(str, errors.not_predicted.values())).items():
+                note = remark("left_out_error_without", left_out=what, count=count, reason=reason)
+                notes += [note] if note not in notes else []
     table = pd.DataFrame(rows, columns=list(LADDER_COLUMNS))
     table.attrs["notes"] = notes
     return table
-
-
-def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[Remark]]:
-    """The row of one model, and notes about trials that could not be predicted."""
-    inside, outside, highest = in_sample(fit), left_out(fit), highest_pressure(fit)
-    floor_m, floor_sigma_m = inside.floor
-    row: dict[str, object] = {
-        "model": "+".join(fit.model.names),
-        "added": added,
-        "rms_in_sample_m": inside.rms_m,
-        "rms_left_out_m": outside.rms_m,
-        "rms_highest_pressure_m": highest.rms_m,
-        "floor_m": floor_m,
-        "excess_left_out_m": excess(outside.rms_m, floor_m),
-        "floor_sigma_m": floor_sigma_m,
-    }
-    return row, [*_notes("conditions", outside), *_notes("highest_pressure", highest)]
 
 
 def excess(rms_m: float, floor_m: float) -> float:
@@ -355,7 +337,7 @@ def left_out(fit: Fit) -> Errors:
     conditions several are left out at once, those of one vine spread over the folds.
     """
     vines = {trial.trial.condition: trial.trial.vine for trial in fit.trials}
-    conditions = list(vines) if len(vines) <= MAX_FOLDS else sorted(vines, key=lambda name: vines[name])
+    conditions = sorted(vines, key=vines.__getitem__)
     folds = [set(conditions[k::MAX_FOLDS]) for k in range(min(len(conditions), MAX_FOLDS))]
     return _combined([_held_out(fit, [trial.trial.condition in fold for trial in fit.trials]) for fold in folds])
 
@@ -384,12 +366,12 @@ def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
     undetermined = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}
     undetermined &= {number.vine for number in fit.numbers if number.key in fit.model.parameter_names}
-    predictable = [trial_data for trial_data in data if trial_data.trial.vine not in undetermined]
     not_predicted = {
         trial_data.trial.name: remark("undetermined_vine", vine=trial_data.trial.vine)
         for trial_data in data
         if trial_data.trial.vine in undetermined
     }
+    predictable = [trial_data for trial_data in data if trial_data.trial.name not in not_predicted]
     return _combined([_predicted(others, predictable), Errors((), not_predicted)])
 
 
@@ -410,14 +392,6 @@ def _combined(parts: Sequence[Errors]) -> Errors:
         tuple(trial for part in parts for trial in part.trials),
         {name: why for part in parts for name, why in part.not_predicted.items()},
     )
-
-
-def _notes(left_out: str, errors: Errors) -> list[Remark]:
-    reasons = Counter(map(str, errors.not_predicted.values()))
-    return [
-        remark("left_out_error_without", left_out=left_out, count=count, reason=reason)
-        for reason, count in reasons.items()
-    ]
 
 
 def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:

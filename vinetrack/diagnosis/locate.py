@@ -17,31 +17,25 @@ import numpy as np
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.drift import (
-    Drift,
+from vinetrack.diagnosis.drift import Drift, drift
+from vinetrack.diagnosis.ladder import excess, position_errors
+from vinetrack.diagnosis.replicates import (
+    Replicates,
     ResidualCourse,
+    Scatter,
+    Stretches,
+    by_condition,
     common_edges,
     common_stretches,
-    courses_by_condition,
-    drift,
     replicate_scatter,
+    replicates_by_condition,
     residual_courses,
-    stretch_means,
-    stretch_variances,
 )
-from vinetrack.diagnosis.ladder import excess, position_errors
-from vinetrack.diagnosis.replicates import Scatter, Stretches, replicate_z, replicates_of, stretch_covariance
 from vinetrack.diagnosis.result import MAX_STRETCHES
-from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.fit_result import Fit
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-_MEANS = ("mean_residual_m", "sigma_m", "z", "n_trials")
-TIME_COLUMNS = ("vine", "condition", "from_s", "to_s", "time_s", *_MEANS)
-POSITION_COLUMNS = ("vine", "condition", "from_m", "to_m", "lead_position_m", *_MEANS)
-SPEED_COLUMNS = ("vine", "condition", "from_m_s", "to_m_s", "lead_velocity_m_s", *_MEANS)
 
 
 @dataclass(frozen=True)
@@ -61,8 +55,13 @@ class Failure:
 
     @property
     def fails(self) -> bool:
-        """Whether the worst condition, or all together, deviate by more than the scatter of replicates."""
-        return _fail(self.by_condition["z"].to_numpy(float))
+        """Whether the largest deviate (Bonferroni), or all together (Fisher's combined test), are significant."""
+        from scipy.stats import chi2, norm
+
+        # 3.0: significance, in standard deviations, from which a model is said to fail
+        level, p = float(norm.sf(3.0)), norm.sf(self.by_condition["z"].to_numpy(float))
+        together = float(chi2.sf(-2 * np.sum(np.log(np.maximum(p, 1e-300))), 2 * p.size))
+        return bool(p.min() < level / p.size or together < level)
 
     def remarks(self) -> tuple[Remark, ...]:
         """Where the model fails most, by how much, and what drifts."""
@@ -74,37 +73,27 @@ def locate(fit: Fit) -> Failure:
     import pandas as pd
 
     courses, predicted = residual_courses(fit)
-    scatter = replicate_scatter(fit, courses)
-    of = courses_by_condition(courses)
-    conditions = list(of)
-    edges = {name: common_edges(members) for name, members in of.items()}
-    rows = []
-    for name in conditions:
-        members = [trial for trial in predicted if trial.trial.condition == name]
-        rows.append(_condition_row(members, common_stretches(of[name], "time_s", edges[name]), scatter))
-    table = pd.DataFrame(rows)
-    vines = list(dict.fromkeys(course.trial.vine for course in courses))
-    by_vine = {vine: [course for course in courses if course.trial.vine == vine] for vine in vines}
+    scatter, together = replicate_scatter(fit, courses), replicates_by_condition(predicted)
+    conditions = by_condition(courses)
+    rows = [_condition_row(together[name], common_stretches(of), scatter) for name, of in conditions.items()]
+    in_time = [(of, common_edges(of), name) for name, of in conditions.items()]
     return Failure(
         model="+".join(fit.model.names),
-        by_condition=table.sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
-        along_time=_table([(of[n], "time_s", edges[n], n) for n in conditions], TIME_COLUMNS, scatter),
-        along_position=_along("lead_position_m", of, by_vine, POSITION_COLUMNS, scatter),
-        along_speed=_along("lead_velocity_m_s", of, by_vine, SPEED_COLUMNS, scatter),
+        by_condition=pd.DataFrame(rows).sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
+        along_time=_table("time_s", "s", in_time, scatter),
+        along_position=_table("lead_position_m", "m", _parts("lead_position_m", courses), scatter),
+        along_speed=_table("lead_velocity_m_s", "m_s", _parts("lead_velocity_m_s", courses), scatter),
         scatter=scatter,
         drift=drift(fit, scatter),
     )
 
 
-def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: Scatter) -> dict[str, object]:
-    together = replicates_of(members)
-    errors = position_errors(members, together)
-    covariance = stretch_covariance(scatter, stretches)
-    mean, count = stretches.means_m.mean(axis=0), len(members)
-    sigma = np.sqrt(np.diag(covariance) / count)
+def _condition_row(together: Replicates, stretches: Stretches, scatter: Scatter) -> dict[str, object]:
+    errors, trial, count = position_errors(together), together.trials[0].trial, len(together.trials)
+    covariance = scatter.covariance(stretches.response_m, stretches.noise_m2)
+    mean_m, sigma_m = stretches.means_m.mean(axis=0), np.sqrt(np.diag(covariance) / count)
     # Replicates without enough frames at common times have no stretch means.
-    worst = int(np.argmax(np.abs(mean))) if mean.size else None
-    trial = members[0].trial
+    worst = int(np.argmax(np.abs(mean_m))) if mean_m.size else None
     return {
         "vine": trial.vine,
         "condition": trial.condition,
@@ -115,70 +104,65 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
         "floor_m": errors["replicate_floor_m"],
         "ratio": errors["ratio"],
         "excess_m": excess(errors["rms_position_m"], errors["replicate_floor_m"]),
-        "z": replicate_z(mean, covariance, count, scatter) if mean.size else 0.0,
+        "z": _replicate_z(mean_m / sigma_m, covariance, scatter) if mean_m.size else 0.0,
         "worst_at_s": errors["worst_at_s"],
         "worst_at_m": errors["worst_at_m"],
-        "worst_residual_m": math.nan if worst is None else float(mean[worst]),
-        "worst_sigma_m": math.nan if worst is None else float(sigma[worst]),
+        "worst_residual_m": math.nan if worst is None else float(mean_m[worst]),
+        "worst_sigma_m": math.nan if worst is None else float(sigma_m[worst]),
     }
 
 
-def _along(
-    along: str,
-    of: dict[str, list[ResidualCourse]],
-    by_vine: dict[str, list[ResidualCourse]],
-    columns: Sequence[str],
-    scatter: Scatter,
-) -> pd.DataFrame:
-    """Mean residuals of each condition in the same stretches, and of all trials of a vine together."""
-    parts = []
-    for members in by_vine.values():
+def _replicate_z(deviates: Floats, covariance: Floats, scatter: Scatter) -> float:
+    """Test whether between-trial scatter explains stretch means as large as observed; the p-value as a normal deviate.
+    The test statistic is the mean square of the deviates, with the effective degrees of freedom of Satterthwaite's
+    approximation, because stretches are correlated. Shapes: deviates (n,); covariance (n, n).
+    """
+    from scipy.stats import chi2, norm
+    from scipy.stats import f as fisher
+
+    sigma, square = np.sqrt(np.diag(covariance)), float(np.mean(deviates**2))
+    degrees = deviates.size**2 / float(np.sum((covariance / sigma[:, None] / sigma) ** 2))
+    p = float(fisher.sf(square, degrees, scatter.dof) if scatter.dof else chi2.sf(square * degrees, degrees))
+    return float(norm.isf(max(p, 1e-300)))
+
+
+Part = tuple[Sequence[ResidualCourse], Floats, str]
+
+
+def _parts(along: str, courses: Sequence[ResidualCourse]) -> list[Part]:
+    """Trials to average in stretches of so many edges: those of each condition, and all of a vine together (blank)."""
+    parts: list[Part] = []
+    for vine in dict.fromkeys(course.trial.vine for course in courses):
+        members = [course for course in courses if course.trial.vine == vine]
         edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), MAX_STRETCHES + 1)
-        names = dict.fromkeys(member.trial.condition for member in members)
-        parts += [(of[name], along, edges, name) for name in names] + [(members, along, edges, "")]
-    return _table(parts, columns, scatter)
+        parts += [(of, edges, name) for name, of in (*by_condition(members).items(), ("", members))]
+    return parts
 
 
-def _table(
-    parts: Sequence[tuple[Sequence[ResidualCourse], str, Floats, str]], columns: Sequence[str], scatter: Scatter
-) -> pd.DataFrame:
+def _table(along: str, unit: str, parts: Sequence[Part], scatter: Scatter) -> pd.DataFrame:
+    """Mean residual of every stretch over the trials that reach it, with its standard error."""
     import pandas as pd
 
-    rows = [row for part in parts for row in _mean_rows(*part, scatter)]
-    return pd.DataFrame(rows, columns=list(columns))
-
-
-def _mean_rows(
-    members: Sequence[ResidualCourse], along: str, edges: Floats, condition: str, scatter: Scatter
-) -> list[tuple[object, ...]]:
-    """Mean residual of every stretch over the trials that reach it, with its standard error."""
-    parts = [stretch_means(member, along, edges) for member in members]
-    both = np.array([means for means, _ in parts])
-    present = np.isfinite(both).all(axis=2)
-    variances = np.array([stretch_variances(*part, scatter) for part in zip(members, parts, strict=True)])
     rows: list[tuple[object, ...]] = []
-    for k in range(edges.size - 1):
-        reached = present[:, k]
-        if not reached.any():
-            continue
-        count = int(reached.sum())
-        mean = float(both[reached, k, 0].mean())
-        sigma = math.sqrt(float(variances[reached, k].sum())) / count
-        low, high = float(edges[k]), float(edges[k + 1])
-        middle = (low + high) / 2
-        rows.append((members[0].trial.vine, condition, low, high, middle, mean, sigma, mean / sigma, count))
-    return rows
-
-
-def _fail(z: Floats) -> bool:
-    """Whether the largest deviate (Bonferroni), or all together (Fisher's combined test), are significant."""
-    from scipy.stats import chi2, norm
-
-    # 3.0: significance, in standard deviations, from which a model is said to fail
-    level = float(norm.sf(3.0))
-    p = norm.sf(z)
-    together = float(chi2.sf(-2 * np.sum(np.log(np.maximum(p, 1e-300))), 2 * z.size))
-    return bool(p.min() < level / z.size or together < level)
+    for members, edges, condition in parts:
+        in_stretches = [member.means(along, edges) for member in members]
+        means_m = np.array([means for means, _ in in_stretches])
+        variances = np.array(
+            [
+                np.diag(scatter.covariance(np.nan_to_num(means[:, 1:]), member.noise(count)))
+                for member, (means, count) in zip(members, in_stretches, strict=True)
+            ]
+        )
+        present = np.isfinite(means_m).all(axis=2)
+        for k in np.flatnonzero(present.any(axis=0)).tolist():
+            reached, low, high = present[:, k], float(edges[k]), float(edges[k + 1])
+            count = int(reached.sum())
+            mean_m = float(means_m[reached, k, 0].mean())
+            sigma_m = math.sqrt(float(variances[reached, k].sum())) / count
+            middle = (low + high) / 2
+            rows.append((members[0].trial.vine, condition, low, high, middle, mean_m, sigma_m, mean_m / sigma_m, count))
+    columns = ("vine", "condition", f"from_{unit}", f"to_{unit}", along, "mean_residual_m", "sigma_m", "z", "n_trials")
+    return pd.DataFrame(rows, columns=list(columns))
 
 
 def _where(table: pd.DataFrame, fails: bool) -> Iterator[Remark]:

@@ -22,7 +22,6 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
-from vinetrack.diagnosis.drift import replicate_scatter, residual_courses
 from vinetrack.diagnosis.force_inversion import (
     LEAST_INFORMATION,
     PARAMETER_CUTOFF,
@@ -38,6 +37,7 @@ from vinetrack.diagnosis.force_inversion import (
 )
 from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid, standard_error
 from vinetrack.diagnosis.learned_force import LearnedForce, learned_force
+from vinetrack.diagnosis.replicates import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit

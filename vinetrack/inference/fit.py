@@ -450,15 +450,6 @@ def _aligned(
     return predictor, solution.state.trial_effects, square
 
 
-def scaled_least_squares(design: Floats, residual: Floats, least: float) -> Floats:
-    """Least squares with columns scaled to unit length; directions that are hardly determined get zero. At constant
-    speed a later release and a higher origin are collinear. Shapes: design (n_points, n_columns); residual (n_points,)
-    → (n_columns,).
-    """
-    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    return np.asarray(np.linalg.lstsq(design / length, residual, rcond=least)[0] / length)
-
-
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
     """Trials with enough frames at rest to determine where they started. Shape (n_trials,)."""
     return np.array(

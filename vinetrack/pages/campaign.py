@@ -17,7 +17,7 @@ import numpy as np
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.replicates import align_replicates, first_that_counts
+from vinetrack.diagnosis.replicates import first_that_counts, replicates_of
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
@@ -272,7 +272,7 @@ def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[st
         squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
         errors_m[name] = math.sqrt(float(np.mean(squares)))
     if floors_m is None:
-        floors_m = {name: align_replicates(trials).floor_m for name, trials in members.items()}
+        floors_m = {name: replicates_of(trials).floor_m for name, trials in members.items()}
     return Prediction(tuple(predicted), errors_m, floors_m)
 
 
