@@ -148,26 +148,21 @@ def _tested(
     against: str,
     levels: tuple[float, float],
     change: tuple[float, float],
-    *,
-    p: float,
+    p: tuple[float, ...],
     dof: float,
     n_trials: int,
-    relative: bool = False,
-    p_constancy: float = math.nan,
     groups: Sequence[dict[str, object]] = (),
+    relative: bool = False,
     **told: Any,
 ) -> ConstancyTest:
-    """A test as a row of the table: levels from and to, the change between them and its standard error. `p` is the
-    p-value of a steady change, `p_constancy` that of any; `told` is what the sentence about it needs besides.
+    """A test as a row of the table: levels from and to, the change between them and its standard error. `p` are the
+    p-values of a steady change and, where it is asked, of any; `told` is what the sentence about it needs besides.
     """
     of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
-    z, z_constancy = _normal_deviate(p), _normal_deviate(p if math.isnan(p_constancy) else p_constancy)
-    numbers = (*levels, *change, relative, z, z_constancy, dof, n_trials)
+    numbers = (*levels, *change, relative, _normal_deviate(p[0]), _normal_deviate(p[-1]), dof, n_trials)
     row = dict(zip(DRIFT_COLUMNS, (*of_parameter, *numbers), strict=False))
-    if not math.isnan(p_constancy):
-        told["steady"] = p <= p_constancy
-        p = min(1.0, 2 * min(p, p_constancy))
-    return ConstancyTest({**row, "sentence": remark("drifts", row=row, **told)}, p, groups)
+    sentence = remark("drifts", row=row, steady=p[0] <= p[-1], **told)
+    return ConstancyTest({**row, "sentence": sentence}, min(1.0, len(p) * min(p)), groups)
 
 
 def _normal_deviate(p: float) -> float:
@@ -182,13 +177,24 @@ def _group(
     vine: str,
     against: str,
     level: float,
-    value: tuple[float, float],
-    ratio: tuple[float, float],
+    base: float,
+    deviation: tuple[float, float],
     n_trials: int,
+    logarithmic: bool = False,
 ) -> dict[str, object]:
-    """A row of the table of groups: value and ratio to the common value, each with its standard error."""
+    """A row of the table of groups: value and ratio to the common value `base`, each with its standard error, from the
+    deviation, of logarithms where so, and its standard error.
+    """
+    change, sigma = deviation
+    if logarithmic:
+        ratio, ratio_sigma = math.exp(change), math.exp(change) * sigma
+        value, value_sigma = base * ratio, base * ratio_sigma
+    else:
+        value, value_sigma = base + change, sigma
+        ratio, ratio_sigma = (value / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
     of_parameter = (parameter.key, vine, parameter.symbol, parameter.unit, against)
-    return dict(zip(GROUP_COLUMNS, (*of_parameter, level, *value, *ratio, n_trials), strict=True))
+    numbers = (level, value, value_sigma, ratio, ratio_sigma, n_trials)
+    return dict(zip(GROUP_COLUMNS, (*of_parameter, *numbers), strict=True))
 
 
 # ------------------------------------------------------------------------------
@@ -329,24 +335,17 @@ def _trend(
     means = d - _centred(d, w, np.array(cells))
     chi2 = float(np.sum(w * means**2))
     p_constancy = float(fisher.sf(chi2 / between / variance, between, dof)) if between else 1.0
-    ends = float(level.min()), float(level.max())
+    low, high = float(level.min()), float(level.max())
+    ends = (low, high) if slope >= 0 else (high, low)
     reach = float(np.ptp(coordinate[chosen]))
     change, error = abs(slope) * reach, sigma * reach
     if estimates.number.logarithmic:
         change, error = math.expm1(change), math.exp(change) * error
     shown = not estimates.per_vine or vine
+    groups = _groups(estimates, against, levels, vine, chosen, variance) if shown else ()
+    number, sizes = estimates.number, (change, error)
     return _tested(
-        estimates.number,
-        vine,
-        against,
-        ends if slope >= 0 else ends[::-1],
-        (change, error),
-        relative=estimates.number.logarithmic,
-        p=p,
-        p_constancy=p_constancy,
-        dof=dof,
-        n_trials=d.size,
-        groups=_groups(estimates, against, levels, vine, chosen, variance) if shown else (),
+        number, vine, against, ends, sizes, (p, p_constancy), dof, d.size, groups, relative=number.logarithmic
     )
 
 
@@ -377,15 +376,10 @@ def _groups(
     for level in np.unique(levels[chosen]).tolist():
         k = np.flatnonzero(chosen & (levels == level))
         w, bases = 1 / estimates.variance[k], estimates.base[k]
-        mean, sigma = float(np.average(estimates.deviation[k], weights=w)), math.sqrt(variance / float(np.sum(w)))
         base = float(np.mean(bases)) if np.ptp(bases) <= 1e-9 * abs(bases[0]) else math.nan
-        if estimates.number.logarithmic:
-            ratio = math.exp(mean), math.exp(mean) * sigma
-            value = base * ratio[0], base * ratio[1]
-        else:
-            value = base + mean, sigma
-            ratio = (value[0] / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
-        rows.append(_group(estimates.number, vine, against, level, value, ratio, k.size))
+        mean, sigma = float(np.average(estimates.deviation[k], weights=w)), math.sqrt(variance / float(np.sum(w)))
+        number = estimates.number
+        rows.append(_group(number, vine, against, level, base, (mean, sigma), k.size, number.logarithmic))
     return rows
 
 
@@ -410,24 +404,15 @@ def _along_growth(fit: Fit, estimates: PerTrialEstimates) -> Iterator[ConstancyT
             continue
         # 2e-3: lower limit of the standard deviation of the rise of ln B in single trials (chosen)
         mean, sigma = float(rise.mean()), max(math.sqrt(variance), 2e-3) / math.sqrt(rise.size)
-        groups = []
-        for level, half in zip(HALVES, halves[chosen].mean(axis=0).tolist(), strict=True):
-            ratio = math.exp(half), math.exp(half) * sigma / math.sqrt(2)
-            base = float(estimates.base[chosen[0]])
-            value = base * ratio[0], base * ratio[1]
-            groups.append(_group(estimates.number, vine, "growth", level, value, ratio, rise.size))
-        yield _tested(
-            estimates.number,
-            vine,
-            "growth",
-            HALVES if mean >= 0 else HALVES[::-1],
-            (math.expm1(abs(mean)), math.exp(abs(mean)) * sigma),
-            relative=True,
-            p=float(2 * student.sf(abs(mean) / sigma, dof)),
-            dof=dof,
-            n_trials=rise.size,
-            groups=groups if vine else (),
-        )
+        base = float(estimates.base[chosen[0]])
+        groups = [
+            _group(estimates.number, vine, "growth", level, base, (half, sigma / math.sqrt(2)), rise.size, True)
+            for level, half in zip(HALVES, halves[chosen].mean(axis=0).tolist(), strict=True)
+        ]
+        p = float(2 * student.sf(abs(mean) / sigma, dof))
+        change, levels = (math.expm1(abs(mean)), math.exp(abs(mean)) * sigma), HALVES if mean >= 0 else HALVES[::-1]
+        shown = groups if vine else ()
+        yield _tested(estimates.number, vine, "growth", levels, change, (p,), dof, rise.size, shown, relative=True)
 
 
 def _halves(fit: Fit, estimates: PerTrialEstimates) -> Floats:
@@ -491,24 +476,16 @@ def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
             continue
         precision = np.array([1 / number.sigma**2 for number in values.values()])
         apart = _centred(np.array([number.value for number in values.values()]), precision, np.full(len(values), ""))
-        low, *_, high = ends = sorted(values.items(), key=lambda of_vine: of_vine[1].value)
-        scale = common.value or math.nan
-        yield _tested(
-            common,
-            "",
-            "vine",
-            (math.nan, math.nan),
-            (high[1].value - low[1].value, math.hypot(high[1].sigma, low[1].sigma)),
-            p=float(chi_square.sf(float(np.sum(precision * apart**2)), len(values) - 1)),
-            dof=math.inf,
-            n_trials=sum(len(alone[vine].trials) for vine in values),
-            ends=[ends[0], ends[-1]],
-            groups=[
-                _group(number, vine, "vine", math.nan, (number.value, number.sigma),
-                       (number.value / scale, number.sigma / scale), len(alone[vine].trials))
-                for vine, number in values.items()
-            ],
-        )  # fmt: skip
+        low, *_, high = sorted(values.items(), key=lambda of_vine: of_vine[1].value)
+        change = high[1].value - low[1].value, math.hypot(high[1].sigma, low[1].sigma)
+        p = float(chi_square.sf(float(np.sum(precision * apart**2)), len(values) - 1))
+        counts = {vine: len(alone[vine].trials) for vine in values}
+        groups = [
+            _group(each, vine, "vine", math.nan, common.value, (each.value - common.value, each.sigma), counts[vine])
+            for vine, each in values.items()
+        ]
+        n_trials, levels = sum(counts.values()), (math.nan, math.nan)
+        yield _tested(common, "", "vine", levels, change, (p,), math.inf, n_trials, groups, ends=[low, high])
 
 
 def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
@@ -522,14 +499,9 @@ def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
         if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:
             continue
         pulled_Pa, sigma_Pa = number.value - free.start, math.sqrt(variance)
+        p = math.erfc(abs(pulled_Pa) / sigma_Pa / math.sqrt(2))
+        n_trials = sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials)
+        levels, change = (free.start, number.value), (pulled_Pa, sigma_Pa)
         yield _tested(
-            number,
-            number.vine,
-            "sheet",
-            (free.start, number.value),
-            (pulled_Pa, sigma_Pa),
-            p=math.erfc(abs(pulled_Pa) / sigma_Pa / math.sqrt(2)),
-            dof=math.inf,
-            n_trials=sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
-            stated_sigma_Pa=free.prior_sd,
+            number, number.vine, "sheet", levels, change, (p,), math.inf, n_trials, stated_sigma_Pa=free.prior_sd
         )

@@ -63,6 +63,7 @@ class OddTrial:
 def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     """Find trials whose speed contradicts the sheet although the other trials agree with it."""
     from scipy.optimize import least_squares
+    from scipy.stats import t as student
 
     trials = [trial_data.trial for trial_data in data]
     if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
@@ -92,7 +93,9 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     median_deviation = float(np.median(np.abs(residual[driven]))) / 0.6745
     # 0.02: lower limit of the scatter of ln F: the scatter of careful trials (chosen)
     scatter = max(median_deviation * math.sqrt(np.count_nonzero(driven) / remaining), 0.02)
-    allowed = _limit(len(data), remaining) * scatter
+    # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
+    # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
+    allowed = scatter * float(student.isf(CHANCE / (2 * len(data)), max(0.37 * remaining + 1.0, 3.0)))
     replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
              for k, trial in enumerate(trials)]  # fmt: skip
     # Where a replicate deviates as much, the cause is physics of the condition.
@@ -107,17 +110,6 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     expected_N = np.where(np.isin(of_vine, vines), np.exp(curves @ fitted.x), math.nan)
     implied_Pa = [stated_Pa[k] + (expected_N[k] - force_N[k]) / trials[k].area_m2 for k in odd]
     return [OddTrial(trials[k].name, stated_Pa[k], float(Pa)) for k, Pa in zip(odd, implied_Pa, strict=True)]
-
-
-def _limit(count: int, remaining: int) -> float:
-    """Residual, in standard deviations, beyond which one of so many trials is an outlier (Bonferroni). `remaining` are
-    the degrees of freedom that the fitted curves leave to the residuals.
-    """
-    from scipy.stats import t
-
-    # 0.37, 1.0: efficiency of a standard deviation from the median absolute deviation, relative to that from the
-    # mean square, and degrees of freedom added to so many times those that the fitted curves leave (derived)
-    return float(t.isf(CHANCE / (2 * count), max(0.37 * remaining + 1.0, 3.0)))
 
 
 def _stated_Pa(trial_data: FitTrial) -> float:
