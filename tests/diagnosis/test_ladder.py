@@ -14,10 +14,9 @@ from vinetrack.core.records import Trial
 from vinetrack.diagnosis import diagnose, result, selection
 from vinetrack.diagnosis import ladder as ladder_module
 from vinetrack.diagnosis.between_trials import between_fits, confounded, differences, significant
-from vinetrack.diagnosis.drift import drift, per_trial_estimates
 from vinetrack.diagnosis.ladder import Errors, compare, excess, highest_pressure, in_sample, ladder, left_out
 from vinetrack.diagnosis.likelihood_ratio import Difference, robust_ratio
-from vinetrack.diagnosis.locate import locate
+from vinetrack.diagnosis.locate import drift, locate, per_trial_estimates
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of

@@ -11,7 +11,7 @@ from scipy.stats import t as student
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.drift import against_the_sheet
+from vinetrack.diagnosis.locate import against_the_sheet
 from vinetrack.inference import fit_result, optimiser, position_errors
 from vinetrack.inference import robust_covariance as sandwich
 from vinetrack.inference.optimiser import solve

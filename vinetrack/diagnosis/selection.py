@@ -27,7 +27,6 @@ from vinetrack.diagnosis.candidate_fits import (
     drop_curves,
     with_curves,
 )
-from vinetrack.diagnosis.drift import drift
 from vinetrack.diagnosis.ladder import with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
@@ -42,6 +41,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     simpler_forms,
     sizes_of,
 )
+from vinetrack.diagnosis.locate import drift
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,

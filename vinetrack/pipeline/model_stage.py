@@ -18,7 +18,6 @@ import numpy as np
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.diagnosis.drift import drift_groups
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
     LADDER_COLUMNS,
@@ -31,6 +30,7 @@ from vinetrack.diagnosis.ladder import (
     moved,
     with_host,
 )
+from vinetrack.diagnosis.locate import drift_groups
 from vinetrack.diagnosis.propose import add
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
