@@ -20,7 +20,7 @@ from vinetrack.core.tables import JsonRecord
 from vinetrack.core.units import decimals, display_unit, or_nan
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
-from vinetrack.inference.fit_data import FitError, FitTrial, ImpreciseRest
+from vinetrack.inference.fit_data import FitError, FitTrial
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -399,7 +399,6 @@ class TrialFit:
     damping_deviation_sigma: float
     noise_m: float
     band_m: Floats | None = None
-    imprecise_rest: ImpreciseRest | None = None
 
     @property
     def within_band(self) -> float:

@@ -650,5 +650,4 @@ def trial_fit(
         damping_deviation=math.expm1(trial_effects[DAMPING_DEVIATION]),
         damping_deviation_sigma=float(sigma[DAMPING_DEVIATION]),
         noise_m=math.sqrt(variance / (1 - rho**2)),
-        imprecise_rest=trial_data.imprecise_rest,
     )
