@@ -77,12 +77,12 @@ def errors(campaign: Hidden, learned: LearnedForce) -> dict[str, float]:
     force_of = true_force(campaign)
     true, alone, sigma, values, shifts = [], [], [], [], []
     for motion in learned.motions:
-        counts = (motion.lead_position_m > 0) & (motion.time_s <= motion.counts_until_s)
+        counts = (motion.lead_position_m > 0) & motion.is_visited
         chosen = np.flatnonzero(counts)[::EVERY]
         courses = (motion.time_s, motion.lead_position_m, motion.tail_velocity_m_s, motion.pressure_Pa)
         true.append(force_of(*(course[chosen] for course in courses)))
         at = [course[chosen] for course in learned.domain.values_along(motion)]
-        force_N, sigma_N = learned.best.force(at)
+        force_N, sigma_N = learned.force(at)
         alone.append(force_N)
         sigma.append(sigma_N)
         values.append(np.column_stack(at))

@@ -1,12 +1,10 @@
 """The force that a model lacks: its algebra against closed forms, hidden forces, their laws and effect files."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 from grown import FORCES, effect_file, grown, hidden_force, pairs_of, sheet
 from scipy.interpolate import BSpline
@@ -22,32 +20,28 @@ from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
-from vinetrack.inference.sensitivity import PRESSURE
+from vinetrack.inference.sensitivity import PRESSURE, RELEASE
 
-GROWTH = laws.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
+GROWTH = learned_force.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
 FAR = math.sqrt(5) / 0.4
 ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
 
 
 def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_first_value():
-    directions, variances = laws.covariance_modes(12, 0.4)
-    covariance = (directions * variances) @ directions.T
+    root = inversion.root_of_covariance(12, 0.4)
+    covariance = root @ root.T
     assert np.diag(covariance) == pytest.approx(np.ones(12))
-    # First and last splines lie at the ends: one whole apart.
-    assert covariance[0, -1] == pytest.approx(ALIKE)
-    directions, variances = laws.covariance_modes(12, 0.4, zero_at_start=True)
-    covariance = (directions * variances) @ directions.T
-    assert covariance[0] == pytest.approx(np.zeros(12), abs=1e-12)
-    assert covariance[-1, -1] == pytest.approx(1 - ALIKE**2)
+    # The second and the last but one lie at the ends: one whole apart.
+    assert covariance[1, -2] == pytest.approx(ALIKE)
+    root, ends = inversion.root_of_covariance(12, 0.4, zero_at_start=True), inversion.splines(np.array([0.0, 1.0]), 12)
+    assert ends @ root @ root.T @ ends[0] == pytest.approx(np.zeros(2), abs=1e-12)
 
 
-@pytest.mark.parametrize("knots", [np.linspace(0, 1, 18), np.array([0, 0.01, 0.05, 0.3, 0.5, 1.0])])
-def test_splines_equal_those_of_scipy(knots):
-    at = np.concatenate([np.random.default_rng(6).uniform(-0.2, 1.2, 300), knots])
-    ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
-    expected = BSpline.design_matrix(np.clip(at, 0, 1), ends, 3).toarray()
-    assert inversion.splines(at, knots) == pytest.approx(expected, abs=1e-14)
+def test_splines_equal_those_of_scipy():
+    at = np.random.default_rng(6).uniform(-0.2, 1.2, 300)
+    expected = BSpline.design_matrix(np.clip(at, 0, 1), (np.arange(16) - 3) / 9, 3).toarray()
+    assert inversion.splines(at, 12) == pytest.approx(expected, abs=1e-14)
 
 
 @pytest.mark.slow
@@ -70,51 +64,40 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
     assert np.mean(np.abs(off - np.median(off))[middle] < 0.06) > 0.8
 
 
-def seen(design: Floats, positions: Floats) -> inversion.CoefficientLikelihood:
-    square = float(positions @ positions)
-    return inversion.CoefficientLikelihood(design.T @ design, design.T @ positions, square, 0.0, 0.0)
-
-
 def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters():
     """Each length scale and amplitude by the normal distribution of the positions, weighted by its density."""
     draw = np.random.default_rng(3)
-    design = inversion.uniform_splines(draw.uniform(0, 1, 60), 12)
+    design = inversion.splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
-    choice = learned_force.marginal_likelihood(GROWTH, seen(design, positions), 1.0, 2.0)
-    assert {each.at_start for each in choice.posteriors} == {laws.ZERO_AT_START, laws.CONSTANT_AT_START}
-    evidences, normal = [], 30 * math.log(2 * math.pi)
-    for posterior in choice.posteriors:
-        logs, means, covariances = [], [], []
-        for length in laws.LENGTH_SCALES:
-            directions, variances = laws.covariance_modes(12, length, zero_at_start=True)
-            variances = np.where(variances > laws.KEPT_VARIANCE * variances.max(), variances, 0.0)
-            process = (directions * variances) @ directions.T + (posterior.at_start == laws.CONSTANT_AT_START)
-            for prior in process * (2 * laws.RELATIVE_AMPLITUDES[:, None, None]) ** 2:
-                predicted = np.eye(60) + design @ prior @ design.T
-                gain = prior @ np.linalg.solve(predicted, design).T
-                logs.append(multivariate_normal(cov=predicted).logpdf(positions))
-                means.append(gain @ positions)
-                covariances.append(prior - gain @ design @ prior)
-        evidences.append(np.mean(np.exp(logs)))
-        assert posterior.log_evidence == pytest.approx(np.log(evidences[-1]) + normal, abs=1e-6)
-        best = int(np.argmax(logs)) // laws.RELATIVE_AMPLITUDES.size
-        assert posterior.length_scales == (laws.LENGTH_SCALES[best],)
-        density = np.exp(np.array(logs) - max(logs))
-        weights = density * (density > math.exp(-learned_force.NEGLIGIBLE_LOG_RATIO))
-        weights /= weights.sum()
-        mean = weights @ means
-        spread = np.tensordot(weights, covariances, 1) + ((means - mean).T * weights) @ (means - mean)
-        assert posterior.mean == pytest.approx(mean, abs=1e-9)
-        assert posterior.covariance == pytest.approx(spread, abs=1e-9)
-    assert choice.log_evidence == pytest.approx(np.log(np.mean(evidences)) + normal, abs=1e-6)
+    sizes, hypotheses = np.geomspace(0.1, 3.0, 4), GROWTH.hypotheses
+    assert {start for start, _ in hypotheses} == {learned_force.ZERO_AT_START, learned_force.CONSTANT_AT_START}
+    modes = [GROWTH.modes(*each) for each in hypotheses]
+    found = inversion.posterior(design.T @ design, design.T @ positions, modes, sizes)
+    logs, means, covariances = [], [], []
+    for each in modes:
+        for prior in (each @ each.T) * sizes[:, None, None] ** 2:
+            predicted = np.eye(60) + design @ prior @ design.T
+            gain = prior @ np.linalg.solve(predicted, design).T
+            logs.append(multivariate_normal(cov=predicted).logpdf(positions))
+            means.append(gain @ positions)
+            covariances.append(prior - gain @ design @ prior)
+    without = multivariate_normal(cov=np.eye(60)).logpdf(positions)
+    assert found.log_evidence == pytest.approx(np.log(np.mean(np.exp(logs))) - without, abs=1e-6)
+    assert (found.hypothesis, found.amplitude) == (np.argmax(logs) // 4, sizes[np.argmax(logs) % 4])
+    density = np.exp(np.array(logs) - max(logs))
+    weights = density * (density > math.exp(-inversion.NEGLIGIBLE_LOG_RATIO))
+    weights /= weights.sum()
+    mean = weights @ means
+    spread = np.tensordot(weights, covariances, 1) + ((means - mean).T * weights) @ (means - mean)
+    assert found.mean == pytest.approx(mean, abs=1e-9)
+    assert found.covariance == pytest.approx(spread, abs=1e-9)
+    # Several sets of coefficients share the hyperparameters: of twice the same, the evidence is that of both.
+    both = inversion.posterior(np.array([design.T @ design] * 2), np.array([design.T @ positions] * 2), modes, sizes)
+    assert both.log_evidence == pytest.approx(np.log(np.mean(np.exp(2 * (np.array(logs) - without)))), abs=1e-6)
 
 
 def test_one_variable_and_two_have_equal_prior_odds():
-    design = inversion.uniform_splines(np.linspace(0, 1, 60), 12)
-    choice = learned_force.marginal_likelihood(GROWTH, seen(design, np.zeros(60)), 1.0, 2.0)
-    single = replace(choice, log_evidence=0.0)
-    pairs = [replace(single, domain=replace(DOMAINS[1], variables=("growth", other))) for other in ("speed", "time")]
-    weights = learned_force.variable_weights([single, *pairs], 1.0)
+    weights = learned_force.variable_weights(dict.fromkeys(("growth", "growth+speed", "growth+time"), 3.0))
     assert weights["growth"] == pytest.approx(0.5)
     assert weights["growth+speed"] == pytest.approx(0.25)
 
@@ -131,30 +114,37 @@ def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium():
     assert stiff[0, -1, 0] == pytest.approx(1e-10)
 
 
-def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
+def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_pressure(tmp_path):
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path)
     slowed = force_problem(vt.fit(vt.base_model(), pairs, profile=False))
-    tracks = slowed.tracks
-    domain = next(each for each in laws.candidate_domains(tracks.motions) if each.variables == ("growth", "pressure"))
-    growth, pressure = (inversion.uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
+    tracks, theta = slowed.tracks, slowed.tracks.theta
+    domains = learned_force.candidate_domains(tracks.motions)
+    domain = next(each for each in domains if each.variables == ("growth", "pressure"))
+    growth, pressure = (inversion.splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
     force = -0.5 * np.outer(*steep).ravel()
-    surface = laws.SmoothForce(domain, np.eye(domain.size))
 
-    def at(point: inversion.ForcePoint, times: int) -> inversion.ForcePoint:
+    def at(effects: Floats, motions, times: int) -> inversion.ForcePoint:
+        """The point with motions that obey the equation of motion."""
+        push = lambda motion: domain.unit_push(motion) @ force  # noqa: E731
         for _ in range(times):
-            point = inversion._with_updated_motions(slowed.fit, point)
-        return point
+            point = slowed.point(theta, effects, motions, push)
+            equations = inversion.ForceEquations(slowed, point, domain.unit_push, force)
+            defects = [columns[:, -1:] for columns in equations.accelerations]
+            moved = zip(point.motions, defects, *inversion._responses(point.motions, defects), strict=True)
+            motions = [inversion._moved(motion, *(each[:, 0] for each in change)) for motion, *change in moved]
+        return slowed.point(theta, effects, motions, push)
 
-    # Where a point far off the tracks is settled depends on where it begins.
-    settled = at(replace(tracks, force=surface, amplitude=force, motions_include_force=True), 12)
-    slope = slowed.linearised(settled).grams[0, PRESSURE, -1]
-    costs = []
+    settled = at(tracks.trial_effects, tracks.motions, 12)
+    columns = [each[:, :1] for each in settled.by_parameters]
+    (slope, *_) = inversion.acceleration_sensitivities(slowed.fit, settled.trial_effects, settled.motions, columns)
+    since_s, positions = slowed.data[0].time_s - settled.trial_effects[0, RELEASE], []
     for step in (-1e-4, 1e-4):
         effects = settled.trial_effects.copy()
         effects[0, PRESSURE] += step
-        costs.append(slowed.linearised(at(replace(settled, trial_effects=effects), 3)).cost)
-    assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.005)
+        positions.append(inversion._observed(at(effects, settled.motions, 3).motions[0], since_s)[0])
+    exact = (positions[1] - positions[0]) / 2e-4
+    assert slope[:, 0] == pytest.approx(exact, abs=0.005 * np.abs(exact).max())
 
 
 def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
@@ -222,20 +212,23 @@ def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path):
 
 
 DOMAINS = [
-    laws.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
-    laws.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
-    laws.Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
+    learned_force.Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
+    learned_force.Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
+    learned_force.Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
 ]
 
 
-def learned(domain: laws.Domain, seed: int) -> learned_force.LearnedForce:
-    coefficients = np.random.default_rng(seed).standard_normal(domain.size)
-    where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4}
-    table = pd.DataFrame([where | {"force_N": -0.1, "sigma_N": 0.01, "trials": 2, "condition": ""}])
-    surface, lengths = laws.SmoothForce(domain, np.eye(domain.size)), (1.0,) * len(domain.variables)
-    known = coefficients, np.eye(domain.size) * 1e-4, 1.0
-    best = learned_force.ForcePosterior(laws.ZERO_AT_START, 50.0, surface, lengths, *known)
-    return learned_force.LearnedForce(best, (), {domain.name: 1.0}, (), 50.0, 0.99, table, "It depends.")
+def learned(domain: learned_force.Domain, seed: int) -> learned_force.LearnedForce:
+    count = math.prod(domain.counts)
+    known = np.random.default_rng(seed).standard_normal(count), np.eye(count) * 1e-4
+    where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4, "is_visited": True}
+    motion = SimpleNamespace(**{name: np.array([value]) for name, value in where.items()})
+    motion.trial = SimpleNamespace(condition="one")
+    found, lengths = inversion.Posterior(*known, 50.0, 0, 0.1), (1.0,) * len(domain.variables)
+    weights = {domain.name: 1.0}
+    return learned_force.LearnedForce(
+        domain, found, learned_force.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, 0.0, True
+    )
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)
@@ -248,7 +241,7 @@ def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(dom
     at = [draw.uniform(low - 0.1 * (high - low), high * 1.2, 40) for low, high in ends]
     names = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
     state = SimpleNamespace(**{names[name]: value for name, value in zip(domain.variables, at, strict=True)})
-    expected = domain.basis(at) @ force.best.mean
+    expected = domain.basis(at) @ force.found.mean
     shown = effect.functions["tail_force"](state, None, 1.0)
     assert shown == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
     assert effect.functions["tail_force"](state, None, 0.0) == pytest.approx(0.0 * expected)
@@ -259,23 +252,23 @@ SCALES = {"falling_with_speed": 1.5, "fading_in_time": 0.04, "fading_along": 0.0
 BEYOND = {"beyond_a_place": (0.06, 0.1), "beyond_a_speed": (1.2, 7.8), "squared_beyond_a_speed": (1.2, 61.0)}
 LAWS = [
     *(laws.Law(name, peak=peak) for name, peak in ({"constant": 1.0, "time": 0.3} | PEAKS).items()),
-    *(laws.Law(name, n_shapes=1, scale=scale) for name, scale in SCALES.items()),
-    *(laws.Law(name, n_shapes=1, scale=scale, peak=peak) for name, (scale, peak) in BEYOND.items()),
+    *(laws.Law(name, scale=scale) for name, scale in SCALES.items()),
+    *(laws.Law(name, scale=scale, peak=peak) for name, (scale, peak) in BEYOND.items()),
     laws.Law("speed", peak=9.0, reference_area_m2=3e-4),
     laws.Law("inverse_speed", scale=2.5, peak=1.7),
-    laws.Law("patch", n_shapes=2, low=0.08, high=0.11),
+    laws.Law("patch", low=0.08, high=0.11),
     laws.Law("position", factor="speed", peak=4.0),
-    laws.Law("patch", n_shapes=2, low=0.08, high=0.11, factor="pressure", peak=3e4),
-    laws.Law("falling_with_speed", n_shapes=1, scale=1.5, factor="position"),
+    laws.Law("patch", low=0.08, high=0.11, factor="pressure", peak=3e4),
+    laws.Law("falling_with_speed", scale=1.5, factor="position"),
     laws.Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4),
-    laws.Law("periodic", n_amplitudes=2, n_shapes=1, scale=0.03),
+    laws.Law("periodic", scale=0.03),
 ]
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_the_effect_file_of_a_law_reproduces_the_law(law, tmp_path):
     path = tmp_path / f"proposed_{law.name}.py"
-    estimate = inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1)
+    estimate = inversion.ForceEstimate(0.0, np.array([-0.2, 0.1][: law.n_amplitudes]), 0.01, np.empty(0), 1.0)
     path.write_text(effect_text(RankedLaw(law, estimate, 0.0), "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]

@@ -1,24 +1,23 @@
 """Forces that a model lacks, estimated from positions: one linear problem, with all other unknowns free.
 
-Positions are linearised about motions that lie on the tracks, whatever the model says. With a force of amplitudes f,
+About motions that need not obey the model, such as those that lie on the tracks, positions are
 
-    y = J δθ + Z b_i + S f + d + e
+    y = y₀ + J δθ + Z δb_i + S f + d + e
 
 J the sensitivities to the model parameters θ, Z those to the effects b_i of trial i (release, origin, pressure, B), S
-those to the force, d the response to what the model's forces lack along these motions (their defect), and e AR(1) noise
-of the tracks. θ, b_i and f have normal priors. The trial effects are eliminated trial by trial, the model parameters
-over all trials (Schur complements), so that only equations for f remain. For the final word motions respond to the
-force in full, and the same equations give the steps.
+those to the force, f its coefficients, d the response to what the forces of the model lack along these motions (their
+defect), and e AR(1) noise of the tracks. θ and b_i have normal priors. b_i are eliminated trial by trial, θ over all
+trials (Schur complements), so that only equations for f remain. Smooth forces are splines whose coefficients are a
+Gaussian process. For the final word the motions are moved to the solution, where all is linearised again.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Protocol
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,66 +27,113 @@ from vinetrack.core.threads import njit
 from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, Scatter
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import SimulationError, Trajectory, simulate_many
+from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import eliminated, trial_effect_prior, with_diagonal
+from vinetrack.inference.marginal_likelihood import eliminated, trial_effect_prior
 from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Job
 from vinetrack.inference.whitening import whiten
 
 # ------------------------------------------------------------------------------
-# Cubic B-splines, evaluated through the four that are nonzero at each position.
+# Smooth functions of a variable from 0 to 1: cubic B-splines at even steps (de Boor 2001, ch. IX), their coefficients a
+# Gaussian process of covariance
+#
+#     a² (1 + s + s²/3) exp(−s),   s = √5 |u − u'|/ℓ
+#
+# between their centres: the Matérn kernel of order 5/2 (Rasmussen & Williams 2006, §4.2), products of it for two
+# variables. Its functions are twice differentiable. The squared-exponential kernel, whose functions are infinitely
+# smooth, gives bands that are far too narrow for a force such as a power of the growth.
 
-N_NONZERO = 4  # Cubic splines that are nonzero between two knots (derived)
+# Length scales ℓ that are averaged over, as parts of the range (chosen)
+LENGTH_SCALES = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
+
+KEPT_VARIANCE = 1e-6  # Relative variance below which a mode is dropped (chosen)
+NEGLIGIBLE_LOG_RATIO = 5.0  # Log-likelihood below the best at which hyperparameters are left out of the mean (chosen)
 
 
-@lru_cache(maxsize=64)
-def _pieces(knots: tuple[float, ...]) -> tuple[Floats, Floats]:
-    """Knots, and the polynomials of the nonzero splines on each interval, shape (n_knots − 1, power, spline)."""
-    from scipy.interpolate import BSpline, PPoly
-
-    ends = np.array([knots[0]] * 3 + [*knots] + [knots[-1]] * 3)
-    polynomials = np.array([PPoly.from_spline(BSpline(ends, unit, 3)).c[::-1] for unit in np.eye(len(knots) + 2)])
-    pieces = [polynomials[k : k + N_NONZERO, :, 3 + k].T for k in range(len(knots) - 1)]
-    return np.array(knots), np.array(pieces)
+def splines(at: Floats, count: int) -> Floats:
+    """Design matrix of the splines; constant beyond 0 and 1. Shapes: at (n,) → (n, count)."""
+    d = np.abs((count - 3) * np.clip(at, 0.0, 1.0)[:, None] + 1.0 - np.arange(count))
+    return np.asarray((np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0)
 
 
-def nonzero_splines(at: Floats, knots: tuple[float, ...]) -> tuple[np.ndarray, Floats]:
-    """Indices and values of the splines that are nonzero at each position; constant beyond the end knots. Returns first
-    (the first of the four nonzero splines, of n_knots + 2), values (of these four; they sum to 1). Shapes: at (n,) →
-    (n,).
+@lru_cache(maxsize=256)
+def root_of_covariance(count: int, length: float, zero_at_start: bool = False) -> Floats:
+    """Modes of the splines' coefficients at unit amplitude: a square root of their covariance, shape (count, count).
+    `zero_at_start` conditions the function on being 0 at 0.
     """
-    breaks, pieces = _pieces(knots)
-    inside = np.clip(at, breaks[0], breaks[-1])
-    first = np.clip(np.searchsorted(breaks, inside, side="right") - 1, 0, len(pieces) - 1)
-    offset = inside - breaks[first]
-    polynomials = pieces[first]
-    values = polynomials[:, 3]
-    for power in (2, 1, 0):
-        values = values * offset[:, None] + polynomials[:, power]
-    return first, values
+    steps = np.arange(count)
+    s = math.sqrt(5) * np.abs(steps[:, None] - steps) / ((count - 3) * length)
+    covariance = (1 + s + s**2 / 3) * np.exp(-s)
+    if zero_at_start:
+        at_start = splines(np.zeros(1), count)[0]
+        with_start = covariance @ at_start
+        covariance = covariance - np.outer(with_start, with_start) / (at_start @ with_start)
+    variances, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(variances, 0.0)))
 
 
-def splines(at: Floats, knots: Floats) -> Floats:
-    """Design matrix of cubic B-splines on these knots; constant beyond the end knots. Shapes: at (n,); knots (n_knots,)
-    → (n, n_knots + 2).
+def product_of_modes(roots: Sequence[Floats]) -> Floats:
+    """Modes of a product of processes, without those of negligible variance, shape (n_splines, n_modes)."""
+    modes = roots[0] if len(roots) == 1 else np.kron(*roots)
+    variances = np.sum(modes**2, axis=0)
+    return np.asarray(modes[:, variances > KEPT_VARIANCE * variances.max()])
+
+
+class Posterior(NamedTuple):
+    """Coefficients given data, averaged over priors and amplitudes by their likelihood. Shapes: mean (..., q),
+    covariance (..., q, q). `log_evidence` is relative to coefficients of 0; `hypothesis`, the place of a prior, and
+    `amplitude` are the most likely.
     """
-    first, values = nonzero_splines(at, tuple(np.asarray(knots).tolist()))
-    design = np.zeros((len(first), len(knots) + 2))
-    np.put_along_axis(design, first[:, None] + np.arange(N_NONZERO), values, axis=1)
-    return design
+
+    mean: Floats
+    covariance: Floats
+    log_evidence: float
+    hypothesis: int
+    amplitude: float
 
 
-def uniform_splines(at: Floats, count: int) -> Floats:
-    """Cubic B-splines on 0 to 1 with evenly spaced knots. Shapes: at (n,) → (n, count)."""
-    return splines(at, np.array(uniform_knots(count)))
+def posterior(
+    information: Floats, score: Floats, priors: Sequence[Floats], amplitudes: Floats, log_odds: Sequence[float] = ()
+) -> Posterior:
+    """Average over priors, given by their modes, and amplitudes, the same for all sets of coefficients. For given modes
+    the information is diagonalised, so that the amplitude only changes how much each component is shrunk. Shapes:
+    information (..., q, q); score (..., q); priors (q, n_modes); amplitudes (n_amplitudes,); log_odds (n_priors,).
+    """
+    odds = np.array(log_odds or [0.0] * len(priors))
+    gained, components = [], []
+    for modes in priors:
+        values, vectors = np.linalg.eigh(modes.T @ information @ modes)
+        directions = modes @ vectors
+        along = (score[..., None, :] @ directions)[..., 0, :]
+        sizes = amplitudes.reshape(-1, *[1] * along.ndim) ** 2
+        widening = 1 + sizes * np.maximum(values, 0.0)
+        shrunk = sizes / widening
+        gains = 0.5 * (shrunk * along**2 - np.log(widening))
+        gained.append(gains.reshape(len(amplitudes), -1).sum(axis=1))
+        components.append((directions, shrunk, shrunk * along))
+    logs = np.array(gained) + odds[:, None]
+    prior, amplitude = divmod(int(np.argmax(logs)), len(amplitudes))
+    likelihood = np.exp(logs - logs.max())
+    weights = np.where(logs > logs.max() - NEGLIGIBLE_LOG_RATIO, likelihood, 0.0)
+    weights /= weights.sum()
+    mean, second_moment = np.zeros_like(score), np.zeros_like(information)
+    for of_prior, (directions, variances, means) in zip(weights, components, strict=True):
+        for weight, variance, along in zip(of_prior, variances, means, strict=True):
+            if weight > 0:
+                each = (directions @ along[..., None])[..., 0]
+                mean += weight * each
+                second_moment += weight * (directions * variance[..., None, :]) @ np.swapaxes(directions, -1, -2)
+                second_moment += weight * each[..., :, None] * each[..., None, :]
+    evidence = float(logs.max()) + math.log(float(likelihood.sum() / (np.exp(odds).sum() * len(amplitudes))))
+    covariance = second_moment - mean[..., :, None] * mean[..., None, :]
+    return Posterior(mean, covariance, evidence, prior, float(amplitudes[amplitude]))
 
 
-@lru_cache
-def uniform_knots(count: int) -> tuple[float, ...]:
-    """Knots of `uniform_splines`."""
-    return tuple(np.linspace(0.0, 1.0, count - 2).tolist())
+def standard_error(basis: Floats, covariance: Floats) -> Floats:
+    """Standard error of linear combinations of coefficients. Shapes: basis (n, q); covariance (q, q) → (n,)."""
+    return np.asarray(np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis)))
 
 
 # ------------------------------------------------------------------------------
@@ -125,31 +171,30 @@ def integrate_responses(
 
 
 # ------------------------------------------------------------------------------
-# Sensitivities of the fitted trajectories to a small added force on the tail.
+# Motions, and the sensitivities of their positions to a small added force on the tail.
 #
 # Linearised about a motion x(t), the equation of motion m ẍ = F(x, ẋ, t) + f becomes the variational equation
 #
 #     δẍ = (∂a/∂x) δx + (∂a/∂ẋ) δẋ + f/m,   a = F/m
 #
 # It is linear in f, so that the responses to many forces of any shape are integrated together, with no model compiled
-# for them. The derivatives are finite differences of the model's own terms (`vinetrack.dynamics.audit`). For a force
-# that is not small the motion is corrected and linearised again (Newton's method in function space, Kantorovich; also
-# known as quasilinearisation).
+# for them. The derivatives are finite differences of the model's own terms (`vinetrack.dynamics.audit`).
 
 N_STEPS = 400  # Steps of a motion, denser at its start (derived)
 
 # Diagonal coefficient of the two-stage, second-order, L-stable method of Alexander, SIAM J. Numer
 SDIRK_GAMMA = 1 - 1 / math.sqrt(2)
 
-
 # Part of the highest speed below which a vine counts as standing still and does not respond to a small force (chosen)
 LEAST_RELATIVE_SPEED = 1e-3
+
+MOST_OF_LENGTH = 0.96  # Part of the length up to which points are used: a moved motion does not end as its model would
 
 
 @dataclass(frozen=True)
 class FittedMotion:
-    """The motion of one trial on a fine grid since release; arrays have shape (N_STEPS + 1,), SI. `mass_kg` is all
-    moving mass; `stiffness` and `friction` are ∂a/∂x and ∂a/∂ẋ.
+    """The motion of one trial on a fine grid since release; arrays have shape (N_STEPS + 1,), SI. `model` and `trial`
+    are those of its parameters; `mass_kg` is all moving mass; `stiffness` and `friction` are ∂a/∂x and ∂a/∂ẋ.
     """
 
     trial: Trial
@@ -158,16 +203,16 @@ class FittedMotion:
     time_s: Floats
     lead_position_m: Floats
     lead_velocity_m_s: Floats
-    pressure_Pa: Floats
-    mass_kg: Floats
-    stiffness: Floats
-    friction: Floats
-    model_acceleration: Floats
     acceleration: Floats
     observed_slope: Floats
     observation_offset_m: Floats
     end_s: float
-    counts_until_s: float = math.inf
+    counts_until_s: float
+    pressure_Pa: Floats
+    mass_kg: Floats
+    model_acceleration: Floats
+    stiffness: Floats
+    friction: Floats
 
     @property
     def tail_position_m(self) -> Floats:
@@ -179,12 +224,21 @@ class FittedMotion:
         """Velocity of the tail, r·ẏ, m/s."""
         return self.trial.travel_ratio * self.lead_velocity_m_s
 
+    @property
+    def is_visited(self) -> NDArray[np.bool_]:
+        """Steps within the track, shape (N_STEPS + 1,)."""
+        return self.time_s <= self.counts_until_s
+
+
+# A force along a motion, N, shape (n_times,); and those of unit coefficients, shape (n_times, n_coefficients)
+Push = Callable[[FittedMotion], Floats]
+
 
 def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
     """Simulate the fitted motions with given trial effects. Shapes: trial_effects (n_trials, 4)."""
     predictor = fit.predictor
     jobs = predictor.jobs(fit.solution.state.theta, trial_effects)
-    trials = [trial_of_job(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
+    trials = [_trial_of_job(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
     # 3.0: frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
     grids = [
         max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + 3.0 * trial_data.frame_s, 1e-6)
@@ -201,7 +255,7 @@ def motions_of(fit: Fit, trial_effects: Floats) -> list[FittedMotion]:
     return [_motion(fit.model, *run) for run in zip(trials, jobs, runs, traces, strict=True)]
 
 
-def trial_of_job(trial: Trial, job: Job) -> Trial:
+def _trial_of_job(trial: Trial, job: Job) -> Trial:
     """The trial with the pressure and yield pressure that its job simulates."""
     yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
     return replace(trial, pressure_Pa=trial.pressure_Pa * (1 + job.pressure_deviation), yield_pressure_Pa=yield_Pa)
@@ -213,44 +267,50 @@ def _motion(model: Model, trial: Trial, job: Job, run: Trajectory, trace: tuple[
     if measured is None and any("chamber_rate" in effect.functions for effect in model):
         # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher order.
         measured = evaluate(model, trial, run.time_s, run.lead_position_m, run.lead_velocity_m_s).pressure_Pa
+    # Derivative of the observed position by the true position of the leading edge; 1 where it stands still
+    velocity = np.gradient(run.lead_position_m, run.time_s)
+    moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
+    slope = np.where(moving, np.gradient(run.observed_position_m, run.time_s) / np.where(moving, velocity, 1.0), 1.0)
     zeros = np.zeros_like(run.time_s)
-    unevaluated = FittedMotion(trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, zeros,
-                  zeros, zeros, zeros, zeros, zeros, _observed_slope(run),
-                  run.observed_position_m - run.lead_position_m,
-                  run.end_time_s if run.status == "ended" else math.inf)  # fmt: skip
-    motion = with_model_terms(unevaluated)
+    motion = with_terms(
+        FittedMotion(
+            trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, zeros, slope,
+            run.observed_position_m - run.lead_position_m,
+            end_s=run.end_time_s if run.status == "ended" else math.inf, counts_until_s=math.inf,
+            pressure_Pa=zeros, mass_kg=zeros, model_acceleration=zeros, stiffness=zeros, friction=zeros,
+        )
+    )  # fmt: skip
     return replace(motion, acceleration=motion.model_acceleration)
 
 
-def with_model_terms(motion: FittedMotion) -> FittedMotion:
-    """The motion with acceleration, mass, stiffness and friction of the model evaluated along it."""
+def _accelerated(motion: FittedMotion, push: Push | None) -> tuple[FittedMotion, Floats]:
+    """The motion with the terms of its model evaluated along it, and the acceleration by model and added force."""
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
-    at_motion, further, faster = (
-        evaluate(motion.model, motion.trial, motion.time_s, *at, measured_Pa=motion.measured_Pa)
-        for at in ((y, v), (y + step_y, v), (y, v + step_v))
+    terms = evaluate(motion.model, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
+    motion = replace(
+        motion,
+        pressure_Pa=np.broadcast_to(terms.pressure_Pa, y.shape),
+        mass_kg=np.broadcast_to(terms.inertia_kg, y.shape),
+        model_acceleration=np.asarray(terms.acceleration_m_s2),
     )
-    r = motion.trial.travel_ratio
+    return motion, motion.model_acceleration + (0.0 if push is None else push(motion) / motion.mass_kg)
+
+
+def with_terms(motion: FittedMotion, push: Push | None = None) -> FittedMotion:
+    """The motion with the terms of its model evaluated along it; stiffness and friction include an added force."""
+    y, v, r = motion.lead_position_m, motion.lead_velocity_m_s, motion.trial.travel_ratio
+    step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
+    there, acceleration = _accelerated(motion, push)
+    _, further = _accelerated(replace(motion, lead_position_m=y + step_y), push)
+    _, faster = _accelerated(replace(motion, lead_velocity_m_s=v + step_v), push)
     stands = v < LEAST_RELATIVE_SPEED * v.max()
     late = motion.time_s > motion.time_s[N_STEPS // 20]
-    stiffness = (further.acceleration_m_s2 - at_motion.acceleration_m_s2) / (r * step_y)
-    friction = (faster.acceleration_m_s2 - at_motion.acceleration_m_s2) / (r * step_v)
+    friction = np.minimum((faster - acceleration) / (r * step_v), 0.0)
     return replace(
-        motion,
-        pressure_Pa=np.broadcast_to(at_motion.pressure_Pa, y.shape),
-        mass_kg=np.broadcast_to(at_motion.inertia_kg, y.shape),
-        stiffness=np.where(stands, 0.0, stiffness),
-        friction=np.where(stands & late, -1e9, np.minimum(friction, 0.0)),
-        model_acceleration=np.asarray(at_motion.acceleration_m_s2),
+        there,
+        stiffness=np.where(stands, 0.0, (further - acceleration) / (r * step_y)),
+        friction=np.where(stands & late, -1e9, friction),
     )
-
-
-def _observed_slope(run: Trajectory) -> Floats:
-    """Derivative of the observed position by the true position of the leading edge; 1 where it stands still."""
-    velocity = np.gradient(run.lead_position_m, run.time_s)
-    observed_velocity = np.gradient(run.observed_position_m, run.time_s)
-    moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
-    return np.where(moving, observed_velocity / np.where(moving, velocity, 1.0), 1.0)
 
 
 def acceleration_sensitivities(
@@ -259,127 +319,96 @@ def acceleration_sensitivities(
     """Derivatives of the observed positions of every trial with respect to the amplitudes of added accelerations of the
     tail. Shapes: trial_effects (n_trials, 4); accelerations (N_STEPS + 1, n) → (n_points, n).
     """
-    dx, _ = _responses(motions, np.array(accelerations))
-    return [
-        _interpolated(
-            trial_data.time_s - trial_effects[i, RELEASE],
-            motion,
-            response * motion.observed_slope[:, None] / motion.trial.travel_ratio,
+    dx, _ = _responses(motions, accelerations)
+    sensitivities = []
+    for i, (trial_data, motion, response) in enumerate(zip(fit.predictor.data, motions, dx, strict=True)):
+        since_s = trial_data.time_s - trial_effects[i, RELEASE]
+        observed = _between_steps(
+            motion, since_s, response * motion.observed_slope[:, None] / motion.trial.travel_ratio
         )
-        for i, (trial_data, motion, response) in enumerate(zip(fit.predictor.data, motions, dx, strict=True))
-    ]
+        growing = (since_s > 0) & (since_s <= motion.end_s)
+        sensitivities.append(np.where(growing[:, None], observed, 0.0))
+    return sensitivities
 
 
-def with_force(
-    motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats], rounds: int
-) -> list[FittedMotion]:
-    """The motions under an added force on the tail that need not be small. Each correction leaves about a tenth of the
-    error of the one before. Motions that do not satisfy their models are corrected to do so. The stiffness and friction
-    returned include the force.
-    """
-    for _ in range(rounds):
-        motions = [_with_force_derivatives(motion, force) for motion in motions]
-        defect = np.array(
-            [motion.model_acceleration + force(motion) / motion.mass_kg - motion.acceleration for motion in motions]
-        )
-        dx, dv = (response[:, :, 0] for response in _responses(motions, defect[:, :, None]))
-        motions = [_corrected(*step) for step in zip(motions, defect, dx, dv, strict=True)]
-    return [_with_force_derivatives(motion, force) for motion in motions]
+def _between_steps(motion: FittedMotion, since_s: Floats, values: Floats) -> Floats:
+    """Values at the steps of a motion interpolated linearly. Shapes: since_s (n,); values (N_STEPS + 1, k) → (n, k)."""
+    k = np.clip(np.searchsorted(motion.time_s, since_s), 1, N_STEPS)
+    before_s, after_s = motion.time_s[k - 1], motion.time_s[k]
+    part = np.clip((since_s - before_s) / (after_s - before_s), 0.0, 1.0)[:, None]
+    return np.asarray(values[k - 1] + part * (values[k] - values[k - 1]))
 
 
-def _with_force_derivatives(motion: FittedMotion, force: Callable[[FittedMotion], Floats]) -> FittedMotion:
-    """The motion with the derivatives of the added force included in stiffness and friction."""
-    y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
-    at_motion, r = force(motion), motion.trial.travel_ratio
-    further = (force(replace(motion, lead_position_m=y + step_y)) - at_motion) / (r * step_y * motion.mass_kg)
-    faster = (force(replace(motion, lead_velocity_m_s=v + step_v)) - at_motion) / (r * step_v * motion.mass_kg)
-    moves = v >= LEAST_RELATIVE_SPEED * v.max()
-    return replace(
-        motion,
-        stiffness=motion.stiffness + np.where(moves, further, 0.0),
-        friction=np.where(moves, np.minimum(motion.friction + faster, 0.0), motion.friction),
-    )
-
-
-def _corrected(motion: FittedMotion, defect: Floats, dx: Floats, dv: Floats) -> FittedMotion:
-    """The motion after a change of the tail's position and velocity; growth does not run backwards."""
-    r = motion.trial.travel_ratio
-    # Step limit: a correction takes away at most half of the speed; the rest is left to the next correction.
-    part = float(np.min(np.where(dv < 0, 0.5 * motion.tail_velocity_m_s / np.maximum(-dv, 1e-12), 1.0), initial=1.0,
-                        where=motion.lead_velocity_m_s > 0.05 * motion.lead_velocity_m_s.max()))  # fmt: skip
-    part = min(part, 1.0)
-    changed = replace(
-        motion,
-        lead_position_m=np.maximum(motion.lead_position_m + part * dx / r, 0.0),
-        lead_velocity_m_s=np.maximum(motion.lead_velocity_m_s + part * dv / r, 0.0),
-        acceleration=motion.acceleration + part * (motion.stiffness * dx + motion.friction * dv + defect),
-    )
-    return with_model_terms(changed)
-
-
-def _interpolated(since_s: Floats, motion: FittedMotion, values: Floats) -> Floats:
-    """Grid values interpolated linearly at other times; 0 before release and after growth has ended."""
-    grid_s = motion.time_s
-    k = np.clip(np.searchsorted(grid_s, since_s), 1, grid_s.size - 1)
-    part = np.clip((since_s - grid_s[k - 1]) / (grid_s[k] - grid_s[k - 1]), 0.0, 1.0)[:, None]
-    growing = (since_s > 0) & (since_s <= motion.end_s)
-    return np.where(growing[:, None], values[k - 1] + part * (values[k] - values[k - 1]), 0.0)
-
-
-def _responses(motions: Sequence[FittedMotion], acceleration: Floats) -> tuple[Floats, Floats]:
+def _responses(motions: Sequence[FittedMotion], accelerations: Sequence[Floats]) -> tuple[Floats, Floats]:
     """δx, m, and δẋ, m/s, of every trial to added accelerations; all of shape (n_trials, N_STEPS + 1, n)."""
     time_s, k, c = (
         np.array([getattr(motion, name) for motion in motions]) for name in ("time_s", "stiffness", "friction")
     )
-    dx, dv = integrate_responses(time_s, k, c, np.ascontiguousarray(acceleration), SDIRK_GAMMA)
+    dx, dv = integrate_responses(time_s, k, c, np.array(accelerations), SDIRK_GAMMA)
     # Compiled code does not raise on overflow.
     if np.geterr()["over"] == "raise" and not (np.isfinite(dx).all() and np.isfinite(dv).all()):
         raise FloatingPointError("the response to a force is not finite")
     return dx, dv
 
 
+def _moved(motion: FittedMotion, push: Floats, dx: Floats, dv: Floats) -> FittedMotion:
+    """The motion after a change of the tail's position and velocity by an acceleration; growth does not run backwards.
+    A change takes away at most half of the speed: the rest is left to the next.
+    """
+    r, fast = motion.trial.travel_ratio, motion.lead_velocity_m_s > 0.05 * motion.lead_velocity_m_s.max()
+    slowed = np.where(dv < 0, 0.5 * motion.tail_velocity_m_s / np.maximum(-dv, 1e-12), 1.0)
+    part = float(np.min(slowed, initial=1.0, where=fast))
+    return replace(
+        motion,
+        lead_position_m=np.maximum(motion.lead_position_m + part * dx / r, 0.0),
+        lead_velocity_m_s=np.maximum(motion.lead_velocity_m_s + part * dv / r, 0.0),
+        acceleration=motion.acceleration + part * (motion.stiffness * dx + motion.friction * dv + push),
+    )
+
+
 # ------------------------------------------------------------------------------
 # Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
 #
-# The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to
-# positions with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4). The acceleration itself is
-# not used as data: the equation of motion is linearised about this motion, and the defect there (what the model's
-# forces lack) enters as one more known acceleration, so that noise in the smoothed motion cancels to first order
-# (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a large force the linearisation
-# would be poor.
+# The acceleration of every trial is a smooth function of the square root of time, integrated twice from rest at its
+# release and fitted to positions. It is not used as data: the equation of motion is linearised about this motion, and
+# the defect there (what the model's forces lack) enters as one more known acceleration, so that noise in the smoothed
+# motion cancels to first order (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a
+# large force the linearisation would be poor.
 
 
-def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
-    since_s = data.time_s - trial_effects[RELEASE]
-    observed_m = data.lead_position_m - trial_effects[ORIGIN]
-    position_m = observed_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
-    length_m = motion.trial.length_m
-    # 0.96: part of the length up to which points are used (chosen)
-    growing = (since_s > 0) & ~(position_m > 0.96 * length_m)
-    if np.count_nonzero(growing) <= 2:
-        return motion
-    grid_s = motion.time_s
-    last_s = float(since_s[growing].max())
-    # 20: splines of an acceleration, even in the square root of time and so denser where a vine accelerates (chosen)
-    accelerations = uniform_splines(np.sqrt(np.clip(grid_s / last_s, 0.0, 1.0)), 20)
-    velocities = _integrated(grid_s, accelerations)
-    positions = _integrated(grid_s, velocities)
-    k = np.clip(np.searchsorted(grid_s, since_s[growing]), 1, grid_s.size - 1)
-    part = ((since_s[growing] - grid_s[k - 1]) / (grid_s[k] - grid_s[k - 1]))[:, None]
-    at_frames = positions[k - 1] + part * (positions[k] - positions[k - 1])
-    coefficients = _penalised_fit(at_frames, position_m[growing])
-    r = motion.trial.travel_ratio
-    moved = replace(
-        motion,
-        lead_position_m=np.maximum.accumulate(np.maximum(positions @ coefficients, 0.0)),
-        lead_velocity_m_s=np.maximum(velocities @ coefficients, 0.0),
-        acceleration=r * (accelerations @ coefficients),
+def _on_tracks(
+    data: Sequence[FitTrial], trial_effects: Floats, noise_m: Floats, motions: Sequence[FittedMotion]
+) -> list[FittedMotion]:
+    courses, information, score = [], [], []
+    for trial_data, effects, noise, motion in zip(data, trial_effects, noise_m, motions, strict=True):
+        since_s = trial_data.time_s - effects[RELEASE]
+        position_m = trial_data.lead_position_m - effects[ORIGIN]
+        position_m = position_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
+        growing = (since_s > 0) & ~(position_m > MOST_OF_LENGTH * motion.trial.length_m)
+        last_s = float(np.max(since_s, initial=1e-6, where=growing))
+        # 20: splines, even in the square root of time and so denser where a vine accelerates (chosen)
+        unit = splines(np.sqrt(np.clip(motion.time_s / last_s, 0.0, 1.0)), 20)
+        unit *= 2 * float(np.max(position_m, initial=noise, where=growing)) / last_s**2
+        velocities = _integrated(motion.time_s, unit)
+        positions = _integrated(motion.time_s, velocities)
+        design = _between_steps(motion, since_s[growing], positions) / noise
+        information.append(design.T @ design)
+        score.append(design.T @ position_m[growing] / noise)
         # The model's end of growth is not that of the track: the vine responds to forces beyond it.
-        end_s=math.inf,
-        counts_until_s=last_s,
-    )
-    return with_model_terms(moved)
+        on_track = replace(motion, end_s=math.inf, counts_until_s=last_s)
+        courses.append((on_track, unit, velocities, positions) if np.count_nonzero(growing) > 2 else (motion,))
+    priors = [root_of_covariance(20, length) for length in LENGTH_SCALES]
+    # Amplitudes that are averaged over, relative to a constant acceleration (chosen)
+    found = posterior(np.array(information), np.array(score), priors, np.geomspace(0.3, 300.0, 7)).mean
+    return [
+        motion if not shapes else replace(
+            motion,
+            lead_position_m=np.maximum.accumulate(np.maximum(shapes[2] @ coefficients, 0.0)),
+            lead_velocity_m_s=np.maximum(shapes[1] @ coefficients, 0.0),
+            acceleration=motion.trial.travel_ratio * (shapes[0] @ coefficients),
+        )
+        for (motion, *shapes), coefficients in zip(courses, found, strict=True)
+    ]  # fmt: skip
 
 
 def _integrated(time_s: Floats, columns: Floats) -> Floats:
@@ -388,121 +417,41 @@ def _integrated(time_s: Floats, columns: Floats) -> Floats:
     return np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(steps, axis=0)])
 
 
-def _penalised_fit(design: Floats, values: Floats) -> Floats:
-    """Coefficients with penalised second differences, the penalty chosen by generalised cross-validation."""
-    second_difference = np.diff(np.eye(design.shape[1]), 2, axis=0)
-    gram = design.T @ design
-    unit = float(np.trace(gram)) / design.shape[1]
-    roughness = unit * (second_difference.T @ second_difference + 1e-9 * np.eye(design.shape[1]))
-    best: tuple[float, Floats] | None = None
-    # Penalties, relative to the information from positions (chosen)
-    for penalty in np.geomspace(1e-8, 1e2, 21):
-        inverse = np.linalg.pinv(gram + penalty * roughness, hermitian=True)
-        coefficients = inverse @ (design.T @ values)
-        degrees_of_freedom = min(float(np.trace(inverse @ gram)), values.size - 1.0)
-        score = float(np.sum((values - design @ coefficients) ** 2)) / (values.size - degrees_of_freedom) ** 2
-        if best is None or score < best[0]:
-            best = score, coefficients
-    assert best is not None
-    return best[1]
-
-
 # ------------------------------------------------------------------------------
 # One linear problem for every question about a force: least squares about a set of motions, all other unknowns free.
 
-
-class Force(Protocol):
-    """Forces that are searched for: those of unit amplitudes along a motion, and the prior of the amplitudes."""
-
-    @property
-    def amplitude_precision(self) -> float:
-        """Prior precision of each amplitude, 1/N²; 0 where it is free."""
-
-    def unit_force(self, motion: FittedMotion) -> Floats:
-        """The force of each unit amplitude along a motion. Shape (n_times, n_amplitudes)."""
-
-    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
-        """The force with these amplitudes along a motion. Shapes: amplitude (n_amplitudes,) → (n_times,)."""
-
-
-PARAMETER_CUTOFF = 1e-11  # Relative eigenvalue below which a combination of model parameters is not estimable (derived)
-LEAST_INFORMATION = 1e-9  # Part of the largest information below which an amplitude is not estimable (chosen)
-
-
-@dataclass(frozen=True)
-class FreeForce:
-    """Forces of free amplitudes: any functions of the motion."""
-
-    unit_force: Callable[[FittedMotion], Floats]
-    amplitude_precision: float = 0.0
-
-    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
-        """The force with these amplitudes along a motion. Shapes: amplitude (n_amplitudes,) → (n_times,)."""
-        return np.asarray(self.unit_force(motion) @ amplitude)
+# Part of what a coefficient would have alone below which its information is rounding (derived)
+LEAST_INFORMATION = 1e-8
 
 
 @dataclass(frozen=True)
 class ForcePoint:
-    """Values of all unknowns, and the motions that they are linearised about. Where `motions_include_force`, the
-    motions are those of these parameters and this force. Otherwise they are others near by, and their defect (by how
-    much they violate the equation of motion) is carried as a residual.
+    """Values of the parameters and trial effects, and motions near by. `by_parameters`: derivatives of the acceleration
+    along each motion by pressure and B of the trial and by every model parameter, shape (n_times, 2 + n_keys).
     """
 
     theta: Floats
     trial_effects: Floats
-    force: Force
-    amplitude: Floats
     motions: Sequence[FittedMotion]
-    motions_include_force: bool = False
-
-    def asking(self, force: Force) -> ForcePoint:
-        """The same motions, to ask what another force explains: its amplitudes are 0, and the defect is all of it."""
-        count = force.unit_force(self.motions[0]).shape[1]
-        return replace(self, force=force, amplitude=np.zeros(count), motions_include_force=False)
+    by_parameters: Sequence[Floats]
 
 
-@dataclass(frozen=True)
-class ForceEstimate:
-    """Least-squares estimate of force amplitudes, N, and the fall of χ² that they bring. `sigma` is the root mean
-    square standard error of an amplitude. `parameter_shift` is how far the model parameters move along, in the fit's
-    own scaling.
+class ForceEstimate(NamedTuple):
+    """Least-squares estimate of coefficients of a force, N, and the fall of χ² that they bring. `sigma` is the root
+    mean square standard error of a coefficient. `parameter_shift` is how far the model parameters move along, in the
+    fit's own scaling.
     """
 
     delta_chi2: float
     amplitude: Floats
     sigma: float
     parameter_shift: Floats
-    degrees_of_freedom: int
+    degrees_of_freedom: float
 
     @property
     def delta_chi2_beyond_chance(self) -> float:
         """The fall of χ² in excess of its expectation under no force; at least 0."""
         return max(self.delta_chi2 - self.degrees_of_freedom, 0.0)
-
-
-@dataclass(frozen=True)
-class CoefficientLikelihood:
-    """Quadratic log-likelihood of the amplitudes, all other unknowns integrated out. `information` and `score` are
-    about amplitudes of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to the best amplitudes.
-    `log_determinant` is that of the information on all other unknowns.
-    """
-
-    information: Floats
-    score: Floats
-    chi2_at_zero: float
-    delta_chi2: float
-    log_determinant: float
-
-    @property
-    def least_chi2(self) -> float:
-        """χ² of the best coefficients, without regard to the smoothness prior."""
-        return self.chi2_at_zero - self.delta_chi2
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether all entries are finite: far outside the visited range the equations overflow."""
-        parts = (self.information, self.score, self.chi2_at_zero, self.delta_chi2, self.log_determinant)
-        return all(bool(np.isfinite(part).all()) for part in parts)
 
 
 class ForceProblem:
@@ -521,268 +470,209 @@ class ForceProblem:
         spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
         state = replace(fit.solution.state, spread=spread)
         self.effects_mean, self.effects_precision = trial_effect_prior(self.prior, state)
-        self.conditions = [trial_data.trial.condition for trial_data in self.data]
+        # A parameter without prior and information stays where it is.
+        self.precision = np.maximum(self.prior.prior_precision, 1e-12)
+        self.conditions = list(dict.fromkeys(trial_data.trial.condition for trial_data in self.data))
         self.n_points = float(sum(trial_data.time_s.size for trial_data in self.data))
         effects = np.zeros_like(self.effects_mean)
         effects[:, :2] = self.effects_mean[:, :2]
-        on_tracks = [_on_track(*pair) for pair in zip(self.data, effects, motions_of(fit, effects), strict=True)]
-        none = FreeForce(lambda motion: np.zeros((motion.time_s.size, 0)))
-        self.tracks = ForcePoint(fit.solution.state.theta, effects, none, np.zeros(0), on_tracks)
+        slow_noise_m = np.sqrt(self.variance) / (1 - self.rho)
+        motions = _on_tracks(self.data, effects, slow_noise_m, motions_of(fit, effects))
+        self.tracks = self.point(fit.solution.state.theta, effects, motions)
 
-    @property
-    def independent_points(self) -> float:
-        """Effective number of independent residuals where a model leaves more than noise."""
-        # 10.0: of one trial (chosen)
-        return 10.0 * len(self.data)
-
-    def bic(self, chi2_without_force: float, delta_chi2: float, n_parameters: int, largest_delta_chi2: float) -> float:
-        """Bayesian information criterion of a force, relative to the force that explains most: smaller is better. The
-        misfit that not even the best force explains is counted as further noise: it inflates the variance of every
-        independent residual. Source: Schwarz, Annals of Statistics 6, 461 (1978), with χ² divided by that inflation.
+    def inflation(self, chi2: float) -> float:
+        """Variance in units of the noise's where a model leaves this χ². What it leaves beyond the noise is correlated
+        along a trial.
         """
-        unexplained = max(chi2_without_force - largest_delta_chi2 - self.n_points, 0.0)
-        misfit = (largest_delta_chi2 - delta_chi2) / (1 + unexplained / self.independent_points)
-        return misfit + n_parameters * math.log(self.independent_points)
+        # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
+        points_per_part = max(self.n_points / (20 * len(self.data)), 1.0)
+        return 1 + max(chi2 / self.n_points - 1, 0.0) * points_per_part
 
-    def linearised(self, point: ForcePoint) -> LinearForce:
-        """Positions as linear functions of all unknowns about a point."""
-        accelerations = _acceleration_derivatives(self.fit, point)
-        sensitivities = acceleration_sensitivities(self.fit, point.trial_effects, point.motions, accelerations)
-        grams = []
-        for i, trial_data in enumerate(self.data):
-            position, velocity = _observed(point.motions[i], trial_data.time_s - point.trial_effects[i, RELEASE])
-            residual = trial_data.lead_position_m - point.trial_effects[i, ORIGIN] - position
-            of_trial = sensitivities[i]
-            if not point.motions_include_force:
-                of_trial, of_defect = of_trial[:, :-1], of_trial[:, -1]
-                residual = residual - of_defect
-            rows = np.column_stack([-velocity, np.ones(residual.size), of_trial, residual])
-            used = _points_before_end(trial_data, point.trial_effects[i])
-            relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
-            white = whiten(rows[used], trial_data.first[used], self.rho, relative_sd)
-            grams.append(white.T @ white / self.variance[i])
-        return LinearForce(self, point, np.array(grams))
+    def point(
+        self, theta: Floats, trial_effects: Floats, motions: Sequence[FittedMotion], push: Push | None = None
+    ) -> ForcePoint:
+        """The terms of the model, and of a force beside it, along motions."""
+        step = 1e-3  # Step of finite differences, in the fit's scaling of parameters (derived)
+        predictor = self.fit.predictor
+        here, *by_effect = (
+            predictor.jobs(theta, trial_effects + step * unit)
+            for unit in np.eye(N_TRIAL_EFFECTS + 1)[[-1, PRESSURE, DAMPING_DEVIATION], :N_TRIAL_EFFECTS]
+        )
+        by_parameter = [predictor.jobs(theta + step * unit, trial_effects) for unit in np.eye(theta.size)]
+        moved, derivatives = [], []
+        for i, motion in enumerate(motions):
+            motion = with_terms(self._with_job(motion, here[i]), push)
+            affected = (predictor.has_pressure_deviation[i], predictor.has_damping_deviation[i])
+            jobs = [each[i] if acts else None for each, acts in zip(by_effect, affected, strict=True)]
+            jobs += [by_parameter[k][i] if k >= 0 else None for k in predictor.layout.index[i]]
+            _, before = _accelerated(motion, push)
+            columns = [
+                np.zeros_like(before)
+                if job is None
+                else (_accelerated(self._with_job(motion, job), push)[1] - before) / step
+                for job in jobs
+            ]
+            moved.append(motion)
+            derivatives.append(np.column_stack(columns))
+        return ForcePoint(theta, trial_effects, moved, derivatives)
+
+    def _with_job(self, motion: FittedMotion, job: Job) -> FittedMotion:
+        """The same motion, its model and trial with the parameters of a job."""
+        values = dict(zip(motion.model.parameter_names, job.row.tolist(), strict=True))
+        trial = _trial_of_job(self.data[job.trial].trial, job)
+        return replace(motion, model=motion.model.with_values(values), trial=trial)
 
 
-class LinearForce:
-    """The normal equations about a point. `cost` is χ² there with all priors. Trial by trial the unknowns are its
-    effects, the model parameters that it depends on, and the amplitudes of the force; the effects are eliminated in
-    each trial, then the parameters over all trials (Schur complements).
+class ForceEquations:
+    """The normal equations of the coefficients of a force about a point, where they have given values (0). `cost` is χ²
+    there with the priors of all other unknowns, `chi2` that with all others estimated anew. `information` (q, q) and
+    `score` (q,) are those of the coefficients with all other unknowns eliminated.
     """
 
-    def __init__(self, problem: ForceProblem, point: ForcePoint, grams: Floats) -> None:
-        self.problem, self.point, self.grams = problem, point, grams
-        prior, p, q = problem.prior, point.theta.size, point.amplitude.size
-        off = point.trial_effects - problem.effects_mean
-        from_mean = point.theta - prior.prior_mean
-        each = np.arange(N_TRIAL_EFFECTS)
-        grams[:, each, -1] -= problem.effects_precision * off
-        grams[:, -1, each] = grams[:, each, -1]
-        self.prior_precision = np.concatenate([prior.prior_precision, np.full(q, point.force.amplitude_precision)])
-        self.prior_score = -self.prior_precision * np.concatenate([from_mean, point.amplitude])
-        self.cost = float(grams[:, -1, -1].sum() + np.sum(problem.effects_precision * off**2))
-        self.cost += float(self.prior_precision @ np.concatenate([from_mean, point.amplitude]) ** 2)
-        # Places of a trial's parameters and amplitudes among all; parameters that it does not depend on come last.
-        keys = np.where(prior.index >= 0, prior.index, p + q)
-        self.places = np.hstack([keys, np.broadcast_to(p + np.arange(q), (len(keys), q))])
-        self.eliminated, _ = self._without_effects(0.0)
+    def __init__(
+        self, problem: ForceProblem, point: ForcePoint, unit_push: Push, coefficients: Floats | None = None
+    ) -> None:
+        self.problem, self.point, self.unit_push = problem, point, unit_push
+        pushes = [unit_push(motion) for motion in point.motions]
+        q, p = pushes[0].shape[1], point.theta.size
+        self.coefficients = np.zeros(q) if coefficients is None else coefficients
+        self.accelerations = [
+            np.column_stack([
+                columns,
+                push / motion.mass_kg[:, None],
+                motion.model_acceleration + push @ self.coefficients / motion.mass_kg - motion.acceleration,
+            ])
+            for motion, columns, push in zip(point.motions, point.by_parameters, pushes, strict=True)
+        ]  # fmt: skip
+        sensitivities = acceleration_sensitivities(problem.fit, point.trial_effects, point.motions, self.accelerations)
+        self.blocks = np.zeros((len(problem.conditions), p + q + 1, p + q + 1))
+        self.of_effects = []
+        for i, of_trial in enumerate(sensitivities):
+            index = problem.prior.index[i]
+            places = np.concatenate([np.where(index >= 0, index, p + q + 1), np.arange(p, p + q + 1)])
+            known = np.flatnonzero(places <= p + q)
+            block, response = self._without_effects(i, of_trial)
+            places = places[known]
+            condition = problem.conditions.index(problem.data[i].trial.condition)
+            self.blocks[condition][np.ix_(places, places)] += block[np.ix_(known, known)]
+            self.of_effects.append((places, response[:, known]))
+        held = np.flatnonzero(~problem.prior.free)
+        self.blocks[:, held] = self.blocks[:, :, held] = 0.0
+        total = self.blocks.sum(axis=0)
+        own = np.diag(total)[p:-1]
+        self.ridge = LEAST_INFORMATION * np.maximum(own, max(1e-6 * own.max(), 1e-300))
+        reduced, self.of_parameters = self._without_parameters(total)
+        self.cost = float(total[-1, -1])
+        self.information, self.score, self.chi2 = reduced[:-1, :-1], reduced[:-1, -1], float(reduced[-1, -1])
 
-    def _without_effects(self, damping: float) -> tuple[Floats, Floats]:
-        """Products of [parameters, amplitudes, residual] of each trial, its effects eliminated, and the response of the
-        effects to those. Shapes (n_trials, m, m), (n_trials, 4, m).
+    def _without_effects(self, trial: int, sensitivities: Floats) -> tuple[Floats, Floats]:
+        """Products of [parameters, coefficients, residual] of a trial, its effects eliminated, and their response."""
+        problem, trial_data = self.problem, self.problem.data[trial]
+        motion, effects = self.point.motions[trial], self.point.trial_effects[trial]
+        since_s = trial_data.time_s - effects[RELEASE]
+        position_m, velocity_m_s = _observed(motion, since_s)
+        residual_m = trial_data.lead_position_m - effects[ORIGIN] - position_m - sensitivities[:, -1]
+        rows = np.column_stack([-velocity_m_s, np.ones_like(since_s), sensitivities[:, :-1], residual_m])
+        length_m = trial_data.trial.length_m
+        ended = np.flatnonzero(trial_data.lead_position_m - effects[ORIGIN] > MOST_OF_LENGTH * length_m)
+        used = slice(0, int(ended[0]) if ended.size else None)
+        relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
+        white = whiten(rows[used], trial_data.first[used], problem.rho, relative_sd)
+        gram, precision = white.T @ white / problem.variance[trial], problem.effects_precision[trial]
+        pull = precision * (effects - problem.effects_mean[trial])
+        gram[:N_TRIAL_EFFECTS, -1] -= pull
+        gram[-1, :N_TRIAL_EFFECTS] -= pull
+        gram[-1, -1] += pull @ (effects - problem.effects_mean[trial])
+        (block,), (response,) = eliminated(gram[None], precision[None])
+        return block, response
+
+    def _without_parameters(self, total: Floats) -> tuple[Floats, Floats]:
+        """Products with the prior of the parameters, which are then eliminated, and the response of these. `total` is
+        changed.
         """
-        precision = self.problem.effects_precision
-        own = np.einsum("nkk->nk", self.grams)[:, :N_TRIAL_EFFECTS] + precision
-        return eliminated(self.grams, precision + damping * own)
+        problem, p = self.problem, self.point.theta.size
+        from_mean = np.where(problem.prior.free, self.point.theta - problem.prior.prior_mean, 0.0)
+        pull = problem.prior.prior_precision * from_mean
+        total[:p, -1] -= pull
+        total[-1, :p] -= pull
+        total[-1, -1] += pull @ from_mean
+        (reduced,), (response,) = eliminated(total[None], problem.precision[None])
+        return reduced, response
 
-    def _blocks(self, products: Floats) -> tuple[Floats, Floats, Floats]:
-        """Normal equations over all trials, with priors: parameters by themselves (p, p), by [amplitudes, residual]
-        (p, q + 1), and the latter by themselves.
+    def estimate(self, columns: slice = slice(None)) -> ForceEstimate:
+        """Least squares for some of the coefficients, the others as they are."""
+        information, score, of_force = self.information[columns, columns], self.score[columns], self.of_parameters
+        covariance = np.linalg.inv(information + np.diag(self.ridge[columns]))
+        change = covariance @ score
+        delta_chi2 = float(score @ change)
+        sigma = math.sqrt(float(np.trace(covariance)) / score.size * self.problem.inflation(self.chi2 - delta_chi2))
+        shift = of_force[:, -1] - of_force[:, :-1][:, columns] @ change
+        return ForceEstimate(delta_chi2, change, sigma, shift, float(np.trace(covariance @ information)))
+
+    def gain_by_condition(self, shape: Floats) -> tuple[float, float]:
+        """Fall of χ² with combinations of the coefficients that differ between conditions, and its expectation under no
+        force. Shapes: shape (q, m).
         """
-        prior = self.problem.prior
-        k, p = prior.index.shape[1], prior.prior_mean.size
-        index = np.where(prior.index >= 0, prior.index, p)
-        parameters, cross = np.zeros((p + 1, p + 1)), np.zeros((p + 1, products.shape[1] - k))
-        np.add.at(parameters, (index[:, :, None], index[:, None, :]), products[:, :k, :k])
-        np.add.at(cross, index, products[:, :k, k:])
-        parameters, cross = parameters[:p, :p] + np.diag(self.prior_precision[:p]), cross[:p]
-        cross[:, -1] += self.prior_score[:p]
-        rest = products[:, k:, k:].sum(axis=0)
-        rest[:-1, :-1] += np.diag(self.prior_precision[p:])
-        rest[:-1, -1] += self.prior_score[p:]
-        held = ~prior.free | ~(np.diag(parameters) > 0)
-        parameters[held, :] = parameters[:, held] = cross[held] = 0.0
-        return parameters, cross, rest
+        p, m = self.point.theta.size, shape.shape[1]
+        change = np.zeros((self.blocks.shape[1], m + p + 1))
+        change[p:-1, :m], change[:p, m:-1], change[-1, -1] = shape, np.eye(p), 1.0
+        blocks = change.T @ self.blocks @ change
+        own = np.einsum("nkk->nk", blocks)[:, :m]
+        ridge = np.maximum(LEAST_INFORMATION * own, 1e-300 + 1e-6 * LEAST_INFORMATION * own.max())
+        reduced, _ = self._without_parameters(eliminated(blocks, ridge)[0].sum(axis=0))
+        return self.chi2 - float(reduced[-1, -1]), float(np.sum(own / (own + ridge)))
 
-    @cached_property
-    def blocks(self) -> tuple[Floats, Floats, Floats]:
-        """The normal equations with the trial effects eliminated; see `_blocks`."""
-        return self._blocks(self.eliminated)
-
-    @cached_property
-    def parameter_response(self) -> Floats:
-        """Steps of the parameters by [each amplitude, the residual], shape (p, q + 1)."""
-        parameters, cross, _ = self.blocks
-        return np.asarray(scaled_pseudo_inverse(parameters, PARAMETER_CUTOFF) @ cross)
-
-    @cached_property
-    def chi2_without_force(self) -> float:
-        """χ² with parameters and trial effects estimated anew, and the amplitudes as they are at the point."""
-        gained = float(self.blocks[1][:, -1] @ self.parameter_response[:, -1])
-        return self.cost - float((self.grams[:, -1, -1] - self.eliminated[:, -1, -1]).sum()) - gained
-
-    def estimates(self, widths: Sequence[int]) -> list[ForceEstimate]:
-        """Each of several forces estimated with none of the others present: so many amplitudes each, in order."""
-        _, cross, rest = self.blocks
-        reduced = rest - cross.T @ self.parameter_response
-        ends = np.concatenate([[0], np.cumsum(widths)])
-        return [self._estimate(reduced, slice(a, b)) for a, b in itertools.pairwise(ends.tolist())]
-
-    def _estimate(self, reduced: Floats, columns: slice) -> ForceEstimate:
-        """The force whose amplitudes are in `columns`, from the equations with all other unknowns eliminated. Its
-        standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
+    def by_condition(self, parameter_shift: Floats) -> tuple[Floats, Floats]:
+        """Information and score of the coefficients in every condition, the parameters shifted and then held. Shapes:
+        (n_conditions, q, q), (n_conditions, q).
         """
-        information, score = reduced[columns, columns], reduced[columns, -1]
-        size = np.diag(information)
-        estimable = size > LEAST_INFORMATION * max(float(size.max()), 1e-300)
-        response = self.parameter_response
-        if not estimable.any():
-            return ForceEstimate(0.0, np.zeros(score.size), math.inf, np.zeros(len(response)), 0)
-        covariance = scaled_pseudo_inverse(information, LEAST_INFORMATION, estimable)
-        amplitude = covariance @ score
-        shift = response[:, -1] - response[:, columns] @ amplitude
-        scores = self._scores_by_trial(columns, amplitude, shift)
-        residual_dof = max(len(scores) - shift.size - score.size, 1)
-        robust = covariance @ (scores.T @ scores * len(scores) / residual_dof) @ covariance
-        sigma = math.sqrt(max(float(np.trace(covariance)), float(np.trace(robust))) / score.size)
-        return ForceEstimate(float(score @ amplitude), amplitude, sigma, shift, int(np.count_nonzero(estimable)))
+        p = self.point.theta.size
+        of_force = self.blocks[:, p:-1]
+        return of_force[:, :, p:-1], of_force[:, :, -1] - of_force[:, :, :p] @ parameter_shift
 
-    def _scores_by_trial(self, columns: slice, amplitude: Floats, shift: Floats) -> Floats:
-        """Contribution of each trial to the score of the amplitudes at the estimate, shape (n_trials, n_columns)."""
-        index, products = self.problem.prior.index, self.eliminated
-        k = index.shape[1]
-        forces = slice(k + columns.start, k + columns.stop)
-        residual_products = (
-            products[:, :, -1]
-            - np.einsum("nqk,nk->nq", products[:, :, :k], np.append(shift, 0.0)[index])
-            - products[:, :, forces] @ amplitude
-        )
-        response = self.parameter_response[:, columns]
-        of_keys = np.vstack([response, np.zeros((1, response.shape[1]))])[index]
-        return np.asarray(residual_products[:, forces] - np.einsum("nkl,nk->nl", of_keys, residual_products[:, :k]))
+    def chi2_with(self, coefficients: Floats) -> float:
+        """χ² with these coefficients, all other unknowns estimated anew."""
+        change = coefficients - self.coefficients
+        return self.chi2 - 2 * float(self.score @ change) + float(change @ self.information @ change)
 
-    def likelihood(self) -> CoefficientLikelihood:
-        """Integrate out all unknowns but the amplitudes, after scaling each unknown to unit information."""
-        # Information, where each unknown alone has 1, below which a combination of unknowns is not estimable (derived)
-        least_information = 1e-8
-        parameters, cross, rest = self.blocks
-        size = np.diag(parameters)
-        unit = 1 / np.sqrt(size[size > 0])
-        values, vectors = np.linalg.eigh(parameters[np.ix_(size > 0, size > 0)] * unit[:, None] * unit)
-        estimable = values > least_information
-        root = vectors[:, estimable] / np.sqrt(values[estimable])
-        explained = root.T @ (cross[size > 0] * unit[:, None])
-        reduced = rest - explained.T @ explained
-        of_effects = with_diagonal(self.grams[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS], self.problem.effects_precision)
-        own = np.einsum("nkk->k", self.grams)[-len(rest) : -1] + self.prior_precision[size.size :]
-        scale = np.sqrt(own)
-        inverse_scale = np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)
-        strength, directions = np.linalg.eigh(reduced[:-1, :-1] * inverse_scale[:, None] * inverse_scale)
-        # Directions that other unknowns reproduce have information only from rounding.
-        directions, strength = directions[:, strength > least_information], strength[strength > least_information]
-        back = scale[:, None] * directions
-        local_score = directions.T @ (reduced[:-1, -1] * inverse_scale)
-        at_point = scale * self.point.amplitude @ directions
-        cost = self.chi2_without_force
-        return CoefficientLikelihood(
-            information=(back * strength) @ back.T,
-            score=back @ (local_score + strength * at_point),
-            chi2_at_zero=cost + 2 * float(local_score @ at_point) + float(strength @ at_point**2),
-            delta_chi2=float(np.sum((local_score + strength * at_point) ** 2 / strength)),
-            log_determinant=float(np.log(values[estimable]).sum() + np.log(size[size > 0]).sum())
-            + float(np.linalg.slogdet(of_effects)[1].sum()),
-        )
-
-    def step(self, damping: float) -> ForcePoint:
-        """The point of a damped Gauss–Newton step: releases limited, parameters inside their bounds."""
-        point, prior, p = self.point, self.problem.prior, self.point.theta.size
-        products, response = self._without_effects(damping)
-        parameters, cross, rest = self._blocks(products)
-        matrix = np.block([[parameters, cross[:, :-1]], [cross[:, :-1].T, rest[:-1, :-1]]])
-        matrix += damping * np.diag(np.diag(matrix))
-        # 1e-12: relative eigenvalue below which a combination of unknowns is not moved in a step (derived)
-        step = scaled_pseudo_inverse(matrix, 1e-12) @ np.concatenate([cross[:, -1], rest[:-1, -1]])
-        of_effects = response[:, :, -1] - np.einsum(
-            "nem,nm->ne", response[:, :, :-1], np.append(step, 0.0)[self.places]
-        )
-        release_limit_s = 2 * np.array([trial_data.frame_s for trial_data in self.problem.data])
-        of_effects[:, RELEASE] = np.clip(of_effects[:, RELEASE], -release_limit_s, release_limit_s)
-        return replace(
-            point,
-            theta=np.clip(point.theta + step[:p], prior.lower, prior.upper),
-            trial_effects=point.trial_effects + of_effects,
-            amplitude=point.amplitude + step[p:],
-        )
+    def moved(self, coefficients: Floats) -> tuple[Floats, Floats, list[FittedMotion]]:
+        """Parameters, trial effects and motions with other coefficients, to first order; releases move by at most two
+        frames, and parameters stay inside their bounds.
+        """
+        point, prior = self.point, self.problem.prior
+        change = coefficients - self.coefficients
+        theta = point.theta + self.of_parameters[:, -1] - self.of_parameters[:, :-1] @ change
+        theta = np.clip(theta, prior.lower, prior.upper)
+        step = np.concatenate([theta - point.theta, change])
+        effects, pushes = point.trial_effects.copy(), []
+        for i, (places, response) in enumerate(self.of_effects):
+            of_trial = response[:, -1] - response[:, :-1] @ step[places[:-1]]
+            limit_s = 2 * self.problem.data[i].frame_s
+            of_trial[RELEASE] = np.clip(of_trial[RELEASE], -limit_s, limit_s)
+            effects[i] += of_trial
+            by_key = np.append(step[: theta.size], 0.0)[prior.index[i]]
+            by_all = [of_trial[PRESSURE], of_trial[DAMPING_DEVIATION], *by_key, *change, 1.0]
+            pushes.append(self.accelerations[i] @ np.array(by_all))
+        dx, dv = (each[:, :, 0] for each in _responses(point.motions, [push[:, None] for push in pushes]))
+        return theta, effects, [_moved(*each) for each in zip(point.motions, pushes, dx, dv, strict=True)]
 
 
-# A force that slows a vine down keeps it longer where the force acts, so that the linear estimate of a force of a tenth
-# of the drive comes out a fifth too large. Below, motions respond to the force in full, and damped Gauss-Newton steps
-# find all unknowns. The search starts on the tracks: simulated without the force, motions would run ahead of them.
-
-CONVERGENCE_TOLERANCE = 1e-3  # Relative fall of χ² below which the search ends (chosen)
-
-
-def optimise_force(problem: ForceProblem, start: ForcePoint) -> LinearForce | None:
-    """The most probable force, all other unknowns free: first with the motions held where they are, then with motions
-    that respond to the force.
+def settled(equations: ForceEquations, estimate: Callable[[ForceEquations], Floats]) -> tuple[float, ForcePoint]:
+    """χ² and motions under a force to which they respond in full: Gauss–Newton steps of all unknowns and motions
+    together (lifted: Albersmeyer & Diehl, SIAM J. Optim. 20, 1655, 2010), with new estimates of the coefficients.
     """
-    if not start.motions_include_force:
-        settled = _descend(problem, start)
-        start = replace(start if settled is None else settled.point, motions_include_force=True)
-    return _descend(problem, start)
-
-
-def _descend(problem: ForceProblem, point: ForcePoint) -> LinearForce | None:
-    """The normal equations at the point of least cost on the way down (Levenberg and Marquardt)."""
-    best: LinearForce | None = None
-    damping = 1e-3  # First damping factor (chosen)
-    # 12: most Gauss-Newton steps (chosen)
-    for _ in range(12):
-        try:
-            with np.errstate(all="raise", under="ignore"):
-                linear = problem.linearised(_with_updated_motions(problem.fit, point))
-        except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
-            linear = None
-        if linear is not None and (best is None or linear.cost < best.cost):
-            converged = best is not None and linear.cost > (1 - CONVERGENCE_TOLERANCE) * best.cost
-            best, damping = linear, 0.2 * damping
-            if converged:
-                break
-        elif best is None:
+    best, unit_push = (math.inf, equations.point), equations.unit_push
+    # 8: most steps (chosen)
+    for _ in range(8):
+        coefficients = estimate(equations)
+        push = partial(lambda of_all, motion: unit_push(motion) @ of_all, coefficients)
+        point = equations.problem.point(*equations.moved(coefficients), push)
+        equations = ForceEquations(equations.problem, point, unit_push, coefficients)
+        # 1e-3: relative fall of χ² below which the search ends (chosen)
+        if not equations.cost < (1 - 1e-3) * best[0]:
             break
-        else:
-            damping = 10 * damping
-        point = best.step(damping)
+        best = equations.cost, point
     return best
-
-
-def _with_updated_motions(fit: Fit, point: ForcePoint) -> ForcePoint:
-    """The point with its motions corrected for its parameters and, where they include it, its force."""
-    jobs = fit.predictor.jobs(point.theta, point.trial_effects)
-    motions = [with_model_terms(_with_parameters_of_job(fit, *pair)) for pair in zip(point.motions, jobs, strict=True)]
-    # 2: corrections of the motions at each step (chosen)
-    corrections = 2 if point.motions_include_force else 0
-    return replace(
-        point, motions=with_force(motions, lambda motion: point.force.force(motion, point.amplitude), corrections)
-    )
-
-
-def _points_before_end(trial_data: FitTrial, trial_effects: Floats) -> slice:
-    """The points before the end of growth, since a corrected motion does not end where its model would."""
-    length_m = trial_data.trial.length_m if math.isfinite(trial_data.trial.length_m) else math.inf
-    # 0.96: part of the length up to which points are used (chosen)
-    after_end = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > 0.96 * length_m)
-    return slice(0, int(after_end[0]) if after_end.size else trial_data.time_s.size)
 
 
 def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
@@ -795,64 +685,3 @@ def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
     offset = np.interp(at, motion.time_s, motion.observation_offset_m)
     slope = np.interp(at, motion.time_s, motion.observed_slope)
     return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * slope, 0.0)
-
-
-def _acceleration_derivatives(fit: Fit, point: ForcePoint) -> list[Floats]:
-    """Derivatives of the acceleration along each motion, shape (n_times, n): by pressure and B of the trial, every
-    model parameter, every amplitude. Where the motions do not include the force, a last column holds their defect.
-    """
-    # Step of finite differences, in the fit's scaling of parameters (derived)
-    step = 1e-3
-    predictor, theta, effects, force = fit.predictor, point.theta, point.trial_effects, point.force
-    by_effect = [
-        predictor.jobs(theta, effects + step * np.eye(N_TRIAL_EFFECTS)[k]) for k in (PRESSURE, DAMPING_DEVIATION)
-    ]
-    by_parameter = [predictor.jobs(theta + step * unit, effects) for unit in np.eye(theta.size)]
-    derivatives = []
-    for i, motion in enumerate(point.motions):
-        affected = (predictor.has_pressure_deviation[i], predictor.has_damping_deviation[i])
-        changed = [jobs[i] if affects else None for jobs, affects in zip(by_effect, affected, strict=True)]
-        changed += [by_parameter[k][i] if k >= 0 else None for k in predictor.layout.index[i]]
-        columns = [
-            np.zeros_like(motion.time_s)
-            if job is None
-            else (_acceleration(fit, point, motion, job) - motion.model_acceleration) / step
-            for job in changed
-        ]
-        columns.append(force.unit_force(motion) / motion.mass_kg[:, None])
-        if not point.motions_include_force:
-            of_force = force.force(motion, point.amplitude) / motion.mass_kg
-            columns.append(motion.model_acceleration + of_force - motion.acceleration)
-        derivatives.append(np.column_stack(columns))
-    return derivatives
-
-
-def _acceleration(fit: Fit, point: ForcePoint, motion: FittedMotion, job: Job) -> Floats:
-    """Acceleration along a motion with a job's parameters, with the change of a force that depends on the pressure."""
-    changed = _with_parameters_of_job(fit, motion, job)
-    y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    terms = evaluate(changed.model, changed.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
-    pressure_Pa = np.broadcast_to(terms.pressure_Pa, y.shape)
-    if not point.amplitude.any() or np.array_equal(pressure_Pa, motion.pressure_Pa):
-        return terms.acceleration_m_s2
-    before, after = (
-        point.force.force(at, point.amplitude) for at in (motion, replace(motion, pressure_Pa=pressure_Pa))
-    )
-    return np.asarray(terms.acceleration_m_s2 + (after - before) / motion.mass_kg)
-
-
-def _with_parameters_of_job(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
-    """The same motion, its model and trial with the parameters of a job."""
-    values = dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True))
-    trial = trial_of_job(fit.predictor.data[job.trial].trial, job)
-    return replace(motion, model=fit.model.with_values(values), trial=trial)
-
-
-def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.bool_] | None = None) -> Floats:
-    """Pseudo-inverse of a symmetric matrix after scaling its diagonal to 1. Returns zero in the rows and columns that
-    do not take part. Shapes: matrix (n, n); estimable (n,) → (n, n).
-    """
-    diagonal = np.diag(matrix)
-    scale = np.where(diagonal > 0 if estimable is None else estimable, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
-    inverse = np.linalg.pinv(matrix * scale[:, None] * scale, rcond=cutoff, hermitian=True)
-    return np.asarray(inverse * scale[:, None] * scale)

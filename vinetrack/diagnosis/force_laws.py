@@ -10,13 +10,12 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
 from vinetrack.core.problems import remark
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_inversion import N_NONZERO, FittedMotion, nonzero_splines, uniform_knots
+from vinetrack.diagnosis.force_inversion import FittedMotion
 
 PATCH_CENTRES = 16  # Number of positions of a local force (chosen)
 
@@ -32,8 +31,6 @@ class Law:
     """
 
     kind: str
-    n_amplitudes: int = 1
-    n_shapes: int = 0
     low: float = math.nan
     high: float = math.nan
     scale: float = math.nan
@@ -45,6 +42,16 @@ class Law:
     def name(self) -> str:
         """Name of the law: its kind and factor."""
         return f"{self.kind}_by_{self.factor}" if self.factor else self.kind
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of its amplitudes."""
+        return 2 if self.kind == "periodic" else 1
+
+    @property
+    def n_shapes(self) -> int:
+        """Number of shape parameters that are searched over."""
+        return {"patch": 2, "inverse_speed": 0}.get(self.kind, int(math.isfinite(self.scale)))
 
     @property
     def n_parameters(self) -> int:
@@ -176,42 +183,26 @@ FORMS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Range:
-    """The largest growth, speed and time among the motions."""
-
-    growth_m: float
-    speed_m_s: float
-    time_s: float
-
-
 def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     """The grid of all laws; where vines differ in width, also each in proportion to the cross-section."""
-    # Positions and speeds in the grid above which a force may set in (chosen)
-    n_threshold_positions, n_threshold_speeds = 8, 8
-    visited = _visited_range(motions)
+    growth_m, speed_m_s, time_s = _visited(motions)
     plain = ["constant", "position", "speed", "speed_squared", "pressure", "time", "position_squared", "speed_cubed"]
     laws = [Law(kind) for kind in plain]
-    for k in range(n_threshold_positions):
-        laws.append(Law("beyond_a_place", n_shapes=1, scale=(k + 0.5) / n_threshold_positions * visited.growth_m))
-    for k in range(n_threshold_speeds):
-        threshold_m_s = (k + 0.5) / n_threshold_speeds * visited.speed_m_s
-        laws += [Law(kind, n_shapes=1, scale=threshold_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
+    # Positions and speeds above which a force may set in, as parts of the highest (chosen)
+    for part in (np.arange(8) + 0.5) / 8:
+        laws.append(Law("beyond_a_place", scale=part * growth_m))
+        laws += [Law(kind, scale=part * speed_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
     # 0.05: part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest (chosen)
-    laws.append(Law("inverse_speed", scale=0.05 * visited.speed_m_s))
-    # (0.04, 0.1, 0.2, 0.4): decay scales in the grid, as parts of the largest growth, speed or time (chosen)
+    laws.append(Law("inverse_speed", scale=0.05 * speed_m_s))
+    # Decay scales as parts of the largest growth, speed or time (chosen)
     for part in (0.04, 0.1, 0.2, 0.4):
-        laws.append(Law("falling_with_speed", n_shapes=1, scale=part * visited.speed_m_s))
-        laws.append(Law("fading_in_time", n_shapes=1, scale=part * visited.time_s))
-        laws.append(Law("fading_along", n_shapes=1, scale=part * visited.growth_m))
+        scales = {"falling_with_speed": speed_m_s, "fading_in_time": time_s, "fading_along": growth_m}
+        laws += [Law(kind, scale=part * largest) for kind, largest in scales.items()]
     # Widths of a local force as parts of the growth (chosen)
-    for width in (0.06, 0.12, 0.2, 0.33):
-        for centre in (np.arange(PATCH_CENTRES) + 0.5) / PATCH_CENTRES * visited.growth_m:
-            laws.append(_patch_at(float(centre), width * visited.growth_m))
-    # 24: periods in the grid (chosen)
-    # 0.6, 0.04: as parts of the growth (derived)
-    for period in np.geomspace(0.04, 0.6, 24) * visited.growth_m:
-        laws.append(Law("periodic", n_amplitudes=2, n_shapes=1, scale=float(period)))
+    for width, place in itertools.product((0.06, 0.12, 0.2, 0.33), range(PATCH_CENTRES)):
+        laws.append(_patch_at((place + 0.5) / PATCH_CENTRES * growth_m, width * growth_m))
+    # 24 periods, as parts of the growth (chosen)
+    laws += [Law("periodic", scale=period * growth_m) for period in np.geomspace(0.04, 0.6, 24).tolist()]
     laws += [replace(law, factor=factor) for law in laws for factor in FORMS[law.kind].times]
     areas = [motion.trial.area_m2 for motion in motions]
     # 1.02: ratio of cross-sections up to which two vines count as equally wide (chosen)
@@ -221,296 +212,53 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     return _with_unit_peak(laws, motions)
 
 
-def laws_near(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
-    """Laws near the best of the grid: its position, width, period or scale varied by less than a step of the grid."""
+def laws_near(law: Law, motions: Sequence[FittedMotion], part: float = 1.0) -> list[Law]:
+    """Laws near another: its position, width, period or scale varied by less than a step of the grid, or by part of
+    that.
+    """
     if law.kind == "patch":
         centre, width = (law.low + law.high) / 2, law.high - law.low
-        step = _visited_range(motions).growth_m / PATCH_CENTRES
+        step = part * _visited(motions)[0] / PATCH_CENTRES
         near = [law] if law.factor else [replace(law, factor="speed"), replace(law, factor="pressure")]
-        near += [
-            replace(_patch_at(centre + shift * step, stretch * width), factor=law.factor)
-            for shift in np.linspace(-0.75, 0.75, 7)
-            for stretch in (0.5, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8)
-        ]
+        for shift, stretch in itertools.product(np.linspace(-0.75, 0.75, 7), (0.5, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8)):
+            moved = _patch_at(centre + float(shift) * step, stretch**part * width)
+            near.append(replace(law, low=moved.low, high=moved.high))
     elif law.n_shapes:
-        near = [
-            replace(law, scale=law.scale * factor)
-            for factor in (
-                np.geomspace(0.9, 1.11, 17) if law.kind == "periodic" else np.geomspace(0.5, 2.0, 13)
-            ).tolist()
-        ]
+        factors = np.geomspace(0.9, 1.11, 17) if law.kind == "periodic" else np.geomspace(0.5, 2.0, 13)
+        near = [replace(law, scale=law.scale * factor) for factor in (factors**part).tolist()]
     else:
         return []
-    if law.reference_area_m2:
-        near = [replace(near_law, reference_area_m2=law.reference_area_m2) for near_law in near]
     return _with_unit_peak(near, motions)
 
 
 def _patch_at(centre: float, width: float) -> Law:
-    return Law("patch", n_shapes=2, low=centre - width / 2, high=centre + width / 2)
+    return Law("patch", low=centre - width / 2, high=centre + width / 2)
 
 
 def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
-    """The laws scaled to a peak of 1 along the motions, without patches that act only at the start."""
+    """The laws scaled to a peak of 1 along the motions, without patches that act only at the start. Those that peak at
+    rest, where positions do not determine the speed, are scaled to 1 at the lowest speed observed.
+    """
+    # 0.05: part of the growth over which a vine accelerates; the size of a law at rest is not observed (chosen)
+    started = [(motion.lead_position_m >= 0.05 * motion.lead_position_m.max())[motion.is_visited] for motion in motions]
     scaled = []
     for law in (replace(law, peak=1.0) for law in laws):
-        forces = [np.abs(law.unit_force(motion)) for motion in motions]
-        peak = max(float(force.max()) for force in forces)
-        # 0.05: part of the growth over which a vine accelerates; the size of a law at rest is not observed (chosen)
+        forces = [np.abs(law.unit_force(motion))[motion.is_visited] for motion in motions]
+        peak = 1.0 if law.kind == "periodic" else max(float(force.max()) for force in forces)
         peak_after_start = max(
-            float(force[motion.lead_position_m >= 0.05 * motion.lead_position_m.max()].max())
-            for force, motion in zip(forces, motions, strict=True)
+            float(np.max(force[after], initial=0.0)) for force, after in zip(forces, started, strict=True)
         )
-        if law.n_amplitudes > 1:
-            peak = 1.0
-        # ("inverse_speed", "falling_with_speed"): kinds that peak at rest, where positions do not determine
-        # the speed: their size is stated at the lowest speed observed
-        elif law.kind in ("inverse_speed", "falling_with_speed"):
+        if law.kind in ("inverse_speed", "falling_with_speed"):
             peak = peak_after_start
-        elif law.kind == "patch" and peak_after_start < 0.5 * peak:
-            continue
-        scaled.append(replace(law, peak=peak or 1.0))
+        if law.kind != "patch" or peak_after_start >= 0.5 * peak:
+            scaled.append(replace(law, peak=peak or 1.0))
     return scaled
 
 
-def _visited_range(motions: Sequence[FittedMotion]) -> _Range:
-    return _Range(
-        max(float(motion.lead_position_m.max()) for motion in motions),
-        max(float(np.quantile(motion.tail_velocity_m_s, 0.98)) for motion in motions),
-        max(float(motion.time_s[-1]) for motion in motions),
+def _visited(motions: Sequence[FittedMotion]) -> tuple[float, float, float]:
+    """The largest growth, m, speed of the tail, m/s, and time, s, among the motions."""
+    return (
+        max(float(motion.lead_position_m[motion.is_visited].max()) for motion in motions),
+        max(float(np.quantile(motion.tail_velocity_m_s[motion.is_visited], 0.98)) for motion in motions),
+        max(float(motion.time_s[motion.is_visited].max()) for motion in motions),
     )
-
-
-# ------------------------------------------------------------------------------
-# Smooth forces over one variable or two: cubic B-splines with a Gaussian-process prior on their coefficients.
-#
-# The coefficients are the values of a Gaussian process at the centres of the splines, with covariance
-#
-#     a² Π_d (1 + s_d + s_d²/3) exp(−s_d),   s_d = √5 |u_d − u'_d|/ℓ_d
-#
-# where u are the variables scaled to the range that the trials visited: the Matérn kernel of order 5/2 (Rasmussen &
-# Williams 2006, §4.2). Its functions are twice differentiable. The squared-exponential kernel exp(−½ s²), whose
-# functions
-# are infinitely smooth, gives bands that are far too narrow for a force such as a power of the growth: in a linear fit
-# to
-# draws they contain a third of the points instead of nearly all. The model is a penalised spline with an amplitude a,
-# N,
-# and length scales ℓ_d as hyperparameters (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015).
-
-# What a force may depend on, and the attribute of a motion that holds it
-VARIABLES = {
-    "growth": "lead_position_m",
-    "speed": "tail_velocity_m_s",
-    "time": "time_s",
-    "pressure": "pressure_Pa",
-}
-
-
-# Length scales that are averaged over, as parts of the visited range (chosen)
-LENGTH_SCALES = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
-
-# Amplitudes that are averaged over, as parts of the largest drive (chosen)
-RELATIVE_AMPLITUDES = np.geomspace(0.003, 0.3, 9)
-
-KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4  # Relative variances below which a mode is dropped (chosen)
-
-# What a force may be where growth begins
-ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
-
-
-def standard_error(basis: Floats, covariance: Floats) -> Floats:
-    """Standard error of a linear combination of coefficients, for each row of a basis. Shapes: basis (n, n_splines);
-    covariance (n_splines, n_splines) → (n,).
-    """
-    return np.asarray(np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis)))
-
-
-@lru_cache(maxsize=256)
-def covariance_modes(count: int, length: float, *, zero_at_start: bool = False) -> tuple[Floats, Floats]:
-    """Eigenvectors and eigenvalues of the covariance of a unit-variance process at the centres of the splines. Returns
-    eigenvectors, variances. Shape (count, count).
-    """
-    knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, count - 2), [1.0] * 3])
-    at = np.array([knots[k + 1 : k + 4].mean() for k in range(count)])
-    distance = math.sqrt(5) * np.abs(at[:, None] - at) / length
-    covariance = (1 + distance + distance**2 / 3) * np.exp(-distance)
-    if zero_at_start:
-        covariance = covariance - np.outer(covariance[:, 0], covariance[0])
-    variances, eigenvectors = np.linalg.eigh(covariance)
-    variances = np.maximum(variances, 0.0)
-    # Cached and shared, so made read-only: the same few are needed thousands of times.
-    for array in (eigenvectors, variances):
-        array.flags.writeable = False
-    return eigenvectors, variances
-
-
-@dataclass(frozen=True)
-class Domain:
-    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
-    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
-    """
-
-    variables: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    counts: tuple[int, ...]
-    log_scale: tuple[float, ...]
-
-    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
-        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
-        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
-        """
-        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
-        return [
-            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
-            if math.isfinite(log_scale)
-            else (at - low) / (high - low)
-            for at, low, high, log_scale in limits
-        ]
-
-    @property
-    def name(self) -> str:
-        """The variables joined by +: `growth`, `growth+speed`."""
-        return "+".join(self.variables)
-
-    @property
-    def size(self) -> int:
-        """Total number of splines (products of splines, for two variables)."""
-        return math.prod(self.counts)
-
-    def values_along(self, motion: FittedMotion) -> list[Floats]:
-        """The variables along a motion, SI, each of shape (n_times,)."""
-        return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
-
-    def basis(self, values: Sequence[Floats]) -> Floats:
-        """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, size)."""
-        indices, products = self._nonzero_products(values)
-        design = np.zeros((len(indices), self.size))
-        np.put_along_axis(design, indices, products, axis=1)
-        return design
-
-    def evaluate(self, values: Sequence[Floats], coefficients: Floats) -> Floats:
-        """Sum of all splines times their coefficients at these values. Shapes: values (n,); coefficients (size,) →
-        (n,).
-        """
-        indices, products = self._nonzero_products(values)
-        return np.asarray(np.einsum("ns,ns->n", products, coefficients[indices]))
-
-    def _nonzero_products(self, values: Sequence[Floats]) -> tuple[np.ndarray, Floats]:
-        """Indices and values of the nonzero products of splines, shape (n, 4^n_variables)."""
-        indices, products = np.zeros((len(values[0]), 1), dtype=int), np.ones((len(values[0]), 1))
-        for position, count in zip(self.normalised(values), self.counts, strict=True):
-            first, splines = nonzero_splines(position, uniform_knots(count))
-            along_axis = first[:, None] + np.arange(N_NONZERO)
-            indices = (indices[:, :, None] * count + along_axis[:, None, :]).reshape(len(position), -1)
-            products = (products[:, :, None] * splines[:, None, :]).reshape(len(position), -1)
-        return indices, products
-
-    @property
-    def start_axis(self) -> int:
-        """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
-        return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
-
-    @property
-    def start_conditions(self) -> tuple[str, ...]:
-        """What a force over these variables may be where growth begins."""
-        if self.start_axis < 0:
-            return (FREE_AT_START,)
-        return (
-            (ZERO_AT_START, CONSTANT_AT_START)
-            if len(self.variables) == 1
-            else (ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START)
-        )
-
-    def prior_modes(
-        self, lengths: Sequence[float], at_start: str = FREE_AT_START, least_variance: float = KEPT_VARIANCE
-    ) -> Floats:
-        """Square root of the prior covariance: coefficients of the splines for each mode at unit amplitude. Shape
-        (size, n_modes).
-        """
-        start_axis = self.start_axis
-        by_axis = [
-            covariance_modes(count, length, zero_at_start=k == start_axis)
-            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
-        ]
-        columns = [_product(by_axis, least_variance)]
-        if start_axis >= 0 and at_start == CONSTANT_AT_START:
-            columns.append(np.ones((self.size, 1)))
-        if start_axis >= 0 and at_start == FREE_AT_START:
-            # 3.0: prior amplitude of the force where growth begins, as a multiple of that of the rest of
-            # the surface (chosen)
-            constant_along_start_axis = [
-                (np.ones((count, 1)), np.array([3.0**2])) if k == start_axis else modes
-                for k, (count, modes) in enumerate(zip(self.counts, by_axis, strict=True))
-            ]
-            columns.append(_product(constant_along_start_axis, least_variance))
-        return np.hstack(columns)
-
-
-def _product(by_axis: Sequence[tuple[Floats, Floats]], least_variance: float) -> Floats:
-    """Modes of a product of processes, scaled by the root of their variance, shape (n_splines, n_modes kept)."""
-    variances: Floats = np.ones(1)
-    for _, of_axis in by_axis:
-        variances = np.asarray(np.kron(variances, of_axis))
-    kept = np.flatnonzero(variances > least_variance * variances.max())
-    vectors: Floats = np.ones((1, kept.size))
-    indices = np.unravel_index(kept, [of_axis.size for _, of_axis in by_axis])
-    for (eigenvectors, _), index in zip(by_axis, indices, strict=True):
-        vectors = (vectors[:, None, :] * eigenvectors[None, :, index]).reshape(-1, kept.size)
-    return np.asarray(vectors * np.sqrt(variances[kept]))
-
-
-@dataclass(frozen=True)
-class SmoothForce:
-    """A force over a domain whose amplitudes have independent normal priors of standard deviation `sd_N`. `modes`,
-    shape (n_splines, n_amplitudes), are the spline coefficients for unit amplitudes. An infinite `sd_N` leaves the
-    amplitudes free.
-    """
-
-    domain: Domain
-    modes: Floats
-    sd_N: float = math.inf
-
-    @property
-    def amplitude_precision(self) -> float:
-        """Prior precision of each amplitude, 1/N²."""
-        return self.sd_N**-2
-
-    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
-        """The force with these amplitudes along a motion. Shapes: amplitude (n_columns,) → (n_times,)."""
-        return self.domain.evaluate(self.domain.values_along(motion), self.modes @ amplitude)
-
-    def unit_force(self, motion: FittedMotion) -> Floats:
-        """The force of each unit amplitude along a motion. Shape (n_times, n_columns)."""
-        return np.asarray(self.domain.basis(self.domain.values_along(motion)) @ self.modes)
-
-
-def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
-    """Every variable alone, then every pair, over the ranges that the motions visit."""
-    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
-    ranges: dict[str, tuple[float, float, float]] = {}
-    for name, attribute in VARIABLES.items():
-        by_trial = [
-            np.asarray(getattr(motion, attribute))[motion.time_s <= motion.counts_until_s] for motion in motions
-        ]
-        # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
-        high = max(float(np.quantile(values, 0.98) if name == "speed" else values.max()) for values in by_trial)
-        low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
-        # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
-        if high - low > 0.02 * abs(high):
-            if name == "pressure":
-                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
-            typical = float(np.median([np.median(values) for values in by_trial]))
-            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
-            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
-
-    def domain(names: tuple[str, ...], counts: dict[str, int]) -> Domain:
-        lows, highs, log_scales = zip(*(ranges[name] for name in names), strict=True)
-        return Domain(names, lows, highs, tuple(counts[name] for name in names), log_scales)
-
-    # Splines along a variable, when it is alone and when it is one of two (chosen)
-    alone = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
-    in_pair = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
-    return [domain((name,), alone) for name in ranges] + [
-        domain(pair, in_pair) for pair in itertools.combinations(ranges, 2)
-    ]

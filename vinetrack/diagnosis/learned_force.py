@@ -3,11 +3,10 @@
 The force is a Gaussian process over growth, speed, time since release or pressure, or over two of them together
 (`vinetrack.diagnosis.force_inversion`). Its coefficients are fitted to positions, through the response of the
 trajectory to a force, with B, n, yield pressures and the release, origin, pressure and B of every trial free, each
-under its own prior; positions are never differentiated. For each choice of variables
-
-    ln Z = −½ χ²(ĉ) − ½ ln |H| + ½ ln |K⁻¹|,   H = ∇∇ ½χ² + K⁻¹
-
-Misfit that no force explains is treated as further noise: χ² is divided by what the best force leaves per point.
+under its own prior; positions are never differentiated. Choices of variables are compared by their marginal likelihood,
+averaged over amplitude, length scales and what the force may be where growth begins. Misfit that no force explains is
+treated as further noise. All choices are compared about the same motions: those on the tracks, then those under the
+force that leaves least.
 """
 
 from __future__ import annotations
@@ -15,7 +14,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,234 +23,290 @@ import numpy as np
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
-    CONVERGENCE_TOLERANCE,
-    CoefficientLikelihood,
+    LENGTH_SCALES,
     FittedMotion,
+    ForceEquations,
+    ForceEstimate,
     ForcePoint,
     ForceProblem,
-    optimise_force,
-)
-from vinetrack.diagnosis.force_laws import (
-    CONSTANT_AT_START,
-    FREE_AT_START,
-    LENGTH_SCALES,
-    RELATIVE_AMPLITUDES,
-    SEARCHED_VARIANCE,
-    VARIABLES,
-    Domain,
-    SmoothForce,
-    candidate_domains,
+    Posterior,
+    posterior,
+    product_of_modes,
+    root_of_covariance,
+    settled,
+    splines,
     standard_error,
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
+from vinetrack.dynamics.simulate import SimulationError
 
 if TYPE_CHECKING:
     import pandas as pd
 
+# What a force may depend on, and the attribute of a motion that holds it
+VARIABLES = {
+    "growth": "lead_position_m",
+    "speed": "tail_velocity_m_s",
+    "time": "time_s",
+    "pressure": "pressure_Pa",
+}
 
-# ------------------------------------------------------------------------------
-# Marginal likelihood and posterior of a smooth force over given variables, averaged over its hyperparameters.
-#
-# A force that is zero where growth begins, one that is constant there and one that is free there are compared by
-# their marginal likelihoods; `force_inversion` explains why the first is drawn unless the tracks contradict it.
-
-
-# Log-likelihood below that of the best hyperparameters at which a set of them is left out of the mean and the band
-# (chosen)
-NEGLIGIBLE_LOG_RATIO = 5.0
-
-
-@dataclass(frozen=True)
-class ForcePosterior:
-    """Posterior of a force under one condition at the start of growth. `log_evidence` is the log marginal likelihood,
-    averaged over amplitude and length scales; `surface` has the most likely ones. `mean`, N, and `covariance`, N², are
-    those of the spline coefficients; `chi2` is that of the mean.
-    """
-
-    at_start: str
-    log_evidence: float
-    surface: SmoothForce
-    length_scales: tuple[float, ...]
-    mean: Floats
-    covariance: Floats
-    chi2: float
-
-    @property
-    def domain(self) -> Domain:
-        """The variables of the force, with their ranges."""
-        return self.surface.domain
-
-    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """Posterior mean of the force at values of the variables, and its standard error. Returns force, sigma :
-        arrays, shape (n,), N. Shapes: values (n,).
-        """
-        basis = self.domain.basis(values)
-        return basis @ self.mean, standard_error(basis, self.covariance)
+# What a force may be where growth begins. A force that is free there competes with B, n and P_y, and has to be worth a
+# Δχ² of the answer set: those are believed first.
+ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
+LOG_ODDS = {ZERO_AT_START: 0.0, CONSTANT_AT_START: 0.0, FREE_AT_START: -0.5 * ANSWER_SET_DELTA_CHI2}
 
 
 @dataclass(frozen=True)
-class VariableChoice:
-    """A choice of variables with its log marginal likelihood, and the posterior under each start condition. The
-    marginal likelihood is averaged over the start conditions.
+class Domain:
+    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
+    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
     """
 
-    domain: Domain
-    log_evidence: float
-    posteriors: tuple[ForcePosterior, ...]
-
-    def best(self, error: float = 1.0) -> ForcePosterior:
-        """The posterior that is drawn; differences of ln Z count in units of `error`. The force is zero where growth
-        begins, or a constant where that is more likely. It is free there only if that is worth Δχ² of 9, because B, n
-        and P_y could take over such a force.
-        """
-        restricted = [each for each in self.posteriors if each.at_start != FREE_AT_START]
-        free = [each for each in self.posteriors if each.at_start == FREE_AT_START]
-        highest = max((each.log_evidence for each in restricted), default=-math.inf)
-        if not restricted or (free and free[0].log_evidence > highest + 0.5 * ANSWER_SET_DELTA_CHI2 * error):
-            return free[0]
-        weights = np.exp([(each.log_evidence - highest) / error for each in restricted])
-        weights /= weights.sum()
-        likely = next(each for each in restricted if each.log_evidence > highest - error)
-        covariance = np.zeros_like(likely.covariance)
-        for weight, each in zip(weights, restricted, strict=True):
-            deviation = each.mean - likely.mean
-            covariance += weight * (each.covariance + np.outer(deviation, deviation))
-        return replace(likely, covariance=covariance)
+    variables: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    counts: tuple[int, ...]
+    log_scale: tuple[float, ...]
 
     @property
-    def undecided_N(self) -> float:
-        """Standard error of a force that is free where growth begins, N: its median over the other variable. B, n and
-        P_y compete with such a force.
+    def name(self) -> str:
+        """The variables joined by +: `growth`, `growth+speed`."""
+        return "+".join(self.variables)
+
+    @property
+    def start_axis(self) -> int:
+        """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
+        return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
+
+    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
+        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
+        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
         """
-        grid_points = 30  # Points over a variable at which the standard error of a force is evaluated (chosen)
-        free = [each for each in self.posteriors if each.at_start == FREE_AT_START]
-        if not free or self.domain.start_axis < 0:
-            return 0.0
-        grid = [
-            np.linspace(low, high, grid_points) for low, high in zip(self.domain.low, self.domain.high, strict=True)
+        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
+        return [
+            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
+            if math.isfinite(log_scale)
+            else (at - low) / (high - low)
+            for at, low, high, log_scale in limits
         ]
-        grid[self.domain.start_axis] = np.full(grid_points, self.domain.low[self.domain.start_axis])
-        return float(np.median(free[0].force(grid)[1]))
+
+    def values_along(self, motion: FittedMotion) -> list[Floats]:
+        """The variables along a motion, SI, each of shape (n_times,)."""
+        return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
+
+    def basis(self, values: Sequence[Floats]) -> Floats:
+        """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, n_splines)."""
+        first, *others = [splines(at, count) for at, count in zip(self.normalised(values), self.counts, strict=True)]
+        for other in others:
+            first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
+        return first
+
+    def unit_push(self, motion: FittedMotion) -> Floats:
+        """The splines along a motion, shape (n_times, n_splines)."""
+        return self.basis(self.values_along(motion))
+
+    @property
+    def hypotheses(self) -> list[tuple[str, tuple[float, ...]]]:
+        """What the force may be where growth begins, with every combination of length scales."""
+        starts = list(LOG_ODDS) if len(self.variables) == 2 else [ZERO_AT_START, CONSTANT_AT_START]
+        lengths = itertools.product(LENGTH_SCALES, repeat=len(self.variables))
+        return list(itertools.product(starts if self.start_axis >= 0 else [FREE_AT_START], lengths))
+
+    def modes(self, at_start: str, lengths: Sequence[float]) -> Floats:
+        """Square root of the covariance of the coefficients at unit amplitude, shape (n_splines, n_modes)."""
+        start = self.start_axis
+        roots = [
+            root_of_covariance(count, length, k == start)
+            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
+        ]
+        modes = [product_of_modes(roots)]
+        if at_start == CONSTANT_AT_START:
+            modes.append(np.ones((math.prod(self.counts), 1)))
+        if at_start == FREE_AT_START and start >= 0:
+            # 3.0: prior amplitude of the force where growth begins, as a multiple of that of the rest (chosen)
+            roots[start] = np.full((self.counts[start], 1), 3.0)
+            modes.append(product_of_modes(roots))
+        return np.hstack(modes)
 
 
-def marginal_likelihood(
-    domain: Domain, likelihood: CoefficientLikelihood, inflation: float, largest_N: float
-) -> VariableChoice:
-    """Average the marginal likelihood of a domain over start conditions, length scales and amplitudes."""
-    posteriors = tuple(
-        _force_posterior(domain, at_start, likelihood, inflation, largest_N) for at_start in domain.start_conditions
-    )
-    logs = np.array([each.log_evidence for each in posteriors])
-    return VariableChoice(domain, float(logs.max() + np.log(np.mean(np.exp(logs - logs.max())))), posteriors)
-
-
-def _force_posterior(
-    domain: Domain, at_start: str, likelihood: CoefficientLikelihood, inflation: float, largest_N: float
-) -> ForcePosterior:
-    """The posterior under one start condition, averaged over length scales and amplitudes by their likelihoods. For
-    given length scales the information in the prior's modes is diagonalised, so that the amplitude only changes how
-    much each component is shrunk.
-    """
-    sizes_N = largest_N * RELATIVE_AMPLITUDES[:, None]
-    log_likelihoods, by_length = [], []
-    for lengths in itertools.product(LENGTH_SCALES, repeat=len(domain.variables)):
-        modes = domain.prior_modes(lengths, at_start)
-        values, vectors = np.linalg.eigh(modes.T @ likelihood.information @ modes / inflation)
-        score = vectors.T @ (modes.T @ likelihood.score) / inflation
-        widening = 1 + sizes_N**2 * np.maximum(values, 0.0)
-        variance = sizes_N**2 / widening
-        log_likelihoods.append(0.5 * np.sum(variance * score**2 - np.log(widening), axis=1))
-        by_length.append((lengths, modes @ vectors, variance, variance * score))
-    logs = np.array(log_likelihoods)
-    best, size = np.unravel_index(np.argmax(logs), logs.shape)
-    highest = logs[best, size]
-    likelihoods = np.exp(logs - highest)
-    evidence = highest + math.log(float(np.mean(likelihoods)))
-    weights = np.where(logs > highest - NEGLIGIBLE_LOG_RATIO, likelihoods, 0.0)
-    weights /= weights.sum()
-    mean, second_moment = np.zeros(domain.size), np.zeros((domain.size, domain.size))
-    for weight, (_, components, variance, means) in zip(weights, by_length, strict=True):
-        if weight.any():
-            mean += components @ (weight @ means)
-            second_moment += components @ (np.diag(weight @ variance) + (means.T * weight) @ means) @ components.T
-    lengths = by_length[best][0]
-    return ForcePosterior(
-        at_start,
-        float(evidence) - 0.5 * likelihood.chi2_at_zero / inflation - 0.5 * likelihood.log_determinant,
-        SmoothForce(domain, domain.prior_modes(lengths, at_start, SEARCHED_VARIANCE), float(sizes_N[size, 0])),
-        lengths,
-        mean,
-        second_moment - np.outer(mean, mean),
-        likelihood.chi2_at_zero - 2 * float(likelihood.score @ mean) + float(mean @ likelihood.information @ mean),
-    )
-
-
-def variable_weights(choices: Sequence[VariableChoice], error: float) -> dict[str, float]:
-    """Posterior probabilities of choices of variables, with equal prior odds for one variable and for two. Returns by
-    name of the choice, highest first.
-    """
-    counts = {size: sum(len(choice.domain.variables) == size for choice in choices) for size in (1, 2)}
-    highest = max(choice.log_evidence for choice in choices)
-    raw = {
-        choice.domain.name: math.exp((choice.log_evidence - highest) / error) / counts[len(choice.domain.variables)]
-        for choice in choices
-    }
-    return {name: value / sum(raw.values()) for name, value in sorted(raw.items(), key=lambda part: -part[1])}
+def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
+    """Every variable alone, then every pair, over the ranges that the motions visit."""
+    pressure_margin = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
+    ranges: dict[str, tuple[float, float, float]] = {}
+    for name, attribute in VARIABLES.items():
+        by_trial = [np.asarray(getattr(motion, attribute))[motion.is_visited] for motion in motions]
+        # 0.98: quantile of a trial's speeds that counts as its highest (chosen)
+        high = max(float(np.quantile(values, 0.98) if name == "speed" else values.max()) for values in by_trial)
+        low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
+        # 0.02: part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
+        if high - low > 0.02 * abs(high):
+            if name == "pressure":
+                low, high = (1 - pressure_margin) * low, (1 + pressure_margin) * high
+            typical = float(np.median([np.median(values) for values in by_trial]))
+            # ("speed", "time"): variables on a logarithmic scale above their median (chosen)
+            ranges[name] = low, high, typical if name in ("speed", "time") else math.inf
+    # Splines along a variable, when it is alone and when it is one of two (chosen)
+    alone = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
+    in_pair = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
+    domains = []
+    for names in (*((name,) for name in ranges), *itertools.combinations(ranges, 2)):
+        counts = tuple((alone if len(names) == 1 else in_pair)[name] for name in names)
+        lows, highs, scales = zip(*(ranges[name] for name in names), strict=True)
+        domains.append(Domain(names, lows, highs, counts, scales))
+    return domains
 
 
 # ------------------------------------------------------------------------------
-# Which variables a learned force may depend on when the trials cannot tell.
+# The choice of variables.
 #
 # Where speeds are steady, growth, speed and time are hardly three separate variables: a surface over two of them can
 # be written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the
 # prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
 
+# Part of χ² that is the unit of differences of ln Z where that is more than 1: so much depends on the prior (chosen)
+LEAST_DIFFERENCE = 5e-4
 
-def not_excluded(
-    best: Domain, weights: Mapping[str, float], losses: Mapping[str, float], threshold: float, others: Sequence[Domain]
-) -> list[str]:
-    """Choices of variables, besides the best, that the trials do not exclude: those with enough weight, and those of no
-    more variables than the best whose χ² is hardly larger; highest weight first.
-    """
-    # 0.05: weight from which a choice of variables is reported with the best (chosen)
-    names = [
-        domain.name
-        for domain in others
-        if domain.name != best.name
-        and (
-            weights[domain.name] >= 0.05
-            or (len(domain.variables) <= len(best.variables) and losses[domain.name] < threshold)
-        )
-    ]
-    return sorted(names, key=lambda name: -weights[name])
-
+LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is estimated (chosen)
 
 LEARNED_COLUMNS = (*VARIABLES.values(), "force_N", "sigma_N", "trials", "condition")
 
 
-LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is estimated (chosen)
+@dataclass(frozen=True)
+class Choice:
+    """A force over some variables. `equations` are those of its coefficients, `best` their least squares without regard
+    to how smooth the force is, `found` their posterior.
+    """
+
+    domain: Domain
+    equations: ForceEquations
+    best: ForceEstimate
+    found: Posterior
+
+    @property
+    def least_chi2(self) -> float:
+        """χ² of the best coefficients."""
+        return self.equations.chi2 - self.best.delta_chi2
+
+
+def amplitudes_N(motions: Sequence[FittedMotion]) -> Floats:
+    """Amplitudes of forces that are averaged over, N."""
+    drive_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
+    return drive_N * np.geomspace(0.003, 0.3, 9)  # Parts of the largest drive (chosen)
+
+
+def choices_seen_from(problem: ForceProblem, point: ForcePoint) -> list[Choice]:
+    """All choices of variables about the motions of a point."""
+    domains = candidate_domains(point.motions)
+    equations = [ForceEquations(problem, point, domain.unit_push) for domain in domains]
+    best = [each.estimate() for each in equations]
+    inflation = problem.inflation(min(e.chi2 - b.delta_chi2 for e, b in zip(equations, best, strict=True)))
+    found = [coefficients_of(*each, inflation) for each in zip(domains, equations, strict=True)]
+    return [Choice(*each) for each in zip(domains, equations, best, found, strict=True)]
+
+
+def coefficients_of(domain: Domain, equations: ForceEquations, inflation: float, begins: str = "") -> Posterior:
+    """The posterior of the coefficients over a domain, their noise variance inflated; `begins`, of forces that are this
+    where growth begins.
+    """
+    hypotheses = [each for each in domain.hypotheses if begins in ("", each[0])]
+    return posterior(
+        equations.information / inflation,
+        (equations.score + equations.information @ equations.coefficients) / inflation,
+        [domain.modes(*each) for each in hypotheses],
+        amplitudes_N(equations.point.motions),
+        [LOG_ODDS[at_start] for at_start, _ in hypotheses],
+    )
+
+
+def variable_weights(log_evidence: Mapping[str, float], unit: float = 1.0) -> dict[str, float]:
+    """Posterior probabilities of choices of variables, with equal prior odds for one variable and for two; differences
+    of ln Z count in this unit. By name, highest first.
+    """
+    pairs, highest = sum("+" in name for name in log_evidence), max(log_evidence.values())
+    raw = {
+        name: math.exp((value - highest) / unit) / (pairs if "+" in name else len(log_evidence) - pairs)
+        for name, value in log_evidence.items()
+    }
+    return {name: value / sum(raw.values()) for name, value in sorted(raw.items(), key=lambda part: -part[1])}
 
 
 @dataclass(frozen=True)
 class LearnedForce:
-    """The missing force over the variables that it most likely depends on. `best` is the posterior of the force;
-    `motions` are those of the trials at the solution.
+    """The missing force over the variables that it most likely depends on: the posterior of its coefficients, N, and
+    the most likely of the hypotheses that this averages over. `motions` are those of the trials at the solution.
     """
 
-    best: ForcePosterior
+    domain: Domain
+    found: Posterior
+    at_start: str
+    length_scales: tuple[float, ...]
     motions: Sequence[FittedMotion]
     weights: Mapping[str, float]
     not_excluded: tuple[str, ...]
     log_bayes_factor: float
     explained: float
-    table: pd.DataFrame
-    sentence: Remark
-    undecided_N: float = 0.0
+    undecided_N: float
+    is_repeated: bool
+
+    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """The force at values of the variables and its standard error, N. Shapes: values (n,) → (n,), (n,)."""
+        basis = self.domain.basis(values)
+        return basis @ self.found.mean, standard_error(basis, self.found.covariance)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The force on a grid, with the trials that visited each point, and along the first trial of each condition."""
+        import pandas as pd
+
+        plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
+        domain = self.domain
+        axes = [
+            np.linspace(low, high, plot_points[len(domain.variables) - 1])
+            for low, high in zip(domain.low, domain.high, strict=True)
+        ]
+        grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
+        trials = np.zeros(grid[0].size, dtype=int)
+        along: dict[str, list[Floats]] = {}
+        for motion in self.motions:
+            visited = domain.values_along(motion)
+            near = np.ones((grid[0].size, motion.time_s.size), dtype=bool) & motion.is_visited
+            for at, course in zip(domain.normalised(grid), domain.normalised(visited), strict=True):
+                near &= np.abs(at[:, None] - course) < visited_distance
+            trials += near.any(axis=1)
+            points = np.linspace(0, np.count_nonzero(motion.is_visited) - 1, plot_points[0]).astype(int)
+            along.setdefault(motion.trial.condition, [values[points] for values in visited])
+        parts = []
+        for condition, values in {"": grid, **along}.items():
+            force_N, sigma_N = self.force(values)
+            columns: dict[str, Any] = dict.fromkeys(VARIABLES.values(), math.nan)
+            columns |= {VARIABLES[name]: at for name, at in zip(domain.variables, values, strict=True)}
+            columns |= {"force_N": force_N, "sigma_N": sigma_N, "trials": 1 if condition else trials}
+            parts.append(pd.DataFrame(columns | {"condition": condition}))
+        return pd.concat(parts, ignore_index=True)
 
     @property
-    def domain(self) -> Domain:
-        """The variables that the force depends on, with their ranges."""
-        return self.best.domain
+    def visited(self) -> pd.DataFrame:
+        """The points of the grid that trials visited."""
+        return self.table[(self.table["condition"] == "") & (self.table["trials"] > 0)]
+
+    @cached_property
+    def sentence(self) -> Remark:
+        """What it depends on and how certain that is."""
+        force_N = self.visited["force_N"]
+        return remark(
+            "learned_force",
+            name=self.domain.name,
+            weights=self.weights,
+            alternatives=self.not_excluded,
+            begins=self.at_start if self.domain.start_axis >= 0 else "",
+            range_N=(float(force_N.min()), float(force_N.max())),
+            sigma_N=float(self.visited["sigma_N"].median()),
+            undecided_N=self.undecided_N,
+            explained=self.explained,
+            is_repeated=self.is_repeated,
+            has_pressures=any("pressure" in name for name in self.weights),
+        )
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
@@ -258,179 +314,89 @@ class LearnedForce:
             "variables": list(self.domain.variables),
             "weights": dict(self.weights),
             "not_excluded": list(self.not_excluded),
-            "length_scales": dict(zip(self.domain.variables, self.best.length_scales, strict=True)),
-            "amplitude_N": self.best.surface.sd_N,
+            "length_scales": dict(zip(self.domain.variables, self.length_scales, strict=True)),
+            "amplitude_N": self.found.amplitude,
             "log_bayes_factor": self.log_bayes_factor,
             "explained": self.explained,
-            "begins": self.best.at_start,
+            "begins": self.at_start,
             "undecided_N": self.undecided_N,
             "sentence": str(self.sentence),
         }
 
 
 def learned_force(problem: ForceProblem) -> LearnedForce | None:
-    """Estimate the missing force over the variables with the highest marginal likelihood. All choices of variables are
-    compared about the same motions: those on the tracks, then those under the force that leaves least.
-    """
-    seen = _choices_seen_from(problem, problem.tracks)
-    if seen is None or seen.chi2_without_force < LEAST_CHI2_PER_POINT * problem.n_points:
-        return None
-    log_bayes_factors = {each.domain.name: each.log_evidence - seen.log_evidence_without_force for each in seen.choices}
+    """The missing force over the variables of the highest marginal likelihood, where it explains the misfit."""
+    on_tracks = choices_seen_from(problem, problem.tracks)
+    misfit = on_tracks[0].equations.chi2 - problem.n_points
+    log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in on_tracks}
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
-    if max(log_bayes_factors.values()) < 18.0:
+    if misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points or max(log_bayes_factors.values()) < 18.0:
         return None
-    chi2_without_force = seen.chi2_without_force
-    point = _under_best(problem, seen)
-    again = None if point is None else _choices_seen_from(problem, point)
-    if again is None:
+    try:
+        with np.errstate(all="raise", under="ignore"):
+            choices = choices_seen_from(problem, _under_best(problem, on_tracks))
+    except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
         return None
-    seen = again
-    # 20: effective number of independent residuals in a trial where a model leaves more than noise (chosen)
-    points_per_part = max(problem.n_points / (20 * len(problem.data)), 1.0)
-    # Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer, and
-    # where the search has ended short of the least χ²
-    correlated = (1 + (seen.inflation - 1) * points_per_part) / seen.inflation
-    error = max(0.5 * CONVERGENCE_TOLERANCE * min(seen.least_chi2.values()) / seen.inflation, correlated)
-    weights = variable_weights(seen.choices, error)
-    choice = max(seen.choices, key=lambda each: weights[each.domain.name])
-    best = choice.best(correlated)
-    misfit = chi2_without_force - problem.n_points
-    explained = (chi2_without_force - best.chi2) / misfit
+    inflation = problem.inflation(min(choice.least_chi2 for choice in choices))
+    unit = max(LEAST_DIFFERENCE * min(choice.least_chi2 for choice in choices) / inflation, 1.0)
+    weights = variable_weights({choice.domain.name: choice.found.log_evidence for choice in choices}, unit)
+    best = max(choices, key=lambda choice: weights[choice.domain.name])
+    domain, equations, mean = best.domain, best.equations, best.found.mean
+    explained = (misfit + problem.n_points - equations.chi2_with(mean)) / misfit
     # 0.95: part of the misfit that the force must take away to be reported (chosen)
     if explained < 0.95:
         return None
-    # Choices are excluded by the χ² of their best coefficients, without regard to how smooth those are.
-    losses = {
-        name: (chi2 - seen.least_chi2[best.domain.name]) / seen.inflation for name, chi2 in seen.least_chi2.items()
-    }
-    alternatives = not_excluded(best.domain, weights, losses, ANSWER_SET_DELTA_CHI2 * error, seen.domains)
-    table, explained = _table(best, seen.point.motions), min(explained, 1.0)
-    visited = table[(table["condition"] == "") & (table["trials"] > 0)]
+    # Besides the best, those with enough weight, and those of no more variables whose χ² is hardly larger, without
+    # regard to how smooth they are. 0.05: weight from which a choice is reported with the best (chosen)
+    threshold = best.least_chi2 + inflation * unit * ANSWER_SET_DELTA_CHI2
+    others = [
+        other.domain.name
+        for other in choices
+        if other is not best
+        and (
+            weights[other.domain.name] >= 0.05
+            or (len(other.domain.variables) <= len(domain.variables) and other.least_chi2 < threshold)
+        )
+    ]
+    others.sort(key=lambda name: -weights[name])
+    at_start, lengths = domain.hypotheses[best.found.hypothesis]
     return LearnedForce(
-        best=best,
-        motions=seen.point.motions,
+        domain=domain,
+        found=best.found,
+        at_start=at_start,
+        length_scales=lengths,
+        motions=equations.point.motions,
         weights=weights,
-        not_excluded=tuple(alternatives),
-        log_bayes_factor=log_bayes_factors[best.domain.name],
-        explained=explained,
-        table=table,
-        sentence=remark(
-            "learned_force",
-            name=best.domain.name,
-            weights=weights,
-            alternatives=alternatives,
-            begins=best.at_start if best.domain.start_axis >= 0 else "",
-            range_N=(float(visited["force_N"].min()), float(visited["force_N"].max())),
-            sigma_N=float(visited["sigma_N"].median()),
-            undecided_N=choice.undecided_N,
-            explained=explained,
-            is_repeated=bool(problem.scatter.dof),
-            has_pressures=any("pressure" in domain.variables for domain in seen.domains),
-        ),
-        undecided_N=choice.undecided_N,
+        not_excluded=tuple(others),
+        log_bayes_factor=log_bayes_factors[domain.name],
+        explained=min(explained, 1.0),
+        undecided_N=_undecided_N(best, inflation),
+        is_repeated=bool(problem.scatter.dof),
     )
 
 
-@dataclass(frozen=True)
-class _Choices:
-    """All choices of variables about the motions of a point, most likely first. `inflation` is the ratio of residual to
-    noise variance that the best coefficients of any of them leave, `least_chi2` what those of each leave, by name.
-    """
-
-    point: ForcePoint
-    choices: list[VariableChoice]
-    inflation: float
-    least_chi2: dict[str, float]
-    chi2_without_force: float
-    log_evidence_without_force: float
-
-    @property
-    def domains(self) -> list[Domain]:
-        """The variables of all choices."""
-        return [choice.domain for choice in self.choices]
-
-
-def _choices_seen_from(problem: ForceProblem, point: ForcePoint) -> _Choices | None:
-    """The marginal likelihood of every choice of variables; None where they cannot be computed."""
-    largest_N = max(float(np.max(np.nan_to_num(m.pressure_Pa) * m.trial.area_m2)) / 2 for m in point.motions)
-    domains = candidate_domains(point.motions)
-    likelihoods = [
-        problem.linearised(point.asking(SmoothForce(domain, np.eye(domain.size)))).likelihood() for domain in domains
-    ]
-    if not all(likelihood.is_finite for likelihood in likelihoods):
-        return None
-    inflation = max(min(likelihood.least_chi2 for likelihood in likelihoods) / problem.n_points, 1.0)
-    chi2_without_force = likelihoods[0].chi2_at_zero
-    choices = [
-        marginal_likelihood(domain, likelihood, inflation, largest_N)
-        for domain, likelihood in zip(domains, likelihoods, strict=True)
-    ]
-    return _Choices(
-        point,
-        sorted(choices, key=lambda choice: -choice.log_evidence),
-        inflation,
-        {domain.name: likelihood.least_chi2 for domain, likelihood in zip(domains, likelihoods, strict=True)},
-        chi2_without_force,
-        -0.5 * chi2_without_force / inflation - 0.5 * likelihoods[0].log_determinant,
-    )
-
-
-def _under_best(problem: ForceProblem, seen: _Choices) -> ForcePoint | None:
+def _under_best(problem: ForceProblem, choices: Sequence[Choice]) -> ForcePoint:
     """The motions under the most probable force of the most likely variable or of the most likely two, whichever leaves
-    less: far from the solution, two are often the more likely for errors of the linear equations alone. The force is
-    constant at the start of growth: what motions on the tracks lack there would be fitted as a force.
+    less: far from the solution, two are often the more likely for errors of the linear equations alone.
     """
-    optima = []
-    for size in (1, 2):
-        choice = next((each for each in seen.choices if len(each.domain.variables) == size), None)
-        if choice is None:
-            continue
-        likely = max(choice.posteriors, key=lambda each: each.log_evidence)
-        modes = choice.domain.prior_modes(likely.length_scales, CONSTANT_AT_START, SEARCHED_VARIANCE)
-        # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
-        surface = SmoothForce(choice.domain, modes, likely.surface.sd_N / math.sqrt(seen.inflation))
-        optima.append(optimise_force(problem, seen.point.asking(surface)))
-    found = [optimum for optimum in optima if optimum is not None]
-    return min(found, key=lambda optimum: optimum.cost).point if found else None
+    inflation = problem.inflation(min(choice.least_chi2 for choice in choices))
+    by_evidence = sorted(choices, key=lambda choice: -choice.found.log_evidence)
+    likely = {len(choice.domain.variables): choice for choice in reversed(by_evidence)}
+
+    def settle(choice: Choice) -> tuple[float, ForcePoint]:
+        return settled(choice.equations, lambda each: coefficients_of(choice.domain, each, inflation).mean)
+
+    return min((settle(choice) for choice in likely.values()), key=lambda found: found[0])[1]
 
 
-def _table(best: ForcePosterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
-    """The force on a grid, with the trials that visited each point, and along the first trial of each condition."""
-    import pandas as pd
-
-    plot_points, visited_distance = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
-    domain = best.domain
-    axes = [
-        np.linspace(low, high, plot_points[len(domain.variables) - 1])
-        for low, high in zip(domain.low, domain.high, strict=True)
-    ]
-    grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
-    trials = np.zeros(grid[0].size)
-    for motion in motions:
-        near = np.ones((grid[0].size, motion.time_s.size), dtype=bool)
-        near &= motion.time_s <= motion.counts_until_s
-        visited = domain.normalised(domain.values_along(motion))
-        for at, along in zip(domain.normalised(grid), visited, strict=True):
-            near &= np.abs(at[:, None] - along) < visited_distance
-        trials += near.any(axis=1)
-    parts = [_rows(best, grid, trials, "")]
-    drawn: set[str] = set()
-    for motion in motions:
-        if motion.trial.condition not in drawn:
-            drawn.add(motion.trial.condition)
-            last = int(np.count_nonzero(motion.time_s <= motion.counts_until_s)) - 1
-            points = np.linspace(0, last, plot_points[0]).astype(int)
-            values = [along[points] for along in domain.values_along(motion)]
-            parts.append(_rows(best, values, np.ones(points.size), motion.trial.condition))
-    return pd.concat(parts, ignore_index=True)
-
-
-def _rows(best: ForcePosterior, values: Sequence[Floats], trials: Floats, condition: str) -> pd.DataFrame:
-    import pandas as pd
-
-    force, sigma = best.force(values)
-    given = {VARIABLES[name]: at for name, at in zip(best.domain.variables, values, strict=True)}
-    columns = {name: given.get(name, np.full(force.size, math.nan)) for name in VARIABLES.values()}
-    return pd.DataFrame(
-        columns | {"force_N": force, "sigma_N": sigma, "trials": trials.astype(int), "condition": condition}
-    )
+def _undecided_N(choice: Choice, inflation: float) -> float:
+    """Standard error of a force that is free where growth begins, N: its median over the other variable. B, n and P_y
+    compete with such a force.
+    """
+    domain = choice.domain
+    if domain.start_axis < 0 or len(domain.variables) < 2:
+        return 0.0
+    at = [np.linspace(low, high, 30) for low, high in zip(domain.low, domain.high, strict=True)]
+    at[domain.start_axis] = np.full(30, domain.low[domain.start_axis])
+    free = coefficients_of(domain, choice.equations, inflation, FREE_AT_START)
+    return float(np.median(standard_error(domain.basis(at), free.covariance)))

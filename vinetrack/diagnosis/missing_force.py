@@ -1,9 +1,10 @@
 """The force that a model lacks: drawn against growth, speed, time and pressure, and compared with simple laws.
 
 Positions are never differentiated. The responses of the trajectories to a force are known
-(`vinetrack.diagnosis.force_inversion`); the force is then estimated by generalised least squares with the noise of
-the tracks (`vinetrack.diagnosis.force_inversion`). Release and origin of every trial are free, its pressure and B are
-free within the scatter of replicates, and B, n and all other model parameters are free.
+(`vinetrack.diagnosis.force_inversion`); the force is then estimated by generalised least squares with the noise of the
+tracks. Release and origin of every trial are free, its pressure and B are free within the scatter of replicates, and B,
+n and all other model parameters are free. The motions are those under the force that is learned
+(`vinetrack.diagnosis.learned_force`).
 
 Part of any force can be taken over by B and n: the data do not decide between them and a freely drawn force. Where a
 simple law explains most of what is missing, B and n are set as they are with this law; otherwise they stay as fitted.
@@ -12,7 +13,7 @@ simple law explains most of what is missing, B and n are set as they are with th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,20 +24,26 @@ from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import (
-    LEAST_INFORMATION,
-    PARAMETER_CUTOFF,
+    LENGTH_SCALES,
     FittedMotion,
+    ForceEquations,
     ForceEstimate,
     ForcePoint,
     ForceProblem,
-    FreeForce,
-    optimise_force,
-    scaled_pseudo_inverse,
-    splines,
-    uniform_splines,
+    posterior,
+    root_of_covariance,
+    settled,
+    standard_error,
 )
-from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid, standard_error
-from vinetrack.diagnosis.learned_force import LearnedForce, learned_force
+from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid
+from vinetrack.diagnosis.learned_force import (
+    VARIABLES,
+    Domain,
+    LearnedForce,
+    amplitudes_N,
+    candidate_domains,
+    learned_force,
+)
 from vinetrack.diagnosis.replicates import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
@@ -45,12 +52,8 @@ from vinetrack.inference.fit_result import Fit
 if TYPE_CHECKING:
     import pandas as pd
 
-
 # ------------------------------------------------------------------------------
 # Simple laws ranked by how well they explain the misfit of a fit.
-
-# Multiple of the largest drive, weight and inertia of the trials above which a force is not reported (chosen)
-MAX_DRIVE_RATIO = 10.0
 
 
 @dataclass(frozen=True)
@@ -76,173 +79,67 @@ class RankedLaw:
         return self.law.words(self.estimate.amplitude.tolist(), self.estimate.sigma)
 
 
-# Splines of a force along the growth of one condition, and the extra knots in the first tenth of it (chosen)
-N_SPLINES, EARLY_KNOTS = 15, (0.01, 0.03, 0.06)
-
-
-def growth_splines(part: Floats) -> Floats:
-    """Splines of a force along the growth, narrower at the start, where the vine accelerates. Shapes: part (n,) → (n,
-    N_SPLINES).
+def ranked_laws(problem: ForceProblem, point: ForcePoint, chi2: float, smooth_delta_chi2: float) -> list[RankedLaw]:
+    """The best law of each kind, over the grid, near the best of each kind, then nearer to the first: detected ones
+    first, then by their Bayesian information criterion (Schwarz, Annals of Statistics 6, 461, 1978). Misfit that not
+    even the best force explains is counted as further noise: it inflates the variance of every independent residual.
+    `chi2` is that without a force, `smooth_delta_chi2` its fall with a smooth force.
     """
-    uniform_knots = np.linspace(0.0, 1.0, N_SPLINES - 2 - len(EARLY_KNOTS))[1:]
-    return splines(part, np.concatenate([[0.0, *EARLY_KNOTS], uniform_knots]))
-
-
-class ForcesByCondition:
-    """A force whose amplitudes are free in every condition: the equations of each condition, with the trial effects
-    eliminated. `information` (n_conditions, q, q) and `score` (n_conditions, q) of the amplitudes, `cross`
-    (n_conditions, p, q) with the model parameters. `delta_chi2` is the fall of χ² from `chi2_without_force`.
-    """
-
-    def __init__(self, problem: ForceProblem, point: ForcePoint, unit_force: Callable[[FittedMotion], Floats]) -> None:
-        linear = problem.linearised(point.asking(FreeForce(unit_force)))
-        self.linear, self.chi2_without_force = linear, linear.chi2_without_force
-        self.names = list(dict.fromkeys(problem.conditions))
-        condition = np.array([self.names.index(name) for name in problem.conditions])
-        prior, products = problem.prior, linear.eliminated
-        k, p, q = prior.index.shape[1], prior.prior_mean.size, linear.point.amplitude.size
-        self.information, self.score = np.zeros((len(self.names), q, q)), np.zeros((len(self.names), q))
-        cross = np.zeros((len(self.names), p + 1, q))
-        np.add.at(self.information, condition, products[:, k:-1, k:-1])
-        np.add.at(self.score, condition, products[:, k:-1, -1])
-        np.add.at(cross, (condition[:, None], prior.places), products[:, :k, k:-1])
-        self.cross = cross[:, :p] * prior.free[:, None]
-        parameters, parameter_score = linear.blocks[0], linear.blocks[1][:, -1]
-        sizes = np.einsum("nkk->nk", self.information)
-        estimable = sizes > LEAST_INFORMATION * max(float(sizes.max()), 1e-300)
-        inverses = np.array(
-            [
-                scaled_pseudo_inverse(information, LEAST_INFORMATION, which)
-                for information, which in zip(self.information, estimable, strict=True)
-            ]
-        )
-        response = self.cross @ inverses
-        parameters = parameters - np.einsum("npq,nrq->pr", response, self.cross)
-        left = parameter_score - np.einsum("npq,nq->p", response, self.score)
-        gained = float(left @ scaled_pseudo_inverse(parameters, PARAMETER_CUTOFF) @ left)
-        gained -= float(parameter_score @ linear.parameter_response[:, -1])
-        self.delta_chi2 = gained + float(np.einsum("nk,nkl,nl->", self.score, inverses, self.score))
-        self.delta_chi2_beyond_chance = max(self.delta_chi2 - int(np.count_nonzero(estimable)), 0.0)
-
-    def curves(self, parameter_shift: Floats) -> dict[str, tuple[Floats, Floats]]:
-        """A smooth force in every condition at given model parameters: coefficients, N, shape (q,), and their
-        covariance. The coefficients minimise χ² plus a penalty on their second differences (a P-spline, Eilers & Marx
-        1996). One penalty for all conditions is chosen by generalised cross-validation. Shapes: parameter_shift
-        (n_free,).
-        """
-        information, score = self.information, self.score - np.einsum("npq,p->nq", self.cross, parameter_shift)
-        n_points, count = self.linear.problem.n_points, score.shape[1]
-        second_difference = np.diff(np.eye(count), 2, axis=0)
-        unit = float(np.mean(np.einsum("nkk->n", information))) / count
-        roughness = unit * (second_difference.T @ second_difference + 1e-6 * np.eye(count))
-        best: tuple[float, Floats, Floats] | None = None
-        independent_points = self.linear.problem.independent_points
-        unpenalised = np.linalg.solve(information + 1e-9 * roughness, score[:, :, None])[:, :, 0]
-        largest_gain = float(np.sum(score * unpenalised))
-        # Penalties, relative to the mean information about a coefficient (chosen)
-        for penalty in np.geomspace(1e-6, 1e2, 17):
-            inverse = np.linalg.inv(information + penalty * roughness)
-            coefficients = np.einsum("nkl,nl->nk", inverse, score)
-            lost_gain = largest_gain - float(
-                np.sum(2 * coefficients * score) - np.einsum("nk,nkl,nl->", coefficients, information, coefficients)
-            )
-            degrees_of_freedom = float(np.einsum("nkl,nlk->", inverse, information))
-            cross_validation = (lost_gain + independent_points) / max(independent_points - degrees_of_freedom, 1.0) ** 2
-            if best is None or cross_validation < best[0]:
-                best = cross_validation, coefficients, inverse
-        assert best is not None
-        unmoved = not parameter_shift.any()
-        left = (self.chi2_without_force - largest_gain) / max(n_points - score.size, 1.0)
-        inflation = max(1.0, left) if unmoved else 1.0
-        return {name: (best[1][i], inflation * best[2][i]) for i, name in enumerate(self.names)}
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """What a fit leaves unexplained, seen from one set of motions: χ² without a force, that of a smooth force in every
-    condition (its fall beyond chance), and the best law of each kind, best first.
-    """
-
-    point: ForcePoint
-    chi2_without_force: float
-    by_condition: ForcesByCondition
-    laws: list[RankedLaw]
-
-    @property
-    def chi2_with_law(self) -> float:
-        """χ² that the first law leaves."""
-        return self.chi2_without_force - self.laws[0].estimate.delta_chi2
-
-
-def misfit_of(problem: ForceProblem) -> Misfit:
-    """The misfit seen from the tracks or, where that leaves less, from the motions under the law that is best there.
-    Tracks are smoothed too much to show a force over a few millimetres in its place; the vine under a law is not.
-    """
-    on_tracks = _seen_from(problem, problem.tracks)
-    best = on_tracks.laws[0]
-    if not best.is_detected:
-        return on_tracks
-    optimum = optimise_force(problem, on_tracks.point.asking(FreeForce(best.law.unit_force)))
-    if optimum is None:
-        return on_tracks
-    under_law = _seen_from(problem, optimum.point)
-    return min(on_tracks, under_law, key=lambda misfit: misfit.chi2_with_law)
-
-
-def _seen_from(problem: ForceProblem, point: ForcePoint) -> Misfit:
-    """The best law of each kind: over the grid, then near the best of each kind."""
-    longest = _longest(point.motions)
-    smooth = ForcesByCondition(
-        problem, point, lambda motion: growth_splines(motion.lead_position_m / longest[motion.trial.condition])
-    )
-    chi2, largest_N = smooth.chi2_without_force, _largest_N(point.motions)
+    n_independent = 10.0 * len(problem.data)  # Independent residuals where a model leaves more than noise (chosen)
+    largest_N = _largest_N(point.motions)
 
     def ranked(estimated: Sequence[tuple[Law, ForceEstimate]]) -> list[RankedLaw]:
-        largest = max(smooth.delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
+        largest = max(smooth_delta_chi2, *(estimate.delta_chi2 for _, estimate in estimated))
+        noise = 1 + max(chi2 - largest - problem.n_points, 0.0) / n_independent
         laws = [
-            RankedLaw(law, one, problem.bic(chi2, one.delta_chi2, law.n_parameters, largest), largest_N=largest_N)
-            for law, one in estimated
+            RankedLaw(
+                law,
+                estimate,
+                (largest - estimate.delta_chi2) / noise + law.n_parameters * math.log(n_independent),
+                largest_N=largest_N,
+            )
+            for law, estimate in estimated
         ]
         best: dict[str, RankedLaw] = {}
-        # Detected ones first, then by BIC
-        for law in sorted(laws, key=lambda law: (not law.is_detected, law.bic)):
-            best.setdefault(law.law.name, law)
+        for each in sorted(laws, key=lambda law: (not law.is_detected, law.bic)):
+            best.setdefault(each.law.name, each)
         return list(best.values())
 
     estimated = _estimates(problem, point, laws_on_grid(point.motions))
-    near = [law for best in ranked(estimated) for law in laws_near(best.law, point.motions)]
-    laws = ranked(estimated + _estimates(problem, point, near))
-    return Misfit(point, chi2, smooth, laws)
+    for finer, count in ((1.0, None), (0.25, 1)):
+        best = ranked(estimated)[:count]
+        near = [law for each in best for law in laws_near(each.law, point.motions, finer)]
+        estimated += _estimates(problem, point, near)
+    return ranked(estimated)
 
 
 def _estimates(problem: ForceProblem, point: ForcePoint, laws: Sequence[Law]) -> list[tuple[Law, ForceEstimate]]:
     """Each law estimated alone."""
     if not laws:
         return []
-    all_laws = FreeForce(lambda motion: np.column_stack([law.unit_force(motion) for law in laws]))
-    each = problem.linearised(point.asking(all_laws)).estimates([law.n_amplitudes for law in laws])
-    return [
-        (law, estimate)
-        for law, estimate in zip(laws, each, strict=True)
-        if estimate.degrees_of_freedom or law.kind == "constant"
-    ]
+    equations = ForceEquations(problem, point, lambda motion: np.hstack([law.unit_force(motion) for law in laws]))
+    ends = np.cumsum([law.n_amplitudes for law in laws]).tolist()
+    places = [slice(end - law.n_amplitudes, end) for law, end in zip(laws, ends, strict=True)]
+    return [(law, equations.estimate(place)) for law, place in zip(laws, places, strict=True)]
 
 
 def _largest_N(motions: Sequence[FittedMotion]) -> float:
-    """The largest force that is reported: MAX_DRIVE_RATIO times drive, weight and inertia at their largest."""
+    """The largest force that is reported: ten times drive, weight and inertia of the trials at their largest."""
     sizes = []
     for motion in motions:
         drive_N = np.nan_to_num(motion.pressure_Pa * motion.trial.area_m2 / motion.trial.travel_ratio)
         body_N = motion.mass_kg * (GRAVITY_M_S2 + np.abs(motion.acceleration))
         sizes.append(float(np.max(drive_N + body_N)))
-    return MAX_DRIVE_RATIO * max(sizes)
+    return 10.0 * max(sizes)
 
+
+# ------------------------------------------------------------------------------
+# What is missing.
 
 FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
 LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
 
 LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
-
 
 # Part of the misfit that a smooth force in every condition must take away for the misfit to count as a force (chosen)
 LEAST_MISFIT_REDUCTION = 0.5
@@ -271,46 +168,6 @@ class MissingForce:
         }
 
 
-@in_one_blas_thread
-def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
-    """Estimate the force that a fit lacks and compare it with simple laws."""
-    problem = force_problem(fit)
-    misfit = misfit_of(problem)
-    point, best = misfit.point, misfit.laws[0]
-    by_variable = _explained_by_variable(problem, point)
-    explicable = max(
-        [
-            1e-300,
-            misfit.by_condition.delta_chi2_beyond_chance,
-            *by_variable.values(),
-            *(law.estimate.delta_chi2_beyond_chance for law in misfit.laws),
-        ]
-    )
-    laws = [replace(law, explained=law.estimate.delta_chi2_beyond_chance / explicable) for law in misfit.laws]
-    depends_on = {name: delta_chi2 / explicable for name, delta_chi2 in by_variable.items()}
-    best = laws[0]
-    named = best.explained >= LEAST_EXPLAINED_TO_NAME and best.is_detected
-    as_fitted = fit.solution.state.theta - point.theta
-    curves = misfit.by_condition.curves(best.estimate.parameter_shift if named else as_fitted)
-    beyond_noise = misfit.chi2_without_force - problem.n_points
-    # NaN where the misfit hardly exceeds the noise
-    reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
-    return MissingForce(
-        table=_force_table(point.motions, curves),
-        laws=_law_table(laws),
-        depends_on=depends_on,
-        sentence=_remark(laws, depends_on, reduction),
-        detected=tuple(law for law in laws if law.is_detected),
-        learned=_learned(problem) if learn else None,
-    )
-
-
-@in_one_blas_thread
-def learn_missing_force(fit: Fit) -> LearnedForce | None:
-    """Estimate the force that a fit lacks as a smooth function, without comparing it with laws."""
-    return _learned(force_problem(fit))
-
-
 def force_problem(fit: Fit) -> ForceProblem:
     """What is asked of forces beside a fit, with the scatter of its replicates."""
     try:
@@ -319,93 +176,118 @@ def force_problem(fit: Fit) -> ForceProblem:
         raise FitError(f"The model cannot be simulated: {error}") from error
 
 
-def _learned(problem: ForceProblem) -> LearnedForce | None:
-    """The force as a smooth function; None also where the motions under it cannot be simulated."""
-    try:
-        with np.errstate(all="raise", under="ignore"):
-            return learned_force(problem)
-    except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
-        return None
+@in_one_blas_thread
+def learn_missing_force(fit: Fit) -> LearnedForce | None:
+    """Estimate the force that a fit lacks as a smooth function, without comparing it with laws."""
+    return learned_force(force_problem(fit))
 
 
-def _explained_by_variable(problem: ForceProblem, point: ForcePoint) -> dict[str, float]:
-    """Fall of χ² beyond chance with a smooth force of one variable, and with a constant force in each condition."""
-    values_of = {
-        "growth": lambda m: m.lead_position_m,
-        "speed": lambda m: m.tail_velocity_m_s,
-        "time": lambda m: m.time_s,
-    }
-    # Splines of a force that depends on one variable alone, the same in all trials (chosen)
-    counts = {"growth": 24, "speed": 10, "time": 10}
-    highest = {name: max(float(of(motion).max()) for motion in point.motions) for name, of in values_of.items()}
-    forces = FreeForce(
-        lambda motion: np.hstack(
-            [uniform_splines(values_of[name](motion) / highest[name], count) for name, count in counts.items()]
-        )
+@in_one_blas_thread
+def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
+    """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
+    problem = force_problem(fit)
+    # Tracks are smoothed too much to show a force over a few millimetres in its place; the vine under a law is not.
+    seen, left = _misfit(problem, problem.tracks), math.inf
+    while seen.laws[0].is_detected and seen.chi2_with_law < 0.99 * left:
+        left, equations = seen.chi2_with_law, ForceEquations(problem, seen.along.point, seen.laws[0].law.unit_force)
+        _, under_law = settled(equations, lambda each: each.coefficients + each.estimate().amplitude)
+        seen = min(seen, _misfit(problem, under_law), key=lambda each: each.chi2_with_law)
+    chi2, point = seen.along.chi2, seen.along.point
+    explained = {"condition": max(seen.constants[0] - seen.constants[1], 0.0)}
+    for domain in candidate_domains(point.motions):
+        if domain.name in ("growth", "speed", "time"):
+            estimate = ForceEquations(problem, point, domain.unit_push).estimate()
+            explained[domain.name] = estimate.delta_chi2_beyond_chance
+    in_laws = [law.estimate.delta_chi2_beyond_chance for law in seen.laws]
+    explicable = max(1e-300, seen.by_condition[0] - seen.by_condition[1], *explained.values(), *in_laws)
+    laws = [replace(law, explained=part / explicable) for law, part in zip(seen.laws, in_laws, strict=True)]
+    depends_on = {name: explained[name] / explicable for name in ("growth", "speed", "time", "condition")}
+    named = laws[0].explained >= LEAST_EXPLAINED_TO_NAME and laws[0].is_detected
+    shift = laws[0].estimate.parameter_shift if named else fit.solution.state.theta - point.theta
+    curves = _curves(seen, shift, problem.inflation(chi2 - seen.by_condition[0]))
+    beyond_noise = chi2 - problem.n_points
+    # NaN where the misfit hardly exceeds the noise
+    reduction = min(explicable / beyond_noise, 1.0) if beyond_noise > problem.n_points else math.nan
+    return MissingForce(
+        table=_force_table(curves),
+        laws=_law_table(laws),
+        depends_on=depends_on,
+        sentence=_remark(laws, depends_on, reduction),
+        detected=tuple(law for law in laws if law.is_detected),
+        learned=learned_force(problem) if learn else None,
     )
-    estimates = problem.linearised(point.asking(forces)).estimates(list(counts.values()))
-    explained = {name: one.delta_chi2_beyond_chance for name, one in zip(counts, estimates, strict=True)}
-    constant = ForcesByCondition(problem, point, lambda motion: np.ones((motion.time_s.size, 1)))
-    return explained | {"condition": constant.delta_chi2_beyond_chance}
 
 
-def _longest(motions: Sequence[FittedMotion]) -> dict[str, float]:
-    """The longest growth of each condition, m; above 0 also where nothing moves."""
-    longest: dict[str, float] = {}
-    for motion in motions:
-        name, growth_m = motion.trial.condition, float(motion.lead_position_m.max())
-        longest[name] = max(longest.get(name, float(np.finfo(float).tiny)), growth_m)
-    return longest
+@dataclass(frozen=True)
+class _Misfit:
+    """What a fit leaves unexplained, seen from one set of motions: the equations of a force of the growth; the fall of
+    χ² with one, and with a constant, of its own in every condition, and their expectations; and the laws, best first.
+    """
+
+    domain: Domain
+    along: ForceEquations
+    by_condition: tuple[float, float]
+    constants: tuple[float, float]
+    laws: list[RankedLaw]
+
+    @property
+    def chi2_with_law(self) -> float:
+        """χ² that the first law leaves."""
+        return self.along.chi2 - self.laws[0].estimate.delta_chi2
 
 
-def _force_table(motions: Sequence[FittedMotion], curves: Mapping[str, tuple[Floats, Floats]]) -> pd.DataFrame:
-    """Force of every condition along its first trial's motion, and the mean over all conditions."""
+def _misfit(problem: ForceProblem, point: ForcePoint) -> _Misfit:
+    domain = candidate_domains(point.motions)[0]
+    along = ForceEquations(problem, point, domain.unit_push)
+    count = along.score.size
+    by_condition, constants = (along.gain_by_condition(shape) for shape in (np.eye(count), np.ones((count, 1))))
+    return _Misfit(domain, along, by_condition, constants, ranked_laws(problem, point, along.chi2, by_condition[0]))
+
+
+def _curves(seen: _Misfit, parameter_shift: Floats, inflation: float) -> pd.DataFrame:
+    """A smooth force in every condition at given model parameters, along its first trial's motion, without the ends
+    where it is hardly determined. Columns `VARIABLES`, force, error and condition.
+    """
     import pandas as pd
 
-    rows, longest = [], _longest(motions)
-    for condition, (coefficients, covariance) in curves.items():
-        motion = next(m for m in motions if m.trial.condition == condition)
+    motions, domain = seen.along.point.motions, seen.domain
+    information, score = seen.along.by_condition(parameter_shift)
+    priors = [root_of_covariance(score.shape[1], length) for length in LENGTH_SCALES]
+    found = posterior(information / inflation, score / inflation, priors, amplitudes_N(motions))
+    curves = []
+    for condition, mean, covariance in zip(seen.along.problem.conditions, found.mean, found.covariance, strict=True):
+        motion = next(motion for motion in motions if motion.trial.condition == condition)
         # 24: points of a curve (chosen)
-        position_m = np.linspace(0.04, 0.96, 24) * motion.lead_position_m.max()
-        basis = growth_splines(position_m / longest[condition])
-        sigma = standard_error(basis, covariance)
+        y = np.linspace(0.04, 0.96, 24) * motion.lead_position_m.max()
+        time_s = np.interp(y, motion.lead_position_m, motion.time_s)
+        values = {name: np.interp(time_s, motion.time_s, getattr(motion, name)) for name in VARIABLES.values()}
+        basis = domain.basis([y])
+        sigma_N = standard_error(basis, covariance)
+        curve = pd.DataFrame(values | {"force_N": basis @ mean, "sigma_N": sigma_N, "condition": condition})
         # 2.0: multiple of the median standard error above which a force is not drawn (chosen)
-        drawn = sigma < 2.0 * np.median(sigma)
-        position_m, force, sigma = position_m[drawn], (basis @ coefficients)[drawn], sigma[drawn]
-        time_s = np.interp(position_m, motion.lead_position_m, motion.time_s)
-        axes = {
-            "lead_position_m": position_m,
-            "tail_velocity_m_s": np.interp(time_s, motion.time_s, motion.tail_velocity_m_s),
-            "time_s": time_s,
-            "pressure_Pa": np.interp(time_s, motion.time_s, motion.pressure_Pa),
-        }
-        for against, values in axes.items():
-            rows += [(against, *row, condition) for row in zip(values, force, sigma, strict=True)]
-    table = pd.DataFrame(rows, columns=list(FORCE_COLUMNS))
-    means = [_binned_means(part) for _, part in table.groupby("against", sort=False)]
-    return pd.concat([table, *means], ignore_index=True)
+        curves.append(curve[sigma_N < 2.0 * np.median(sigma_N)])
+    return pd.concat(curves, ignore_index=True)
 
 
-def _binned_means(part: pd.DataFrame) -> pd.DataFrame:
-    """Weighted means over all conditions in bins of an axis; errors at least as large as conditions differ."""
+def _force_table(curves: pd.DataFrame) -> pd.DataFrame:
+    """The force against each variable, by condition and as weighted means over all conditions in ten bins, their errors
+    at least as large as conditions differ.
+    """
     import pandas as pd
 
-    n_bins = 10  # Bins along each axis in which the mean over all conditions is taken (chosen)
-    values = part["value"].to_numpy(float)
-    edges = np.linspace(values.min(), values.max(), n_bins + 1)
-    bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, n_bins - 1)
-    rows = []
-    for k in np.unique(bin_of):
-        inside = part[bin_of == k]
-        weight = 1 / inside["sigma_N"].to_numpy(float) ** 2
-        force = inside["force_N"].to_numpy(float)
-        mean = float(np.average(force, weights=weight))
-        conditions = len(set(inside["condition"]))
-        scatter = math.sqrt(float(np.average((force - mean) ** 2, weights=weight)) / max(conditions - 1, 1))
-        formal = float(np.sqrt(1 / np.sum(weight)))
-        at = float(np.average(inside["value"].to_numpy(float), weights=weight))
-        rows.append((part["against"].iloc[0], at, mean, max(formal, scatter if conditions > 1 else 0.0), ""))
-    return pd.DataFrame(rows, columns=list(FORCE_COLUMNS))
+    by_condition, means = [], []
+    for against in VARIABLES.values():
+        points = curves.rename(columns={against: "value"}).assign(against=against)
+        by_condition.append(points)
+        low, high = points["value"].min(), points["value"].max()
+        for _, inside in points.groupby(np.minimum(10 * (points["value"] - low) // max(high - low, 1e-300), 9)):
+            force_N, weight = inside["force_N"], 1 / inside["sigma_N"] ** 2
+            mean, at = (float(np.average(each, weights=weight)) for each in (force_N, inside["value"]))
+            others = inside["condition"].nunique() - 1
+            scatter = math.sqrt(float(np.average((force_N - mean) ** 2, weights=weight)) / others) if others else 0.0
+            means.append((against, at, mean, max(float(weight.sum()) ** -0.5, scatter), ""))
+    columns = list(FORCE_COLUMNS)
+    return pd.concat([*by_condition, pd.DataFrame(means, columns=columns)], ignore_index=True)[columns]
 
 
 def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
@@ -414,7 +296,7 @@ def _law_table(laws: Sequence[RankedLaw]) -> pd.DataFrame:
     rows = []
     for law in laws:
         amplitude, estimate = law.estimate.amplitude, law.estimate
-        size_N = float(amplitude[0]) if law.law.n_amplitudes == 1 else float(np.hypot(*amplitude))
+        size_N = float(amplitude[0]) if amplitude.size == 1 else float(np.hypot(*amplitude))
         rows.append((law.law.name, law.words, law.explained, size_N, estimate.sigma, estimate.delta_chi2, law.bic))
     return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
 

@@ -28,10 +28,9 @@ from vinetrack.diagnosis.candidate_fits import (
     full_fit,
     start_values,
 )
-from vinetrack.diagnosis.force_inversion import uniform_splines
-from vinetrack.diagnosis.force_laws import FORMS, VARIABLES, Domain
+from vinetrack.diagnosis.force_laws import FORMS
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
-from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce
+from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, VARIABLES, Domain, LearnedForce
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     OUT_OF_REACH,
@@ -125,7 +124,7 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
     worked example.
     """
     domain = learned.domain
-    table = uniform_table(domain, learned.best.mean)
+    table = learned.found.mean.reshape(domain.counts)
     state, worked = _worked_example(learned)
     axes = [line for k in range(len(domain.variables)) for line in _axis_code(domain, k)]
     parts = [
@@ -163,25 +162,6 @@ def _sum_code(axes: int) -> list[str]:
         for k in range(4)
     ]
     return [*rows, "    return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)"]
-
-
-def uniform_table(domain: Domain, coefficients: Floats) -> Floats:
-    """Convert the coefficients of a domain's splines to those of identical splines at even steps, N. The splines of a
-    domain have repeated knots at its ends; those of the file are all alike. Both span the same functions. Shapes:
-    coefficients (n_splines,) → (n_first,).
-    """
-    table = coefficients.reshape(domain.counts)
-    for axis, count in enumerate(domain.counts):
-        # 4: positions per spline at which the two sets of splines are matched by least squares (chosen)
-        at = np.linspace(0.0, 1.0, 4 * count)
-        conversion = np.linalg.lstsq(_even_splines(at, count), uniform_splines(at, count), rcond=None)[0]
-        table = np.moveaxis(np.tensordot(conversion, table, axes=(1, axis)), 0, axis)
-    return np.asarray(table)
-
-
-def _even_splines(at: Floats, count: int) -> Floats:
-    d = np.abs((count - 3) * at[:, None] + 1.0 - np.arange(count))
-    return np.asarray((np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0)
 
 
 def _axis_code(domain: Domain, k: int) -> list[str]:
@@ -224,10 +204,10 @@ def _table_lines(table: Floats) -> list[str]:
 
 def _worked_example(learned: LearnedForce) -> tuple[dict[str, float], float]:
     """The visited state at which the force is largest, as arguments of an effect, and the force there, N."""
-    visited = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
+    visited = learned.visited
     largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
     at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in learned.domain.variables}
-    force_N, _ = learned.best.force([np.array([value]) for value in at.values()])
+    force_N, _ = learned.force([np.array([value]) for value in at.values()])
     return {_STATE[name]: value for name, value in at.items()}, float(force_N[0])
 
 

@@ -725,7 +725,7 @@ def _dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[
 
 def _begins_text(begins: str, undecided_N: float) -> str:
     """Return from where the force is measured, and which part of it the trials do not determine."""
-    from vinetrack.diagnosis.force_laws import CONSTANT_AT_START, FREE_AT_START
+    from vinetrack.diagnosis.learned_force import CONSTANT_AT_START, FREE_AT_START
 
     if not begins:
         return "These trials do not decide how much of it belongs to B, n and P_y; it is drawn as small as they allow."
