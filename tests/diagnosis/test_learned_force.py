@@ -149,7 +149,7 @@ def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_p
 
 def laws_of(folder: Path, name: str, size_N: float, seed: int) -> MissingForce:
     pairs = hidden_force(sheet((4,)), seed, name, size_N, folder)
-    return missing_force(vt.fit(vt.base_model(), pairs, profile=False), learn=False)
+    return missing_force(vt.fit(vt.base_model(), pairs, profile=False))
 
 
 def test_a_rough_patch_is_found_with_its_position_and_size_and_in_every_condition(tmp_path):

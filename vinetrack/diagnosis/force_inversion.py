@@ -182,8 +182,7 @@ def integrate_responses(
 
 N_STEPS = 400  # Steps of a motion, denser at its start (derived)
 
-# Diagonal coefficient of the two-stage, second-order, L-stable method of Alexander, SIAM J. Numer
-SDIRK_GAMMA = 1 - 1 / math.sqrt(2)
+SDIRK_GAMMA = 1 - 1 / math.sqrt(2)  # Diagonal coefficient of `integrate_responses` (derived)
 
 # Part of the highest speed below which a vine counts as standing still and does not respond to a small force (chosen)
 LEAST_RELATIVE_SPEED = 1e-3
@@ -661,17 +660,21 @@ def settled(equations: ForceEquations, estimate: Callable[[ForceEquations], Floa
     """χ² and motions under a force to which they respond in full: Gauss–Newton steps of all unknowns and motions
     together (lifted: Albersmeyer & Diehl, SIAM J. Optim. 20, 1655, 2010), with new estimates of the coefficients.
     """
-    best, unit_push = (math.inf, equations.point), equations.unit_push
-    # 8: most steps (chosen)
-    for _ in range(8):
-        coefficients = estimate(equations)
-        push = partial(lambda of_all, motion: unit_push(motion) @ of_all, coefficients)
-        point = equations.problem.point(*equations.moved(coefficients), push)
-        equations = ForceEquations(equations.problem, point, unit_push, coefficients)
-        # 1e-3: relative fall of χ² below which the search ends (chosen)
-        if not equations.cost < (1 - 1e-3) * best[0]:
-            break
-        best = equations.cost, point
+    problem, unit_push, best = equations.problem, equations.unit_push, (math.inf, equations.point)
+    try:
+        with np.errstate(all="raise", under="ignore"):
+            # 8: most steps (chosen)
+            for _ in range(8):
+                coefficients = estimate(equations)
+                push = partial(lambda of_all, motion: unit_push(motion) @ of_all, coefficients)
+                point = problem.point(*equations.moved(coefficients), push)
+                equations = ForceEquations(problem, point, unit_push, coefficients)
+                # 1e-3: relative fall of χ² below which the search ends (chosen)
+                if not equations.cost < (1 - 1e-3) * best[0]:
+                    break
+                best = equations.cost, point
+    except (FloatingPointError, np.linalg.LinAlgError):
+        pass  # The step led where nothing can be computed: the point before it stands.
     return best
 
 

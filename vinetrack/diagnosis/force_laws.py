@@ -189,7 +189,7 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
     plain = ["constant", "position", "speed", "speed_squared", "pressure", "time", "position_squared", "speed_cubed"]
     laws = [Law(kind) for kind in plain]
     # Positions and speeds above which a force may set in, as parts of the highest (chosen)
-    for part in (np.arange(8) + 0.5) / 8:
+    for part in ((np.arange(8) + 0.5) / 8).tolist():
         laws.append(Law("beyond_a_place", scale=part * growth_m))
         laws += [Law(kind, scale=part * speed_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
     # 0.05: part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest (chosen)

@@ -38,7 +38,6 @@ from vinetrack.diagnosis.force_inversion import (
     standard_error,
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
-from vinetrack.dynamics.simulate import SimulationError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -168,8 +167,6 @@ def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
 LEAST_DIFFERENCE = 5e-4
 
 LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is estimated (chosen)
-
-LEARNED_COLUMNS = (*VARIABLES.values(), "force_N", "sigma_N", "trials", "condition")
 
 
 @dataclass(frozen=True)
@@ -325,18 +322,16 @@ class LearnedForce:
 
 
 def learned_force(problem: ForceProblem) -> LearnedForce | None:
-    """The missing force over the variables of the highest marginal likelihood, where it explains the misfit."""
+    """The missing force over the variables of the highest marginal likelihood, where it explains the misfit. Raises
+    FloatingPointError or LinAlgError where it cannot be computed.
+    """
     on_tracks = choices_seen_from(problem, problem.tracks)
     misfit = on_tracks[0].equations.chi2 - problem.n_points
     log_bayes_factors = {choice.domain.name: choice.found.log_evidence for choice in on_tracks}
     # 18.0: ln Z in excess of that of no force from which a force is reported (chosen)
     if misfit < (LEAST_CHI2_PER_POINT - 1) * problem.n_points or max(log_bayes_factors.values()) < 18.0:
         return None
-    try:
-        with np.errstate(all="raise", under="ignore"):
-            choices = choices_seen_from(problem, _under_best(problem, on_tracks))
-    except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
-        return None
+    choices = choices_seen_from(problem, _under_best(problem, on_tracks))
     inflation = problem.inflation(min(choice.least_chi2 for choice in choices))
     unit = max(LEAST_DIFFERENCE * min(choice.least_chi2 for choice in choices) / inflation, 1.0)
     weights = variable_weights({choice.domain.name: choice.found.log_evidence for choice in choices}, unit)

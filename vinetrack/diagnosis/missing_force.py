@@ -177,13 +177,7 @@ def force_problem(fit: Fit) -> ForceProblem:
 
 
 @in_one_blas_thread
-def learn_missing_force(fit: Fit) -> LearnedForce | None:
-    """Estimate the force that a fit lacks as a smooth function, without comparing it with laws."""
-    return learned_force(force_problem(fit))
-
-
-@in_one_blas_thread
-def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
+def missing_force(fit: Fit) -> MissingForce:
     """Estimate the force that a fit lacks as a smooth function, and compare it with simple laws."""
     problem = force_problem(fit)
     # Tracks are smoothed too much to show a force over a few millimetres in its place; the vine under a law is not.
@@ -214,8 +208,16 @@ def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
         depends_on=depends_on,
         sentence=_remark(laws, depends_on, reduction),
         detected=tuple(law for law in laws if law.is_detected),
-        learned=learned_force(problem) if learn else None,
+        learned=_learned(problem),
     )
+
+
+def _learned(problem: ForceProblem) -> LearnedForce | None:
+    try:
+        with np.errstate(all="raise", under="ignore"):
+            return learned_force(problem)
+    except (FloatingPointError, np.linalg.LinAlgError):
+        return None
 
 
 @dataclass(frozen=True)

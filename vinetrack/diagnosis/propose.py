@@ -38,7 +38,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     answer_set,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, RankedLaw, learn_missing_force, missing_force
+from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, RankedLaw, missing_force
 from vinetrack.diagnosis.score_test import shapes_of
 from vinetrack.dynamics.model import Model, check_needs, make_model
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
@@ -102,7 +102,7 @@ def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
 # A learned force as an effect file: a table of spline coefficients over one variable or two, in place of a formula.
 #
 # Where no formula reproduces the learned force, the force itself can enter the equation of motion. The file holds the
-# coefficients of its splines, N, at even steps of each normalised variable (`force_inversion.Domain`), and a function
+# coefficients of its splines, N, at even steps of each normalised variable (`learned_force.Domain`), and a function
 # that sums the four splines that are nonzero:
 #
 #     T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,
@@ -124,44 +124,73 @@ def table_text(learned: LearnedForce, origin: str = "") -> str:
     worked example.
     """
     domain = learned.domain
-    table = learned.found.mean.reshape(domain.counts)
-    state, worked = _worked_example(learned)
-    axes = [line for k in range(len(domain.variables)) for line in _axis_code(domain, k)]
+    visited = learned.visited
+    largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
+    at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in domain.variables}
+    worked_N = float(learned.force([np.array([value]) for value in at.values()])[0][0])
+    return _source(
+        str(remark("learned_file", learned=learned, origin=origin)),
+        constants=_table_lines(learned.found.mean.reshape(domain.counts)),
+        parameters=[_parameter(("a", "a", "1"), "1.0", (-10, 10), (0, 2), 'meaning="size of the table"')],
+        arguments={"a": 1.0},
+        body=[*(line for k in range(len(domain.variables)) for line in _axis_code(domain, k)), *_sum_code(domain)],
+        worked_N=worked_N,
+        how="the learned force at this state",
+        state={_STATE[name]: value for name, value in at.items()},
+    )
+
+
+def _source(
+    docstring: str,
+    constants: Sequence[str],
+    parameters: Sequence[str],
+    arguments: Mapping[str, float],
+    body: Sequence[str],
+    worked_N: float,
+    how: str,
+    state: Mapping[str, float],
+) -> str:
+    """Source of an effect file with a tail force: the lines of its parts, and a worked example."""
     parts = [
-        f'"""{remark("learned_file", learned=learned, origin=origin)}"""\n',
+        f'"""{docstring}"""\n',
         "import numpy as np\n",
         "from vinetrack.effects import Parameter, Worked\n",
-        *_table_lines(table),
-        "",
-        'PARAMETERS = (Parameter("a", "a", "1", 1.0, bounds=(-10.0, 10.0), plausible=(0.0, 2.0), '
-        'meaning="size of the table"),)',
-        "\n",
-        "def tail_force(s, rig, a):",
-        *(f"    {line}" for line in axes),
-        *_sum_code(table.ndim),
+        *constants,
+        "PARAMETERS = (",
+        *(f"    {parameter}," for parameter in parameters),
+        ")\n\n",
+        f"def tail_force(s, rig, {', '.join(arguments)}):",
+        *(f"    {line}" for line in body),
         "\n",
         "WORKED = (",
         "    Worked(",
         '        "tail_force",',
-        f"        {worked:.8g},",
-        '        "the learned force at this state",',
+        f"        {worked_N:.8g},",
+        f'        "{how}",',
         f"        state={state!r},",
-        '        parameters={"a": 1.0},',
+        f"        parameters={arguments!r},",
         "    ),",
         ")",
     ]
     return "\n".join(parts) + "\n"
 
 
-def _sum_code(axes: int) -> list[str]:
+def _parameter(names: Sequence[str], value: str, bounds: Sequence[float], plausible: Sequence[float], more: str) -> str:
+    """The line of a parameter of an effect file, of this name, symbol and unit."""
+    quoted = ", ".join(f'"{name}"' for name in names)
+    limits = ("({:.6g}, {:.6g})".format(*sorted(pair)) for pair in (bounds, plausible))
+    return "Parameter({}, {}, bounds={}, plausible={}, {})".format(quoted, value, *limits, more)
+
+
+def _sum_code(domain: Domain) -> list[str]:
     """Lines of code that sum the nonzero splines along one axis, or along two."""
-    if axes == 1:
-        return ["    return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])"]
+    if len(domain.variables) == 1:
+        return ["return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])"]
     rows = [
-        f"    r{k} = " + " + ".join(f"g{m} * TABLE[i + {k}, j + {m}]" for m in range(4)).replace(" + 0", "")
+        f"r{k} = " + " + ".join(f"g{m} * TABLE[i + {k}, j + {m}]" for m in range(4)).replace(" + 0", "")
         for k in range(4)
     ]
-    return [*rows, "    return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)"]
+    return [*rows, "return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)"]
 
 
 def _axis_code(domain: Domain, k: int) -> list[str]:
@@ -196,25 +225,16 @@ def _table_lines(table: Floats) -> list[str]:
         return [
             "TABLE = np.array((  # N",
             *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "),
-            "))",
+            "))\n",
         ]
     rows = [f"    ({', '.join(f'{value:.{table_digits}g}' for value in row)})," for row in table.tolist()]
-    return ["TABLE = np.array((  # N", *rows, "))"]
-
-
-def _worked_example(learned: LearnedForce) -> tuple[dict[str, float], float]:
-    """The visited state at which the force is largest, as arguments of an effect, and the force there, N."""
-    visited = learned.visited
-    largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
-    at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in learned.domain.variables}
-    force_N, _ = learned.force([np.array([value]) for value in at.values()])
-    return {_STATE[name]: value for name, value in at.items()}, float(force_N[0])
+    return ["TABLE = np.array((  # N", *rows, "))\n"]
 
 
 # ------------------------------------------------------------------------------
-# The learned force fitted as an effect, where no formula reproduces it.
+# Laws, and where no formula reproduces it the learned force, fitted as effects.
 
-LEAST_SIGMAS = 6.0  # Standard deviations by which a law must improve the fit to be proposed
+LEAST_SIGMAS = 6.0  # Standard deviations by which a force must improve the fit to be proposed
 
 
 @dataclass(frozen=True)
@@ -225,42 +245,6 @@ class ProposedTable:
     effect: Effect
     ratio: LikelihoodRatio
     rms_left_out_m: float
-
-
-def proposed_table(
-    model: Model, before: Fit, laws: Sequence[Fit], report: Callable[[str], None]
-) -> ProposedTable | None:
-    """Estimate the missing force as a smooth function and fit it as a table."""
-    misfit = before.chi2_per_dof - 1
-    remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
-    # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
-    if misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - 0.9) * misfit:
-        return None
-    report("estimating the missing force as a table")
-    learned = learn_missing_force(before)
-    if learned is None:
-        return None
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{table_name(learned)}.py"
-        path.write_text(table_text(learned), encoding="utf-8")
-        remember(path)
-        effect = load_effect(path)
-        try:
-            start = with_host(before, Model((*model, effect)))
-            after = fit_with(start, effect, report)
-        except FitError:
-            return None
-        ratio = likelihood_ratio(start, (effect,), after)
-        better = all(2 * (after.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in laws)
-        explains = start.chi2_per_dof - after.chi2_per_dof > LEAST_MISFIT_REDUCTION * misfit
-        if not (better and explains and ratio.sigma > LEAST_SIGMAS):
-            return None
-        report("errors with the table")
-        return ProposedTable(learned, effect, ratio, left_out(after).rms_m)
-
-
-# State of the worked example; a convention of this file
-_WORKED_STATE = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
 
 
 @dataclass(frozen=True)
@@ -293,137 +277,147 @@ class Proposal:
 @in_one_blas_thread
 def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Proposal:
     """Find laws of force that explain the misfit of a model, and fit each in the equation of motion."""
-    candidates = candidates_of(model, None, {})
     report("fitting the model")
-    before = initial_fit(model, pairs, candidates, profile=False)
+    before = initial_fit(model, pairs, candidates_of(model, None, {}), profile=False)
     report("estimating the missing force")
-    detected = missing_force(before, learn=False).detected
+    force = missing_force(before)
+    detected = force.detected
     # 0.2: laws that explain less than the best by more than this part are not fitted (chosen)
-    best = [law for law in detected if law.explained > detected[0].explained - 0.2]
     # 4: most laws that are fitted in the equation of motion (chosen)
-    proposal = _fitted_laws(model, before, best[:4], report)
-    fits = [law.ratio.fit for law in proposal.tied]
-    return replace(proposal, table=proposed_table(model, proposal.before, fits, report))
-
-
-def _fitted_laws(model: Model, before: Fit, detected: Sequence[RankedLaw], report: Callable[[str], None]) -> Proposal:
-    """Fit the laws in the equation of motion, and find those that the data do not exclude."""
-    if not detected:
-        reason = remark("no_law_detected")
-        return Proposal(before, left_out(before).rms_m, (), (), reason)
+    best = [law for law in detected if law.explained > detected[0].explained - 0.2][:4]
     with tempfile.TemporaryDirectory() as folder:
-        effects = [_loaded(law, Path(folder)) for law in detected]
-        # Compiled without the catalogue, which is not needed here.
-        before = with_host(before, Model((*model, *effects)))
-        fitted = []
-        for law, effect in zip(detected, effects, strict=True):
-            try:
-                after = fit_with(before, effect, report)
-            except FitError:
-                continue
-            fitted.append((law, effect, likelihood_ratio(before, (effect,), after)))
-        report("errors on left-out conditions")
-        highest = max((ratio.fit.log_likelihood for _, _, ratio in fitted), default=-math.inf)
-
-        def near_best(ratio: LikelihoodRatio) -> bool:
-            return 2 * (highest - ratio.fit.log_likelihood) < OUT_OF_REACH
-
-        laws = [
-            ProposedLaw(law, effect, ratio, left_out(ratio.fit).rms_m if near_best(ratio) else math.nan)
-            for law, effect, ratio in fitted
-        ]
-    return _proposal(before, laws)
+        files = [Path(folder) / f"proposed_{law.law.name}.py" for law in best]
+        effects = [_loaded(path, effect_text(law)) for path, law in zip(files, best, strict=True)]
+        if best:
+            # Compiled without the catalogue, which is not needed here.
+            before = with_host(before, Model((*model, *effects)))
+        proposal = _fitted_laws(before, best, effects, report)
+        return replace(proposal, table=_fitted_table(proposal, force.learned, Path(folder), report))
 
 
-def _proposal(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
-    """The laws in order of their likelihood, with the significant ones that cannot be excluded."""
-    error_m = left_out(before).rms_m
-    laws = tuple(sorted(laws, key=lambda law: -law.ratio.fit.log_likelihood))
-    misfit = max(before.chi2_per_dof - 1, 0.0)
-    significant = [
-        law
-        for law in laws
-        if law.ratio.sigma > LEAST_SIGMAS
-        and law.rms_left_out_m < error_m
-        and (misfit < 1 or before.chi2_per_dof - law.ratio.fit.chi2_per_dof > LEAST_MISFIT_REDUCTION * misfit)
-    ]
-    if not significant:
-        reason = remark("no_law_predicts_better")
-        return Proposal(before, error_m, laws, (), reason)
-    not_excluded, _ = answer_set([law.ratio for law in significant])
-    tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
-    return Proposal(before, error_m, laws, tied)
-
-
-def _loaded(law: RankedLaw, folder: Path) -> Effect:
-    """A law as an effect, written to a file in this folder and loaded from it."""
-    path = folder / f"proposed_{law.law.name}.py"
-    path.write_text(effect_text(law), encoding="utf-8")
+def _loaded(path: Path, text: str) -> Effect:
+    path.write_text(text, encoding="utf-8")
     remember(path)
     return load_effect(path)
+
+
+def _fitted_laws(
+    before: Fit, laws: Sequence[RankedLaw], effects: Sequence[Effect], report: Callable[[str], None]
+) -> Proposal:
+    """The laws in order of their likelihood, with the significant ones that the data do not exclude."""
+    fitted = []
+    for law, effect in zip(laws, effects, strict=True):
+        try:
+            ratio = likelihood_ratio(before, (effect,), fit_with(before, effect, report))
+        except FitError:
+            continue
+        fitted.append(ProposedLaw(law, effect, ratio, math.nan))
+    report("errors on left-out conditions")
+    error_m = left_out(before).rms_m
+    fitted.sort(key=lambda law: -law.ratio.fit.log_likelihood)
+    fitted = [
+        replace(law, rms_left_out_m=left_out(law.ratio.fit).rms_m)
+        if 2 * (fitted[0].ratio.fit.log_likelihood - law.ratio.fit.log_likelihood) < OUT_OF_REACH
+        else law
+        for law in fitted
+    ]
+    significant = [law for law in fitted if law.rms_left_out_m < error_m and _explains(before, law.ratio)]
+    if not significant:
+        reason = remark("no_law_predicts_better" if laws else "no_law_detected")
+        return Proposal(before, error_m, tuple(fitted), (), reason)
+    not_excluded, _ = answer_set([law.ratio for law in significant])
+    tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
+    return Proposal(before, error_m, tuple(fitted), tied)
+
+
+def _explains(before: Fit, ratio: LikelihoodRatio) -> bool:
+    """Whether a force is significant, and takes away a good part of a misfit that exceeds the noise."""
+    misfit = before.chi2_per_dof - 1
+    reduction = before.chi2_per_dof - ratio.fit.chi2_per_dof
+    return ratio.sigma > LEAST_SIGMAS and (misfit < 1 or reduction > LEAST_MISFIT_REDUCTION * misfit)
+
+
+def _fitted_table(
+    proposal: Proposal, learned: LearnedForce | None, folder: Path, report: Callable[[str], None]
+) -> ProposedTable | None:
+    """The missing force as a smooth function, fitted as a table, where it explains what no law does."""
+    before, laws = proposal.before, [law.ratio.fit for law in proposal.tied]
+    misfit = before.chi2_per_dof - 1
+    remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
+    # 0.9: part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
+    if learned is None or misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - 0.9) * misfit:
+        return None
+    effect = _loaded(folder / f"{table_name(learned)}.py", table_text(learned))
+    try:
+        start = with_host(before, before.model + effect)
+        ratio = likelihood_ratio(start, (effect,), fit_with(start, effect, report))
+    except FitError:
+        return None
+    better = all(2 * (ratio.fit.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in laws)
+    if not (better and _explains(start, ratio)):
+        return None
+    report("errors with the table")
+    return ProposedTable(learned, effect, ratio, left_out(ratio.fit).rms_m)
+
+
+# ------------------------------------------------------------------------------
+# A law as an effect file.
+
+# State of the worked example; a convention of this file
+_WORKED_STATE = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
 
 
 def effect_text(detected: RankedLaw, origin: str = "") -> str:
     """Source of an effect file that holds a law: docstring, parameters with units and bounds, function,
     worked example.
     """
-    law, expression = detected.law, FORMS[detected.law.kind]
+    law, form = detected.law, FORMS[detected.law.kind]
     # What a law may be multiplied by: code, symbol, and the change of the unit of the size
     factors = {
-        "position": ("s.tail_position", "x", (0, -1, 0, 0)),
-        "speed": ("s.tail_velocity", "ẋ", (0, -1, 1, 0)),
-        "pressure": ("s.pressure", "P", (0, 0, 0, -1)),
+        "": ("", "", (0, 0, 0, 0)),
+        "position": (" * s.tail_position", " x", (0, -1, 0, 0)),
+        "speed": (" * s.tail_velocity", " ẋ", (0, -1, 1, 0)),
+        "pressure": (" * s.pressure", " P", (0, 0, 0, -1)),
     }
-    factor_code, factor_symbol, factor_unit = factors.get(law.factor, ("", "", (0, 0, 0, 0)))
-    unit = _unit([a + b for a, b in zip(expression.size[2], factor_unit, strict=True)])
-    size, shapes = _values(detected)
-    names = [expression.size[0], *(name for name, _, _ in expression.shapes)]
-    area = " * (s.area / AREA)" if law.reference_area_m2 else ""
-    state = _WORKED_STATE | ({"area": law.reference_area_m2} if law.reference_area_m2 else {})
-    worked = _force_N(detected)
-    times = f" * {factor_code}" if factor_code else ""
-    symbols = f" {factor_symbol}" if factor_symbol else ""
-    formula = f"tail force {expression.formula}{symbols}" + (
-        " A/A₀, A₀ the mean cross-section of these vines" if area else ""
-    )
-    parts = [
-        f'"""{remark("law_file", law=detected.words, formula=formula, origin=origin)}"""\n',
-        "import numpy as np\n",
-        "from vinetrack.effects import Parameter, Worked\n",
-        f"AREA = {law.reference_area_m2:.6g}  # m²\n" if area else None,
-        "PARAMETERS = (",
-        f"    {_size_parameter(expression.size[0], expression.size[1], unit, size)},",
-        *(f"    {_shape_parameter(*number)}," for number in zip(expression.shapes, shapes, strict=True)),
-        ")\n\n",
-        f"def tail_force(s, rig, {', '.join(names)}):",
-        f"    return {names[0]} * ({expression.code}){times}{area}\n\n",
-        "WORKED = (",
-        "    Worked(",
-        '        "tail_force",',
-        f"        {worked:.8g},",
-        f'        "the fitted law at this state: {size:.6g} × {worked / size:.6g}",',
-        f"        state={state!r},",
-        f"        parameters={dict(zip(names, (size, *shapes), strict=True))!r},",
-        "    ),",
-        ")",
+    times, symbol, factor_unit = factors[law.factor]
+    unit = _unit([a + b for a, b in zip(form.size[2], factor_unit, strict=True)])
+    size, *shapes = (float(f"{value:.6g}") for value in _values(detected))
+    limit = 100 * abs(size)
+    of_size = (*form.size[:2], unit)
+    parameters = [
+        _parameter(of_size, repr(size), (-limit, limit), (0.0, 10 * size), 'meaning="size of the law"'),
+        *(_shape_parameter(*each) for each in zip(form.shapes, shapes, strict=True)),
     ]
-    return "\n".join(part for part in parts if part is not None) + "\n"
+    names = [form.size[0], *(name for name, _, _ in form.shapes)]
+    formula, state, constants = f"tail force {form.formula}{symbol}", dict(_WORKED_STATE), []
+    if law.reference_area_m2:
+        times, formula = f"{times} * (s.area / AREA)", f"{formula} A/A₀, A₀ the mean cross-section of these vines"
+        state["area"] = law.reference_area_m2
+        constants = [f"AREA = {law.reference_area_m2:.6g}  # m²\n"]
+    worked_N = _force_N(detected)
+    return _source(
+        str(remark("law_file", law=detected.words, formula=formula, origin=origin)),
+        constants=constants,
+        parameters=parameters,
+        arguments=dict(zip(names, (size, *shapes), strict=True)),
+        body=[f"return {names[0]} * ({form.code}){times}"],
+        worked_N=worked_N,
+        how=f"the fitted law at this state: {size:.6g} × {worked_N / size:.6g}",
+        state=state,
+    )
 
 
-def _values(detected: RankedLaw) -> tuple[float, tuple[float, ...]]:
-    """Size and shape parameters of a law as its effect holds them, SI, rounded to what is printed."""
+def _values(detected: RankedLaw) -> tuple[float, ...]:
+    """Size and shape parameters of a law as its effect holds them, SI."""
     law, amplitude = detected.law, detected.estimate.amplitude
-
-    def rounded(*values: float) -> tuple[float, ...]:
-        return tuple(float(f"{value:.6g}") for value in values)
-
     if law.kind == "periodic":
-        return rounded(math.hypot(*amplitude))[0], rounded(law.scale, math.atan2(amplitude[1], amplitude[0]))
+        return math.hypot(*amplitude), law.scale, math.atan2(amplitude[1], amplitude[0])
+    size = amplitude[0] / law.peak
     if law.kind == "patch":
-        return rounded(amplitude[0] / law.peak)[0], rounded(law.low, law.high - law.low)
+        return size, law.low, law.high - law.low
     if law.kind == "inverse_speed":
-        return rounded(amplitude[0] / law.peak / law.scale)[0], rounded(law.scale)
-    return rounded(amplitude[0] / law.peak)[0], rounded(law.scale) if FORMS[law.kind].shapes else ()
+        return size / law.scale, law.scale
+    return (size, law.scale) if FORMS[law.kind].shapes else (size,)
 
 
 def _force_N(detected: RankedLaw) -> float:
@@ -436,39 +430,21 @@ def _force_N(detected: RankedLaw) -> float:
 
 def _unit(powers: Sequence[int]) -> str:
     """A unit by its exponents of N, m, s and Pa."""
-
-    def product(sign: int) -> list[str]:
-        raised = {2: "²", 3: "³", 4: "⁴"}
-        return [
-            name + raised.get(sign * power, "")
-            for name, power in zip(("N", "m", "s", "Pa"), powers, strict=True)
-            if sign * power > 0
-        ]
-
-    denominator = "·".join(product(-1))
-    return "·".join(product(1)) + (
-        f"/({denominator})" if "·" in denominator else f"/{denominator}" if denominator else ""
-    )
-
-
-def _size_parameter(name: str, symbol: str, unit: str, value: float) -> str:
-    low, high = sorted((0.0, 10 * value))
-    limit = 100 * abs(value)
-    return (
-        f'Parameter("{name}", "{symbol}", "{unit}", {value!r}, bounds=({-limit:.6g}, {limit:.6g}), '
-        f'plausible=({low:.6g}, {high:.6g}), meaning="size of the law")'
-    )
+    above: list[str] = []
+    below: list[str] = []
+    for name, power in zip(("N", "m", "s", "Pa"), powers, strict=True):
+        if power:
+            (above if power > 0 else below).append(name + {1: "", 2: "²", 3: "³", 4: "⁴"}[abs(power)])
+    denominator = "·".join(below)
+    return "·".join(above) + (f"/({denominator})" if len(below) > 1 else f"/{denominator}" if below else "")
 
 
 def _shape_parameter(names: tuple[str, str, str], value: float) -> str:
-    name, symbol, unit = names
-    if name in ("phi", "y_1"):
-        half_range = math.pi if name == "phi" else max(abs(value), 0.01)
+    if names[0] in ("phi", "y_1"):
+        half_range = math.pi if names[0] == "phi" else max(abs(value), 0.01)
         bounds, plausible = (value - 2 * half_range, value + 2 * half_range), (value - half_range, value + half_range)
     else:
         bounds, plausible = (value / 10, value * 10), (value / 3, value * 3)
-    return (
-        f'Parameter("{name}", "{symbol}", "{unit}", {value!r}, zero={value!r}, bounds=({bounds[0]:.6g}, '
-        f"{bounds[1]:.6g}), plausible=({plausible[0]:.6g}, {plausible[1]:.6g}), tried=({value!r},), "
-        'meaning="its shape")'
+    return _parameter(
+        names, f"{value!r}, zero={value!r}", bounds, plausible, f'tried=({value!r},), meaning="its shape"'
     )
