@@ -368,46 +368,53 @@ def _moved(motion: FittedMotion, push: Floats, dx: Floats, dv: Floats) -> Fitted
 # ------------------------------------------------------------------------------
 # Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
 #
-# The acceleration of every trial is a smooth function of the square root of time, integrated twice from rest at its
-# release and fitted to positions. It is not used as data: the equation of motion is linearised about this motion, and
+# The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to positions
+# with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4), which takes a release that is a frame
+# off for noise. It is not used as data: the equation of motion is linearised about this motion, and
 # the defect there (what the model's forces lack) enters as one more known acceleration, so that noise in the smoothed
 # motion cancels to first order (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a
 # large force the linearisation would be poor.
 
 
-def _on_tracks(
-    data: Sequence[FitTrial], trial_effects: Floats, noise_m: Floats, motions: Sequence[FittedMotion]
-) -> list[FittedMotion]:
-    courses, information, score = [], [], []
-    for trial_data, effects, noise, motion in zip(data, trial_effects, noise_m, motions, strict=True):
-        since_s = trial_data.time_s - effects[RELEASE]
-        position_m = trial_data.lead_position_m - effects[ORIGIN]
-        position_m = position_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
-        growing = (since_s > 0) & ~(position_m > MOST_OF_LENGTH * motion.trial.length_m)
-        last_s = float(np.max(since_s, initial=1e-6, where=growing))
-        # 20: splines, even in the square root of time and so denser where a vine accelerates (chosen)
-        unit = splines(np.sqrt(np.clip(motion.time_s / last_s, 0.0, 1.0)), 20)
-        unit *= 2 * float(np.max(position_m, initial=noise, where=growing)) / last_s**2
-        velocities = _integrated(motion.time_s, unit)
-        positions = _integrated(motion.time_s, velocities)
-        design = _between_steps(motion, since_s[growing], positions) / noise
-        information.append(design.T @ design)
-        score.append(design.T @ position_m[growing] / noise)
+def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
+    since_s = data.time_s - trial_effects[RELEASE]
+    position_m = data.lead_position_m - trial_effects[ORIGIN]
+    position_m = position_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
+    growing = (since_s > 0) & ~(position_m > MOST_OF_LENGTH * motion.trial.length_m)
+    if np.count_nonzero(growing) <= 2:
+        return motion
+    last_s = float(since_s[growing].max())
+    # 20: splines, even in the square root of time and so denser where a vine accelerates (chosen)
+    accelerations = splines(np.sqrt(np.clip(motion.time_s / last_s, 0.0, 1.0)), 20)
+    velocities = _integrated(motion.time_s, accelerations)
+    positions = _integrated(motion.time_s, velocities)
+    coefficients = _smoothed(_between_steps(motion, since_s[growing], positions), position_m[growing])
+    return replace(
+        motion,
+        lead_position_m=np.maximum.accumulate(np.maximum(positions @ coefficients, 0.0)),
+        lead_velocity_m_s=np.maximum(velocities @ coefficients, 0.0),
+        acceleration=motion.trial.travel_ratio * (accelerations @ coefficients),
         # The model's end of growth is not that of the track: the vine responds to forces beyond it.
-        on_track = replace(motion, end_s=math.inf, counts_until_s=last_s)
-        courses.append((on_track, unit, velocities, positions) if np.count_nonzero(growing) > 2 else (motion,))
-    priors = [root_of_covariance(20, length) for length in LENGTH_SCALES]
-    # Amplitudes that are averaged over, relative to a constant acceleration (chosen)
-    found = posterior(np.array(information), np.array(score), priors, np.geomspace(0.3, 300.0, 7)).mean
-    return [
-        motion if not shapes else replace(
-            motion,
-            lead_position_m=np.maximum.accumulate(np.maximum(shapes[2] @ coefficients, 0.0)),
-            lead_velocity_m_s=np.maximum(shapes[1] @ coefficients, 0.0),
-            acceleration=motion.trial.travel_ratio * (shapes[0] @ coefficients),
-        )
-        for (motion, *shapes), coefficients in zip(courses, found, strict=True)
-    ]  # fmt: skip
+        end_s=math.inf,
+        counts_until_s=last_s,
+    )
+
+
+def _smoothed(design: Floats, values: Floats) -> Floats:
+    """Coefficients with penalised second differences, the penalty chosen by generalised cross-validation."""
+    second_difference = np.diff(np.eye(design.shape[1]), 2, axis=0)
+    gram = design.T @ design
+    unit = float(np.trace(gram)) / design.shape[1]
+    roughness = unit * (second_difference.T @ second_difference + 1e-9 * np.eye(design.shape[1]))
+    found = []
+    # Penalties, relative to the information from positions (chosen)
+    for penalty in np.geomspace(1e-8, 1e2, 21):
+        inverse = np.linalg.pinv(gram + penalty * roughness, hermitian=True)
+        coefficients = inverse @ (design.T @ values)
+        degrees_of_freedom = min(float(np.trace(inverse @ gram)), values.size - 1.0)
+        squares = float(np.sum((values - design @ coefficients) ** 2))
+        found.append((squares / (values.size - degrees_of_freedom) ** 2, coefficients))
+    return min(found, key=lambda each: each[0])[1]
 
 
 def _integrated(time_s: Floats, columns: Floats) -> Floats:
@@ -456,8 +463,8 @@ class ForceEstimate(NamedTuple):
 class ForceProblem:
     """A fit, the noise of its tracks, and the priors of its parameters and trial effects: what is asked of forces. The
     noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial
-    have the standard deviations estimated from replicates. `tracks` are the motions that lie on the tracks, whatever
-    the model says, at its fitted parameters.
+    have the standard deviations estimated from replicates. At its fitted parameters, `tracks` are the motions that lie
+    on the tracks, whatever the model says, and `fitted` those of the model.
     """
 
     def __init__(self, fit: Fit, scatter: Scatter) -> None:
@@ -475,9 +482,9 @@ class ForceProblem:
         self.n_points = float(sum(trial_data.time_s.size for trial_data in self.data))
         effects = np.zeros_like(self.effects_mean)
         effects[:, :2] = self.effects_mean[:, :2]
-        slow_noise_m = np.sqrt(self.variance) / (1 - self.rho)
-        motions = _on_tracks(self.data, effects, slow_noise_m, motions_of(fit, effects))
-        self.tracks = self.point(fit.solution.state.theta, effects, motions)
+        motions = [_on_track(*each) for each in zip(self.data, effects, motions_of(fit, effects), strict=True)]
+        self.tracks = self.point(state.theta, effects, motions)
+        self.fitted = self.point(state.theta, state.trial_effects, motions_of(fit, state.trial_effects))
 
     def inflation(self, chi2: float) -> float:
         """Variance in units of the noise's where a model leaves this χ². What it leaves beyond the noise is correlated
@@ -545,16 +552,18 @@ class ForceEquations:
         ]  # fmt: skip
         sensitivities = acceleration_sensitivities(problem.fit, point.trial_effects, point.motions, self.accelerations)
         self.blocks = np.zeros((len(problem.conditions), p + q + 1, p + q + 1))
-        self.of_effects = []
+        self.of_effects, of_trials = [], []
         for i, of_trial in enumerate(sensitivities):
             index = problem.prior.index[i]
             places = np.concatenate([np.where(index >= 0, index, p + q + 1), np.arange(p, p + q + 1)])
             known = np.flatnonzero(places <= p + q)
             block, response = self._without_effects(i, of_trial)
+            of_trials.append(block)
             places = places[known]
             condition = problem.conditions.index(problem.data[i].trial.condition)
             self.blocks[condition][np.ix_(places, places)] += block[np.ix_(known, known)]
             self.of_effects.append((places, response[:, known]))
+        self.of_trials = np.array(of_trials)
         held = np.flatnonzero(~problem.prior.free)
         self.blocks[:, held] = self.blocks[:, :, held] = 0.0
         total = self.blocks.sum(axis=0)
@@ -599,14 +608,27 @@ class ForceEquations:
         return reduced, response
 
     def estimate(self, columns: slice = slice(None)) -> ForceEstimate:
-        """Least squares for some of the coefficients, the others as they are."""
-        information, score, of_force = self.information[columns, columns], self.score[columns], self.of_parameters
+        """Least squares for some of the coefficients, the others as they are. Standard errors are the larger of those
+        of the noise and those of the scatter between trials (cluster-robust).
+        """
+        information, score, response = self.information[columns, columns], self.score[columns], self.of_parameters
+        of_force = response[:, :-1][:, columns]
         covariance = np.linalg.inv(information + np.diag(self.ridge[columns]))
         change = covariance @ score
-        delta_chi2 = float(score @ change)
-        sigma = math.sqrt(float(np.trace(covariance)) / score.size * self.problem.inflation(self.chi2 - delta_chi2))
-        shift = of_force[:, -1] - of_force[:, :-1][:, columns] @ change
-        return ForceEstimate(delta_chi2, change, sigma, shift, float(np.trace(covariance @ information)))
+        shift = response[:, -1] - of_force @ change
+        # What each trial adds to the score of the coefficients at the estimate
+        index = self.problem.prior.index
+        k, trials = index.shape[1], self.of_trials
+        rows = np.concatenate([trials[:, :k], trials[:, k:-1][:, columns]], axis=1)
+        left = rows[:, :, -1] - rows[:, :, k:-1][:, :, columns] @ change
+        left -= np.einsum("nrk,nk->nr", rows[:, :, :k], np.append(shift, 0.0)[index])
+        by_key = np.vstack([of_force, np.zeros((1, change.size))])[index]
+        scores = left[:, k:] - np.einsum("nkl,nk->nl", by_key, left[:, :k])
+        clusters = len(scores) / max(len(scores) - shift.size - change.size, 1)
+        robust = covariance @ (scores.T @ scores * clusters) @ covariance
+        variance = max(float(np.trace(covariance)), float(np.trace(robust))) / change.size
+        dof = float(np.trace(covariance @ information))
+        return ForceEstimate(float(score @ change), change, math.sqrt(variance), shift, dof)
 
     def gain_by_condition(self, shape: Floats) -> tuple[float, float]:
         """Fall of χ² with combinations of the coefficients that differ between conditions, and its expectation under no
