@@ -30,7 +30,7 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import eliminated, trial_effect_prior
+from vinetrack.inference.marginal_likelihood import eliminated, inverse_of_block, trial_effect_prior
 from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Job
 from vinetrack.inference.whitening import whiten
@@ -569,7 +569,7 @@ class ForceEquations:
         total = self.blocks.sum(axis=0)
         own = np.diag(total)[p:-1]
         self.ridge = LEAST_INFORMATION * np.maximum(own, max(1e-6 * own.max(), 1e-300))
-        reduced, self.of_parameters = self._without_parameters(total)
+        reduced, self.of_parameters = self._without_parameters(total, np.diag(total)[:p].copy())
         self.cost = float(total[-1, -1])
         self.information, self.score, self.chi2 = reduced[:-1, :-1], reduced[:-1, -1], float(reduced[-1, -1])
 
@@ -594,9 +594,9 @@ class ForceEquations:
         (block,), (response,) = eliminated(gram[None], precision[None])
         return block, response
 
-    def _without_parameters(self, total: Floats) -> tuple[Floats, Floats]:
+    def _without_parameters(self, total: Floats, information: Floats) -> tuple[Floats, Floats]:
         """Products with the prior of the parameters, which are then eliminated, and the response of these. `total` is
-        changed.
+        changed; `information` is that on each parameter before anything was eliminated. Shapes: information (p,).
         """
         problem, p = self.problem, self.point.theta.size
         from_mean = np.where(problem.prior.free, self.point.theta - problem.prior.prior_mean, 0.0)
@@ -604,8 +604,11 @@ class ForceEquations:
         total[:p, -1] -= pull
         total[-1, :p] -= pull
         total[-1, -1] += pull @ from_mean
-        (reduced,), (response,) = eliminated(total[None], problem.precision[None])
-        return reduced, response
+        square = total[:p, :p] + np.diag(problem.precision)
+        # 1e-9: share of its information below which what other unknowns leave of a parameter is rounding (derived)
+        determined = np.flatnonzero(np.diag(square) > 1e-9 * np.maximum(information, 1e-300))
+        response = inverse_of_block(square, determined) @ total[:p, p:]
+        return total[p:, p:] - total[p:, :p] @ response, response
 
     def estimate(self, columns: slice = slice(None)) -> ForceEstimate:
         """Least squares for some of the coefficients, the others as they are. Standard errors are the larger of those
@@ -640,7 +643,8 @@ class ForceEquations:
         blocks = change.T @ self.blocks @ change
         own = np.einsum("nkk->nk", blocks)[:, :m]
         ridge = np.maximum(LEAST_INFORMATION * own, 1e-300 + 1e-6 * LEAST_INFORMATION * own.max())
-        reduced, _ = self._without_parameters(eliminated(blocks, ridge)[0].sum(axis=0))
+        known = np.einsum("nkk->k", blocks)[m : m + p]
+        reduced, _ = self._without_parameters(eliminated(blocks, ridge)[0].sum(axis=0), known)
         return self.chi2 - float(reduced[-1, -1]), float(np.sum(own / (own + ridge)))
 
     def by_condition(self, parameter_shift: Floats) -> tuple[Floats, Floats]:

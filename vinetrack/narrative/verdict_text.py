@@ -314,14 +314,10 @@ def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
     if power.wary or not power.effects:
         return "sizes that trials would detect were not computed", str(power.wary)
     undetectable = unseen(power)
-    bounded = (
-        [row for row in diagnosis.rounds[-1].ranking if row.largest] if diagnosis.final_verdict == ADEQUATE else []
-    )
-    notes = [f"limits of {len(bounded)} undetected sizes are in the report"] if bounded else []
-    notes += [f"not even then: {listed_names(undetectable[:6])}" + " and others" * (len(undetectable) > 6)] * bool(
-        undetectable
-    )
-    return f"smaller effects: {detectable_count(power)} would have been detected {AT_LARGEST}", "; ".join(notes)
+    # 6: undetectable effects that are named, at most (chosen)
+    named = [*undetectable[:6], *(["others"] if len(undetectable) > 6 else [])]
+    note = f"not even then: {listed_names(named)}" if named else ""
+    return f"smaller effects: by linear theory {detectable_count(power)} would have been detected {AT_LARGEST}", note
 
 
 def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:
