@@ -27,7 +27,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (617, 4, 5),
     "core": (1398, 9, 58),
-    "diagnosis": (9391, 21, 118),
+    "diagnosis": (9395, 21, 118),
     "dynamics": (2407, 8, 27),
     "effects": (765, 3, 8),
     "experiment": (1868, 7, 18),
@@ -36,7 +36,7 @@ BUDGETS = {
     "interface": (627, 2, 2),
     "kinematics": (1741, 6, 12),
     "laboratory": (1600, 6, 9),
-    "narrative": (1819, 3, 12),
+    "narrative": (1815, 3, 12),
     "pages": (2998, 8, 22),
     "paper": (842, 3, 15),
     "pipeline": (2919, 10, 12),
