@@ -31,6 +31,7 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, Fit
+from vinetrack.inference.marginal_likelihood import at_unknowns
 from vinetrack.inference.trial_effects import subset
 from vinetrack.planning.discriminating_design import (
     NEW_VINE,
@@ -38,7 +39,6 @@ from vinetrack.planning.discriminating_design import (
     SAME_RIG,
     Condition,
     RefitTerms,
-    at_unknowns,
     conditions_by_effort,
     exchanged,
     extend,

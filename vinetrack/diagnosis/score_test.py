@@ -365,7 +365,7 @@ class Products:
     def of(self, places: Sequence[int]) -> Products:
         """The same for some of the trials, which may be repeated."""
         columns, data = tuple(self.columns[k] for k in places), [self.data[k] for k in places]
-        return replace(self, columns=columns, data=data, problem=problem_of(self.problem, list(places)))
+        return replace(self, columns=columns, data=data, problem=self.problem.of_trials(list(places)))
 
     @cached_property
     def _all_cross_products(self) -> Floats:
@@ -413,23 +413,9 @@ def products_without_trial_effects(products: Products, state: FitState) -> Float
     for part in products.parts:
         of_part = replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part])
         blocks[part] = trial_effects_eliminated(
-            products.cross_products(part), products.n_unknowns, problem_of(products.problem, part), of_part
+            products.cross_products(part), products.n_unknowns, products.problem.of_trials(part), of_part
         )
     return blocks
-
-
-def problem_of(problem: MixedProblem, trials: slice | list[int]) -> MixedProblem:
-    """The problem of some of the trials, with all its parameters."""
-    arrays = (
-        "index",
-        "has_deviation",
-        "gauge_error",
-        "release_origin_mean",
-        "release_origin_precision",
-        "points",
-        "stretches",
-    )
-    return replace(problem, **{name: getattr(problem, name)[trials] for name in arrays})
 
 
 @dataclass(frozen=True)
@@ -589,7 +575,7 @@ def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float,
         white = at_correlation(cross_products, state.rho) / state.variance[part, None, None]
         release_origin = white[:, :2, :2] + problem.release_origin_precision[part, :, None] * np.eye(2)
         eliminated = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(release_origin, white[:, :2, 2:])
-        whole += sum_matrix_blocks(eliminated[:, 2:, 2:], problem_of(problem, part))
+        whole += sum_matrix_blocks(eliminated[:, 2:, 2:], problem.of_trials(part))
         lever = np.zeros((len(eliminated), 2, total + 1))
         for k in range(index.shape[1]):
             lever[np.arange(len(eliminated)), :, index[part, k]] += eliminated[:, :2, 2 + k]

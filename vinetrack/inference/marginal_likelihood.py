@@ -7,7 +7,7 @@ Between-trial standard deviations and noise maximise the restricted likelihood (
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -217,6 +217,11 @@ class MixedProblem:
     stretches: Floats
     random: NDArray[np.bool_]
 
+    def of_trials(self, trials: slice | NDArray[np.int_] | list[int]) -> MixedProblem:
+        """The problem of some of the trials, with all its parameters."""
+        arrays = "index has_deviation gauge_error release_origin_mean release_origin_precision points stretches"
+        return replace(self, **{name: getattr(self, name)[trials] for name in arrays.split()})
+
     @cached_property
     def places(self) -> NDArray[np.int_]:
         """`index` with -1 replaced by n_free, one past the last parameter."""
@@ -275,6 +280,15 @@ def sum_vector_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
     """
     p = problem.prior_mean.size
     return np.asarray(np.bincount(problem.places.ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
+
+
+def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
+    """Blocks of trials at the unknowns of a campaign; those at −1 or `size` are dropped. Shapes: blocks (n, k, k);
+    index (n, k) → (n, size, size).
+    """
+    placed = np.zeros((len(blocks), size + 1, size + 1))
+    np.add.at(placed, (np.arange(len(blocks))[:, None, None], index[:, :, None], index[:, None, :]), blocks)
+    return placed[:, :size, :size]
 
 
 def by_parameter(blocks: Floats, problem: MixedProblem) -> Floats:

@@ -27,6 +27,7 @@ from vinetrack.inference.marginal_likelihood import (
     FitState,
     Marginal,
     MixedProblem,
+    at_unknowns,
     by_parameter,
     deviance,
     estimate_noise,
@@ -557,10 +558,8 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     problem = solution.problem
     size, p = problem.prior_mean.size, problem.index.shape[1]
     blocks = trial_effects_eliminated(solution.cross_products, p, problem, solution.state)
-    information = np.zeros((len(blocks), size + 1, size + 1))
-    rows = np.arange(len(blocks))[:, None, None]
-    np.add.at(information, (rows, problem.places[:, :, None], problem.places[:, None, :]), blocks[:, :p, :p])
-    return information[:, :size, :size], by_parameter(blocks[:, :p, p], problem)
+    information = at_unknowns(blocks[:, :p, :p], problem.index, size)
+    return information, by_parameter(blocks[:, :p, p], problem)
 
 
 def _typical_root(covariance: Floats, information: Floats, shared: int) -> Floats:

@@ -116,12 +116,10 @@ def subset(
     )
     smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
     smaller.pressure_step, smaller.steps = predictor.pressure_step[rows], predictor.steps[columns]
-    by_trial = "has_deviation gauge_error release_origin_mean release_origin_precision points stretches"
     by_parameter = "prior_mean prior_precision lower upper free random"
     problem = replace(
-        problem,
+        problem.of_trials(rows),
         index=layout.index,
-        **{name: getattr(problem, name)[rows] for name in by_trial.split()},
         **{name: getattr(problem, name)[places] for name in by_parameter.split()},
     )
     reduced = [

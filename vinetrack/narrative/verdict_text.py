@@ -118,12 +118,7 @@ def _range(numbers: Sequence[Number], factor: float, unit: str) -> str:
 
 
 # ------------------------------------------------------------------------------
-# The verdict as a table, the same in terminal, report, notebook and `diagnosis.json`.
-
-ODD_MEANING = (
-    "The row of a trial in the sheet contradicts its motion. The verdict in full covers the other trials. Correct its "
-    "row, or leave it out with `use: no`, and run again."
-)
+# The verdict as a table, the same in terminal, report, explorer, notebook and `diagnosis.json`.
 
 # What would make the part of an error smaller that all trials share, by its source
 SHARED_REMEDIES = {
@@ -269,7 +264,7 @@ def _how_large(diagnosis: Diagnosis) -> tuple[str, str]:
 
 
 def _damping_law(diagnosis: Diagnosis) -> tuple[str, str]:
-    """N and B of the last model."""
+    """Exponent n and B of the last model."""
     law = [p for p in diagnosis.parameters if p.key in (EXPONENT, DAMPING) and is_finite(p.value)]
     # 5: n and the B of as many vines as a line has room for
     law = sorted(law, key=lambda p: p.key != EXPONENT)[:5]

@@ -33,6 +33,7 @@ from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
     LARGEST_SPREAD,
     LEAST_BETWEEN_TRIAL_SD,
+    at_unknowns,
     eliminated,
     marginal,
     normal_equations,
@@ -516,15 +517,6 @@ def film_trials(
 # With its trial effects eliminated, a trial is a quadratic form in the unknowns of a campaign, and forms add up. Those
 # of a refit are the free parameters of the hypothesis and, for each hypothesis that may be true, by how much the trial
 # moves as it says: minimised over the first, the diagonal of the others is what the refit does not explain.
-
-
-def at_unknowns(blocks: Floats, index: NDArray[np.int_], size: int) -> Floats:
-    """Blocks of trials at the unknowns of a campaign; those at −1 or `size` are dropped. Shapes: blocks (n, k, k);
-    index (n, k) → (n, size, size).
-    """
-    placed = np.zeros((len(blocks), size + 1, size + 1))
-    np.add.at(placed, (np.arange(len(blocks))[:, None, None], index[:, :, None], index[:, None, :]), blocks)
-    return placed[:, :size, :size]
 
 
 @dataclass(frozen=True)
