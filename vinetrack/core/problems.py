@@ -52,16 +52,15 @@ class Problem:
         """
         value = self.value or ""
         shown = repr(value if len(value) <= 60 else f"{value[:59]}…") if value else ""
-        subject = " ".join(part for part in (self.column, shown, self.message) if part)
-        allowed = f" (allowed: {self.allowed})" if self.allowed else ""
-        return _one_line(f"{subject}{allowed}{': ' + self.remedy if self.remedy else ''}")
+        allowed = f"(allowed: {self.allowed})" if self.allowed else ""
+        said = " ".join(filter(None, (self.column, shown, self.message, allowed)))
+        return _one_line(f"{said}{': ' + self.remedy if self.remedy else ''}")
 
     def __str__(self) -> str:
         """One line naming severity, file, line, trial, column, value, what is allowed and the remedy."""
         place = self.file + (f" line {self.line}" if self.line else "")
-        trial = f"trial {self.trial}" if self.trial else ""
-        where = ", ".join(part for part in (place, trial) if part)
-        return _one_line(": ".join(part for part in (self.severity, where, self.reason) if part))
+        where = ", ".join(filter(None, (place, self.trial and f"trial {self.trial}")))
+        return _one_line(": ".join(filter(None, (self.severity, where, self.reason))))
 
 
 class UserError(Exception):
@@ -95,12 +94,12 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
         for group in groups.values()
     ]
     ordered = sorted(merged, key=lambda problem: problem.severity != "error")
+    lines, remaining = list(map(str, ordered)), ordered[limit - 1 :]
     if len(ordered) <= limit:
-        return list(map(str, ordered))
-    remaining = ordered[limit - 1 :]
+        return lines
     errors = sum(problem.severity == "error" for problem in remaining)
     more = f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"
-    return [*map(str, ordered[: limit - 1]), more]
+    return [*lines[: limit - 1], more]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

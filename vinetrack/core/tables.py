@@ -7,6 +7,7 @@ convert strictly. A file is written under a temporary name and renamed, so that 
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import csv
 import errno
@@ -23,7 +24,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,23 +88,19 @@ PROVENANCE = "provenance.json"  # Its presence marks a results folder
 MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
 
 
-def list_recordings(folder: Path) -> list[str]:
+def list_recordings(folder: Path, depth: int = 4) -> list[str]:
     """Return the recordings below a folder, as relative paths in natural order."""
     # 4: levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
-    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, 4)]
-    return sorted(names, key=natural_order)
-
-
-def _recordings(folder: Path, depth: int) -> Iterator[Path]:
+    found = []
     for path in entries(folder):
         if path.is_file() and (path.suffix.lower() in CONTAINERS or _is_stack(path)):
-            yield path
+            found.append(path.name)
         elif path.is_dir() and not (path / PROVENANCE).exists() and not is_calibration(path):
-            inside = [entry for entry in entries(path) if entry.suffix.lower() in IMAGES]
-            if len(inside) >= MIN_PICTURES:
-                yield path
+            if sum(entry.suffix.lower() in IMAGES for entry in entries(path)) >= MIN_PICTURES:
+                found.append(path.name)
             elif depth > 0:
-                yield from _recordings(path, depth - 1)
+                found += [f"{path.name}/{name}" for name in list_recordings(path, depth - 1)]
+    return sorted(found, key=natural_order)
 
 
 def entries(folder: Path) -> list[Path]:
@@ -121,15 +118,12 @@ def is_calibration(folder: Path) -> bool:
 
 def _is_stack(path: Path) -> bool:
     """Whether a TIFF holds as many pictures as a recording needs."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
-    if path.suffix.lower() not in (".tif", ".tiff"):
-        return False
-    try:
-        with Image.open(path) as image:
+    if path.suffix.lower() in (".tif", ".tiff"):
+        with contextlib.suppress(OSError), Image.open(path) as image:
             return getattr(image, "n_frames", 1) >= MIN_PICTURES
-    except (OSError, UnidentifiedImageError):
-        return False
+    return False
 
 
 def natural_order(text: str) -> list[Any]:
@@ -200,11 +194,19 @@ def parse_number(text: str, decimal: str = ".") -> float:
     return value
 
 
-def decode_text(data: bytes) -> str:
-    r"""Decode a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`."""
-    if data.startswith((b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")):
+def read_text(path: Path) -> str:
+    r"""Read a text file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`."""
+    try:
+        if file_size(path) > MAX_TABLE_BYTES:
+            raise TableError("is too large to be a table", "is it a recording?")
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise TableError(*missing_file_message(path)) from None
+    except (OSError, ValueError) as error:
+        raise TableError("cannot be read", getattr(error, "strerror", None) or "it cannot be opened") from None
+    if data.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
         encodings = ["utf-32"]
-    elif data.startswith((b"\xff\xfe", b"\xfe\xff")):
+    elif data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encodings = ["utf-16"]
     elif b"\x00" in data:
         raise TableError("is not text", "save the table as CSV (comma or semicolon separated)")
@@ -214,19 +216,6 @@ def decode_text(data: bytes) -> str:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
     raise TableError("is not readable as text", "save it as CSV in UTF-8")
-
-
-def read_text(path: Path) -> str:
-    """Read a text file of at most `MAX_TABLE_BYTES`."""
-    try:
-        if file_size(path) > MAX_TABLE_BYTES:
-            raise TableError("is too large to be a table", "is it a recording?")
-        return decode_text(path.read_bytes())
-    except FileNotFoundError:
-        raise TableError(*missing_file_message(path)) from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it cannot be opened"
-        raise TableError("cannot be read", reason) from None
 
 
 def read_table(path: Path) -> Table:
@@ -240,7 +229,9 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
     if lines and (match := re.fullmatch(r'"?sep=(.)"?[;,\t]*', lines[0].strip("\ufeff "))):
         delimiter, lines, skip_lines = match[1], lines[1:], skip_lines + 1
     else:
-        delimiter = _find_delimiter(next((line for line in lines if line.strip()), ""))
+        # The separator that splits the header into most cells; headers contain no decimal commas.
+        header = re.sub(r'"[^"]*"', "", next((line for line in lines if line.strip()), ""))
+        delimiter = max("\t;,", key=header.count) if re.search("[\t;,]", header) else ","
     records = [(line, cells) for line, cells in _records("\n".join(lines), delimiter) if any(cells)]
     if not records:
         raise TableError("is empty", "its first line must name the columns")
@@ -258,12 +249,6 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
         decimal=_find_decimal([cell for _, cells in body for cell in cells], delimiter),
         nameless=any(cell and not name for row in pairs for name, cell in row),
     )
-
-
-def _find_delimiter(header: str) -> str:
-    """Return the separator that splits the header into most cells; headers contain no decimal commas."""
-    bare = re.sub(r'"[^"]*"', "", header)
-    return max("\t;,", key=bare.count) if any(mark in bare for mark in "\t;,") else ","
 
 
 def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
@@ -351,21 +336,11 @@ def write_csv(path: Path, frame: pd.DataFrame) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON with NaN and infinities as `null`, arrays as lists and paths as text."""
-    text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+    from pydantic_core import to_jsonable_python
+
+    plain = to_jsonable_python(content, inf_nan_mode="null", fallback=lambda array: array.tolist())
+    text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
     print(text) if path == STANDARD_OUTPUT else write_text(path, text + "\n")
-
-
-def _plain(content: Any) -> Any:
-    """Convert content to JSON types."""
-    if isinstance(content, dict):
-        return {str(key): _plain(value) for key, value in content.items()}
-    if isinstance(content, np.ndarray | np.generic):
-        return _plain(content.tolist())
-    if isinstance(content, list | tuple | set | frozenset):
-        return [_plain(value) for value in (sorted(content) if isinstance(content, set | frozenset) else content)]
-    if isinstance(content, float):
-        return content if math.isfinite(content) else None
-    return content.as_posix() if isinstance(content, Path) else content
 
 
 class JsonRecord:
@@ -373,15 +348,12 @@ class JsonRecord:
 
     def to_json(self) -> dict[str, Any]:
         """As the file holds it."""
-        adapter = _adapter(type(self))  # type: ignore[arg-type]
-        entry: dict[str, Any] = adapter.dump_python(self, by_alias=True, warnings=False)
-        return entry
+        return dict(_adapter(type(self)).dump_python(self, by_alias=True, warnings=False))  # type: ignore[arg-type]
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Self:
         """Read what `to_json` wrote."""
-        read: Self = _adapter(cls).validate_python(entry)  # type: ignore[arg-type]
-        return read
+        return cast(Self, _adapter(cls).validate_python(entry))  # type: ignore[arg-type]
 
 
 @cache
@@ -406,10 +378,9 @@ class YamlDocument:
 def read_yaml(path: Path) -> YamlDocument:
     """Read a YAML file that holds one mapping; an empty file is an empty mapping."""
     try:
-        text = read_text(path)
+        return parse_yaml(read_text(path), path.name)
     except TableError as error:
         raise ExperimentError([Problem.from_error(error, path.name)]) from None
-    return parse_yaml(text, path.name)
 
 
 def parse_yaml(text: str, file: str) -> YamlDocument:
@@ -419,7 +390,7 @@ def parse_yaml(text: str, file: str) -> YamlDocument:
 
     lines: dict[tuple[Any, ...], int] = {}
     problems: list[Problem] = []
-    content: Any = None
+    content: Any = {}
     try:
         yaml = YAML(typ="safe", pure=True)
         document = yaml.compose(text)
@@ -438,12 +409,11 @@ def parse_yaml(text: str, file: str) -> YamlDocument:
         remedy = "use spaces (no tabs) to indent, a space after each colon, and quotes around text that contains : or #"
         line = mark.line + 1 if mark is not None else 0
         problems = [Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)]
-    content = {} if content is None else content
-    if not isinstance(content, dict):
+    if not isinstance(content, dict | None):
         problems = [Problem(message="holds no settings", file=file, remedy="write lines such as 'key: value'")]
     if problems:
         raise ExperimentError(problems)
-    return YamlDocument(content, lines)
+    return YamlDocument(content or {}, lines)
 
 
 def _places(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], int]]:
@@ -494,10 +464,11 @@ def _edited(old: Any, value: Any) -> Any:
 
     if isinstance(value, dict):
         tree = old if isinstance(old, CommentedMap) else CommentedMap()
-        for name in [name for name in tree if name not in value]:
+        for name in tree.keys() - value.keys():
             del tree[name]
-        changed = {name: inner for name, inner in value.items() if name not in tree or tree[name] != inner}
-        tree.update({name: _edited(tree.get(name), inner) for name, inner in changed.items()})
+        for name, inner in value.items():
+            if name not in tree or tree[name] != inner:
+                tree[name] = _edited(tree.get(name), inner)
         return tree
     if isinstance(value, list):
         elements = old if isinstance(old, CommentedSeq) else CommentedSeq()

@@ -1,4 +1,4 @@
-"""Terminal output: aligned tables with units, progress bars, colour.
+"""Terminal output: aligned tables with units, progress bars, colour; and tables and figures in a notebook.
 
 Progress is drawn by rich on standard error, and only on a terminal; piped or logged output stays plain. Colour is used
 on a terminal unless NO_COLOR is set (https://no-color.org).
@@ -6,14 +6,17 @@ on a terminal unless NO_COLOR is set (https://no-color.org).
 
 from __future__ import annotations
 
+import html
 import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Generic, TextIO, TypeVar
+from importlib import import_module
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, Generic, TextIO, TypeVar
 
 if TYPE_CHECKING:
-    from rich.progress import ProgressColumn
+    from matplotlib.figure import Figure
 
 Item = TypeVar("Item")
 
@@ -39,20 +42,16 @@ def table(
     """Format rows as lines of aligned columns: numbers right-aligned, words left-aligned."""
     from rich.cells import cell_len
 
-    body = [[str(cell) for cell in row] for row in rows]
-    above = [list(line) for line in (header, units) if line]
-    lines = [*above, *body]
-    count = max(map(len, lines), default=0)
-    lines = [line + [""] * (count - len(line)) for line in lines]
-    columns = list(zip(*lines, strict=True))
-    sides = align or "".join(">" if _is_numeric(column[len(above) :]) else "<" for column in columns)
-    widths = [max(map(cell_len, column)) for column in columns]
-
-    def padded(cell: str, width: int, side: str) -> str:
-        room = " " * (width - cell_len(cell))
-        return room + cell if side == ">" else cell + room
-
-    return [(indent + "  ".join(map(padded, line, widths, sides))).rstrip() for line in lines]
+    above = [line for line in (header, units) if line]
+    columns = list(zip_longest(*above, *(map(str, row) for row in rows), fillvalue=""))
+    for i, column in enumerate(columns):
+        side = align[i] if align else ">" if _is_numeric(column[len(above) :]) else "<"
+        width = max(map(cell_len, column))
+        rooms = [" " * (width - cell_len(cell)) for cell in column]
+        columns[i] = tuple(
+            room + cell if side == ">" else cell + room for room, cell in zip(rooms, column, strict=True)
+        )
+    return [(indent + "  ".join(line)).rstrip() for line in zip(*columns, strict=True)]
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:
@@ -69,21 +68,12 @@ class Progress(Generic[Item]):
         from rich import progress as rich
         from rich.console import Console
 
-        def text(content: str) -> ProgressColumn:
-            return rich.TextColumn(content, markup=False)
-
-        def where(is_known: bool, column: ProgressColumn) -> ProgressColumn:
-            """Show a column only where the number of steps is known, or only where it is not."""
-            shown = column.render
-            column.render = lambda task: shown(task) if (task.total is not None) == is_known else ""  # type: ignore[method-assign]
-            return column
-
-        amount = [text("{task.description}:"), rich.BarColumn(), rich.MofNCompleteColumn(), text(unit)]
-        amount += [rich.TimeRemainingColumn(compact=True), text("left")]
-        columns = [where(False, rich.SpinnerColumn()), where(False, text("{task.description} … {task.elapsed:.0f} s"))]
-        columns += [where(True, column) for column in amount]
         self._items = items
-        screen = Console(stderr=True)
+        self._spinner = (rich.SpinnerColumn(), "{task.description} … {task.elapsed:.0f} s")
+        amount = (rich.BarColumn(), rich.MofNCompleteColumn(), unit, rich.TimeRemainingColumn(compact=True), "left")
+        self._count = ("{task.description}:", *amount)
+        screen = Console(stderr=True, markup=False, emoji=False, highlight=False)
+        columns = self._spinner if total is None else self._count
         self._bar = rich.Progress(*columns, console=screen, transient=True, disable=not sys.stderr.isatty())
         self._task = self._bar.add_task(description, total=total)
 
@@ -94,10 +84,12 @@ class Progress(Generic[Item]):
     def begin(self, description: str) -> None:
         """Show other work, of unknown length until `reach` says more."""
         self._bar.remove_task(self._task)
+        self._bar.columns = self._spinner
         self._task = self._bar.add_task(description, total=None)
 
     def reach(self, done: int, total: int, what: str) -> None:
         """Set the number of completed steps, of how many, and of what."""
+        self._bar.columns = self._count
         self._bar.update(self._task, completed=done, total=total, description=what)
 
     def __iter__(self) -> Iterator[Item]:
@@ -124,3 +116,18 @@ def progress(work: Sequence[Item] | int, description: str, unit: str = "trial") 
 def waiting(description: str) -> Progress[None]:
     """Return a spinner with the elapsed time, for work of unknown length."""
     return Progress((), None, description)
+
+
+def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:
+    """Return a table as HTML with all text escaped."""
+    above = f"<p><b>{html.escape(title)}</b></p>" if title else ""
+    names = "".join(f"<th>{html.escape(name)}</th>" for name in head)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    table = f"<table><thead><tr>{names}</tr></thead><tbody>{body}</tbody></table>" if rows else ""
+    return above + table + "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+
+
+def plot(shown: Any, name: str = "", **options: Any) -> Figure:
+    """Draw an object as in the report; figures are made in a room above, imported when one is requested."""
+    figure: Figure = import_module("vinetrack.interface.loaded").figure_of(shown, name, **options)
+    return figure

@@ -6,7 +6,7 @@ The program calculates in SI. A name that carries a unit ends with it: `pressure
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,12 +36,6 @@ def decimals(sigma: float) -> int:
 def or_nan(value: Any) -> float:
     """Return a number of a JSON file as a float; NaN for None, which means unknown."""
     return math.nan if value is None else float(value)
-
-
-def _known(values: Sequence[float | None] | None) -> tuple[float, ...]:
-    """The values, or nothing if one of them is unknown."""
-    numbers = tuple(map(or_nan, values or ()))
-    return numbers if all(map(math.isfinite, numbers)) else ()
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -76,18 +70,18 @@ def with_error(value: float | None, sigma: float | None) -> str:
 
 def interval(bounds: Sequence[float | None] | None) -> str:
     """Return `(low, high)` as "low to high", with decimals that suit its width; "–" if unknown."""
-    if not _known(bounds):
+    low, high = map(or_nan, bounds or (None, None))
+    if not math.isfinite(low + high):
         return "–"
-    low, high = _known(bounds)
     places = min(decimals(high - low), 6) if high > low else 2
     return f"{low:.{places}f} to {high:.{places}f}"
 
 
 def with_interval(value: float | None, bounds: Sequence[float | None] | None, shown: bool = True) -> str:
     """Return `value (95 %: low to high)`, with decimals that suit the width; without bounds the value."""
-    if value is None or not _known(bounds):
+    low, high = map(or_nan, bounds or (None, None))
+    if value is None or not math.isfinite(low + high):
         return number(value)
-    low, high = _known(bounds)
     half = float(f"{(high - low) / 2:.1e}")  # 0.00999 rounds to 0.010
     places = min(decimals(half), 6) if half > 0 else 3
     return f"{value:.{places}f}" + (f" (95 %: {low:.{places}f} to {high:.{places}f})" if shown else "")
@@ -114,40 +108,33 @@ class Unit:
         return value * self.divide / self.multiply
 
 
+def _units(scales: dict[str, str]) -> Iterator[tuple[str, Unit]]:
+    """Yield the units of a table that states, by SI unit, `name=multiply/divide` of each."""
+    texts = {"um": "µm", "m": "metres", "us": "µs", "cm3": "cm³", "l": "litres", "m3": "m³", "deg": "degrees"}
+    texts |= {"rad": "radians", "g_cm3": "g/cm³", "kg_m3": "kg/m³", "fps": "frames per second"}
+    metavars = {"kPa": "KPA", "MPa": "MPA", "um": "UM", "mm": "MM", "g": "GRAMS", "l": "LITRES", "deg": "DEGREES"}
+    for si, units in scales.items():
+        for name, _, scale in (unit.partition("=") for unit in units.split()):
+            multiply, _, divide = scale.partition("/")
+            metavar = metavars.get(name, "NUMBER")
+            yield name, Unit(si, texts.get(name, name), float(multiply), float(divide or 1), metavar)
+
+
 # Units by the suffix of a name
-UNITS: dict[str, Unit] = {
-    "Pa": Unit("Pa", "Pa"),
-    "mbar": Unit("Pa", "mbar", multiply=100.0),
-    "kPa": Unit("Pa", "kPa", multiply=1000.0, metavar="KPA"),
-    "psi": Unit("Pa", "psi", multiply=6894.757293168361),
-    "bar": Unit("Pa", "bar", multiply=1e5),
-    "MPa": Unit("Pa", "MPa", multiply=1e6, metavar="MPA"),
-    "nm": Unit("m", "nm", divide=1e9),
-    "um": Unit("m", "µm", divide=1e6, metavar="UM"),
-    "mm": Unit("m", "mm", divide=1000.0, metavar="MM"),
-    "cm": Unit("m", "cm", divide=100.0),
-    "in": Unit("m", "in", multiply=25.4, divide=1000.0),
-    "ft": Unit("m", "ft", multiply=304.8, divide=1000.0),
-    "m": Unit("m", "metres"),
-    "mg": Unit("kg", "mg", divide=1e6),
-    "g": Unit("kg", "g", divide=1000.0, metavar="GRAMS"),
-    "oz": Unit("kg", "oz", multiply=28.349523125, divide=1000.0),
-    "lb": Unit("kg", "lb", multiply=453.59237, divide=1000.0),
-    "kg": Unit("kg", "kg"),
-    "ns": Unit("s", "ns", divide=1e9),
-    "us": Unit("s", "µs", divide=1e6),
-    "ms": Unit("s", "ms", divide=1000.0),
-    "s": Unit("s", "s"),
-    "ml": Unit("m3", "ml", divide=1e6),
-    "cm3": Unit("m3", "cm³", divide=1e6),
-    "l": Unit("m3", "litres", divide=1000.0, metavar="LITRES"),
-    "m3": Unit("m3", "m³"),
-    "deg": Unit("rad", "degrees", multiply=math.pi / 180, metavar="DEGREES"),
-    "rad": Unit("rad", "radians"),
-    "g_cm3": Unit("kg_m3", "g/cm³", multiply=1000.0),
-    "kg_m3": Unit("kg_m3", "kg/m³"),
-    "fps": Unit("fps", "frames per second"),
-}
+UNITS = dict(
+    _units(
+        {
+            "Pa": "Pa=1 mbar=100 kPa=1000 psi=6894.757293168361 bar=1e5 MPa=1e6",
+            "m": "nm=1/1e9 um=1/1e6 mm=1/1000 cm=1/100 in=25.4/1000 ft=304.8/1000 m=1",
+            "kg": "mg=1/1e6 g=1/1000 oz=28.349523125/1000 lb=453.59237/1000 kg=1",
+            "s": "ns=1/1e9 us=1/1e6 ms=1/1000 s=1",
+            "m3": "ml=1/1e6 cm3=1/1e6 l=1/1000 m3=1",
+            "rad": f"deg={math.pi / 180!r} rad=1",
+            "kg_m3": "g_cm3=1000 kg_m3=1",
+            "fps": "fps=1",
+        }
+    )
+)
 
 NO_UNIT = Unit("", "")  # That of text, and of numbers that have none
 

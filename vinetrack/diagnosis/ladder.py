@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.notebook import plot
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Kinematics, Track
+from vinetrack.core.terminal import plot
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_by_condition
 from vinetrack.dynamics.model import Model, host_for

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer
 
-from vinetrack.core.notebook import plot
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.tables import JsonRecord
+from vinetrack.core.terminal import plot
 from vinetrack.inference.fit_result import OrNaN, or_open
 
 if TYPE_CHECKING:

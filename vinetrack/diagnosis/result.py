@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
-from vinetrack.core.notebook import plot
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.tables import JsonRecord
+from vinetrack.core.terminal import plot
 from vinetrack.diagnosis.power import Power
 from vinetrack.inference.fit_result import Fit, Number, OrNaN
 

@@ -14,10 +14,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator
 
-from vinetrack.core.notebook import html_table
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.tables import JsonRecord
+from vinetrack.core.terminal import html_table
 from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, OrNaN, numbers_text
 from vinetrack.inference.position_errors import with_smooth_errors

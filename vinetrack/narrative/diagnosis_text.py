@@ -10,8 +10,8 @@ from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.notebook import html_table
 from vinetrack.core.problems import joined
+from vinetrack.core.terminal import html_table
 from vinetrack.core.units import PREDICTION_UNITS, decimals, display_unit, number, with_error, with_interval
 from vinetrack.diagnosis.result import (
     NOT_TESTABLE,
