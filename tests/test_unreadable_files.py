@@ -27,8 +27,7 @@ from vinetrack.core.problems import format_problems
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import parse_number, parse_table
 from vinetrack.effects._catalogue import remember
-from vinetrack.experiment.folder import check_experiment
-from vinetrack.experiment.provenance import describe_run
+from vinetrack.experiment.folder import check_experiment, describe_run
 from vinetrack.pipeline.workflow import make_plan
 from vinetrack.results.folder_layout import read_result
 from vinetrack.tracks.importers import TrackError, read_pressure_trace, read_track

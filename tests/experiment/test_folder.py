@@ -14,9 +14,16 @@ from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import read_yaml
 from vinetrack.experiment.folder import Experiment, check_experiment, read_experiment
-from vinetrack.experiment.reference import reference_content, reference_page, setting_entries
 from vinetrack.experiment.schema import COLUMNS, SHARED
-from vinetrack.experiment.settings import ExperimentSettings, RunSettings, read_experiment_settings, run_settings
+from vinetrack.experiment.settings import (
+    ExperimentSettings,
+    RunSettings,
+    read_experiment_settings,
+    reference_content,
+    reference_page,
+    run_settings,
+    setting_entries,
+)
 from vinetrack.pipeline.effects_stage import model_problems
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -39,7 +40,7 @@ class Column:
     low: float
     high: float
     above_low: bool
-    slips: tuple[str, ...]
+    slips: list[str]
     usual_from: float
     unusual_hint: str
     allowed_text: str
@@ -61,13 +62,15 @@ class Column:
         return self.scale.text
 
     @property
+    def bounds(self) -> str:
+        """The allowed values, in words, without the unit."""
+        above = "above " if self.above_low else "at least " if math.isinf(self.high) else ""
+        return self.allowed_text or f"{above}{self.low:g}" + ("" if math.isinf(self.high) else f" to {self.high:g}")
+
+    @property
     def allowed(self) -> str:
         """The allowed values, in words."""
-        if self.allowed_text:
-            return self.allowed_text
-        above = "above " if self.above_low else "at least " if math.isinf(self.high) else ""
-        high = "" if math.isinf(self.high) else f" to {self.high:g}"
-        return f"{above}{self.low:g}{high} {self.unit}".rstrip()
+        return f"{self.bounds} {self.unit}".rstrip()
 
     @property
     def quantity(self) -> str:
@@ -89,22 +92,12 @@ class Column:
 
 def _read_columns() -> dict[str, Column]:
     with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
-        head, *lines = csv.reader(file)
-    rows: list[dict[str, Any]] = [dict(zip(head, line, strict=True)) for line in lines]
-    return {
-        row["name"]: Column(
-            **row
-            | {
-                "low": float(row["low"].removeprefix(">") or -math.inf),
-                "above_low": row["low"].startswith(">"),
-                "high": float(row["high"] or math.inf),
-                "slips": tuple(row["slips"].split()),
-                "usual_from": float(row["usual_from"] or -math.inf),
-                "shared": row["shared"] == "yes",
-            }
-        )
-        for row in rows
-    }
+        rows: list[dict[str, Any]] = list(csv.DictReader(file))
+    for row in rows:
+        row |= {"above_low": row["low"].startswith(">"), "low": row["low"].lstrip(">"), "slips": row["slips"].split()}
+        row |= {"shared": row["shared"] == "yes", "high": float(row["high"] or math.inf)}
+        row |= {name: float(row[name] or -math.inf) for name in ("low", "usual_from")}
+    return {row["name"]: Column(**row) for row in rows}
 
 
 COLUMNS = _read_columns()  # Every column of `trials.csv` by name, in the order of the documentation
@@ -153,14 +146,12 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
                 if text.lower() not in ("yes", "y", "true", "1", "no", "n", "false", "0"):
                     raise CellError("is neither yes nor no", code="not_yes_or_no")
                 return text.lower() in ("yes", "y", "true", "1")
-            case "window":
-                return _read_window(text, decimal)
+            case "window" | "frames":
+                return _read_span(text, decimal, of_frames=column.kind == "frames")
             case "bends":
                 return _read_bends(text, decimal)
             case "axis":
                 return _read_axis(text)
-            case "frames":
-                return _read_frames(text)
         return _check_number(column, parse_number(text, decimal))
     except InputError as error:
         raise CellError(error.message, error.remedy, column.allowed, error.code) from None
@@ -197,9 +188,10 @@ def _check_number(column: Column, value: float) -> float:
     return value
 
 
-def unusual_value_hint(column: Column, value: float) -> str:
-    """Return the column's hint if an allowed value lies below the usual range; zero is deliberate, hence usual."""
-    return "" if value == 0 or value >= column.usual_from else column.unusual_hint
+def unusual(column: Column, value: Any) -> str:
+    """Say so if an allowed number lies below the usual range; zero is deliberate, hence usual."""
+    is_unusual = column.kind == "number" and value is not None and value != 0 and value < column.usual_from
+    return f"is unusual: {column.unusual_hint}" if is_unusual else ""
 
 
 def _likely_unit(column: Column, value: float) -> str:
@@ -214,23 +206,13 @@ def _likely_unit(column: Column, value: float) -> str:
     return ""
 
 
-def _read_window(text: str, decimal: str) -> tuple[float, float]:
-    """Read a time window `from_s:to_s`."""
-    parts = text.split(":")
-    if len(parts) != 2:
-        raise CellError("is not a window", code="not_a_window")
-    start, end = (parse_number(part, decimal) for part in parts)
-    if start >= end:
-        raise CellError("ends before it starts", code="reversed")
-    return start, end
-
-
-def _read_frames(text: str) -> tuple[int, int]:
-    """Read a range of frames `from:to`, counted from 0, both ends included."""
+def _read_span(text: str, decimal: str, of_frames: bool) -> tuple[float, float]:
+    """Read a time window `from_s:to_s`, or a range of frames `from:to`, counted from 0, both ends included."""
     parts = [part.strip() for part in text.split(":")]
-    if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
-        raise CellError("is not a range of frames", code="not_a_range")
-    first, last = int(parts[0]), int(parts[1])
+    if len(parts) != 2 or (of_frames and not all(part.isascii() and part.isdigit() for part in parts)):
+        kind, code = ("range of frames", "not_a_range") if of_frames else ("window", "not_a_window")
+        raise CellError(f"is not a {kind}", code=code)
+    first, last = (int(part) if of_frames else parse_number(part, decimal) for part in parts)
     if first >= last:
         raise CellError("ends before it starts", code="reversed")
     return first, last
@@ -281,20 +263,17 @@ def _read_bends(text: str, decimal: str) -> tuple[Bend, ...]:
 def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     """Return the trials with `vine` and `condition` filled in. The name of a condition always contains pressure and
     payload, and other physical settings only if they differ within the experiment (the yield pressure only if it
-    differs within one vine). Returns the trials, in the same order.
+    differs within one vine).
     """
     # Columns that a condition's name shows only if they differ within the experiment; bends, the longest part, last
     optional = sorted((c for c in COLUMNS.values() if c.condition_part), key=lambda column: column.kind == "bends")
     shown = [column for column in optional if len({_part(column, trial) for trial in trials}) > 1]
-    yields: dict[str, set[str]] = {}
-    for trial in trials:
-        yields.setdefault(_vine(trial), set()).add(_yield_pressure(trial))
+    yields = Counter(vine for vine, _ in {(_vine(trial), _yield_pressure(trial)) for trial in trials})
     named = []
     for trial in trials:
         vine = _vine(trial)
         parts = [vine, f"{_digits(trial.pressure_Pa / 1000)}kPa", f"{_digits(trial.payload_kg * 1000)}g"]
-        if len(yields[vine]) > 1:
-            parts.append(_yield_pressure(trial))
+        parts += [_yield_pressure(trial)] if yields[vine] > 1 else []
         parts += filter(None, (_part(column, trial) for column in shown))
         named.append(replace(trial, vine=vine, condition="_".join(parts)))
     return tuple(named)

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+import types
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 from pydantic import (
@@ -27,9 +28,10 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 
+from vinetrack.core import terminal
 from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
-from vinetrack.core.records import Bend
 from vinetrack.core.tables import Table, TableError, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
 from vinetrack.experiment.schema import (
@@ -147,20 +149,17 @@ class Charuco(_Board):
 Calibration = Annotated[Charuco | Checkerboard | TwoPoints | MmPerPx, Field(discriminator="kind")]
 
 # Models of `calibration`, by its kind
-CALIBRATIONS: dict[str, type[BaseModel]] = {
-    **{"charuco": Charuco, "checkerboard": Checkerboard, "two_points": TwoPoints, "mm_per_px": MmPerPx}
-}
+CALIBRATIONS: dict[str, type[BaseModel]] = {"charuco": Charuco, "checkerboard": Checkerboard}
+CALIBRATIONS |= {"two_points": TwoPoints, "mm_per_px": MmPerPx}
 
 
-def _optional_fields(types: Mapping[str, Any]) -> Any:
-    """Return a base class with an optional field of each name and type, None by default."""
-    fields: dict[str, Any] = {name: (kind | None, None) for name, kind in types.items()}
+def _columns(names: Iterable[str]) -> Any:
+    """Return a base class with a field of each name, None by default; its values are read like cells of the sheet."""
+    fields: dict[str, Any] = dict.fromkeys(names, (Any, None))
     return create_model("Columns", __base__=_Strict, **fields)
 
 
-_LimitedColumns: Any = _optional_fields(
-    dict.fromkeys(LIMITED["range"], tuple[float, float]) | dict.fromkeys(LIMITED["choice"], tuple[float, ...])
-)
+_LimitedColumns: Any = _columns((*LIMITED["range"], *LIMITED["choice"]))
 
 
 class Limits(_LimitedColumns):
@@ -195,9 +194,7 @@ class Limits(_LimitedColumns):
         return tuple(sorted({read_limit(column, limit) for limit in value}))
 
 
-# Type of the value of each kind of column; all others are numbers
-_TYPES: Any = {"text": str, "path": str, "bends": tuple[Bend, ...], "window": tuple[float, float], "yes_no": bool}
-_SharedColumns: Any = _optional_fields({name: _TYPES.get(COLUMNS[name].kind, float) for name in SHARED})
+_SharedColumns: Any = _columns(SHARED)
 
 
 class ExperimentSettings(_SharedColumns):
@@ -410,15 +407,17 @@ def _group(model: type[BaseModel], location: tuple[Any, ...]) -> type[BaseModel]
 # Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a warning.
 
 
+def _in_other_units(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Every name of one of these quantities in another unit: its own name, and that unit."""
+    return {other: (name, unit) for name in names for other, unit in other_units(name).items()}
+
+
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
     """Convert columns in other units to those of the sheet, with a warning each; of two units the blank gives way."""
     problems: list[Problem] = []
-    known = {other: (name, unit) for name in COLUMNS for other, unit in other_units(name).items()}
+    known, renamed = _in_other_units(COLUMNS), dict[str, tuple[str, str]]()
     taken = {name for name in table.columns if any(row[name] for row in table.rows)}
-    renamed: dict[str, tuple[str, str]] = {}
-    for other in table.columns:
-        if other in COLUMNS or other not in known:
-            continue
+    for other in filter(known.__contains__, table.columns):
         name, unit = known[other]
         if name in taken:
             message = f"is ignored, because the sheet also has {name}"
@@ -437,21 +436,14 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
 
 def _to_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> None:
     """Convert keys in other units to those of the settings, with a warning each; of two units the blank gives way."""
-    groups: dict[tuple[str, ...], Iterable[type[BaseModel]]] = {
-        (): [ExperimentSettings],
-        ("limits",): [Limits],
-        ("axis",): [AxisSettings],
-        ("calibration",): CALIBRATIONS.values(),
-    }
-    for path, models in groups.items():
-        keys = document.content.get(path[0]) if path else document.content
-        names = dict.fromkeys(name for model in models for name in model.model_fields)
-        pairs = [(name, *other) for name in names for other in other_units(name).items()]
-        for name, other, unit in pairs if isinstance(keys, dict) else ():
+    of_group: dict[str, Any] = {"": [ExperimentSettings], "limits": [Limits], "axis": [AxisSettings]}
+    for group, models in (of_group | {"calibration": CALIBRATIONS.values()}).items():
+        keys, path = (document.content.get(group), (group,)) if group else (document.content, ())
+        known = _in_other_units(name for model in models for name in model.model_fields)
+        for other, (name, unit) in known.items() if isinstance(keys, dict) else ():
             if other not in keys or None not in (keys.get(name), keys[other]):
                 continue
-            value = keys.pop(other)
-            if value is not None:
+            if (value := keys.pop(other)) is not None:
                 line = document.lines[*path, name] = document.lines.get((*path, other), 0)
                 keys[name] = _converted(value, unit, name)
                 problems.append(_conversion(name, unit, column=".".join((*path, other)), file=file, line=line))
@@ -477,3 +469,120 @@ def _conversion(name: str, unit: str, **place: Any) -> Problem:
     own = split_unit(name)[1]
     message = f"is read as {name}: 1 {UNITS[unit].text} is {convert(1.0, unit, own):.6g} {UNITS[own].text}"
     return Problem("unit", message, severity="warning", **place)
+
+
+# ------------------------------------------------------------------------------
+# Reference of all columns of `trials.csv` and all keys of `experiment.yaml` and `config/config.yaml`.
+#
+# Generated from the declarations that validate them, so that reference and validation agree.
+
+
+class Entry(NamedTuple):
+    """Reference entry of a column or key; fields that do not apply are blank. `measured` says how to measure it."""
+
+    name: str
+    unit: str
+    default: str
+    allowed: str
+    meaning: str
+    measured: str = ""
+
+
+def setting_entries(model: type[BaseModel], prefix: str = "", suffix: str = "") -> Iterator[Entry]:
+    """Yield the entries of all keys of a settings model that are not columns; keys of a group as `group.key`."""
+    for name, field in model.model_fields.items():
+        if name == "kind" or (model is ExperimentSettings and name in SHARED):
+            continue
+        if model is Limits and name in COLUMNS:
+            words = "Range to choose from." if name in LIMITED["range"] else "Values to choose from."
+            yield Entry(prefix + name, COLUMNS[name].unit, "as in the trials so far", COLUMNS[name].bounds, words)
+            continue
+        key = split_unit(name)[1]
+        unit = UNITS[key].text if key else "mm/px" if name == "mm_per_px" else "px" if name.endswith("_px") else ""
+        meaning = " ".join((field.description or "").split())
+        measured = next((text for text in field.metadata if isinstance(text, str)), "")
+        yield Entry(f"{prefix}{name}{suffix}", unit, _default(name, field), _allowed(field), meaning, measured)
+        if isinstance(field.default, BaseModel):
+            yield from setting_entries(type(field.default), f"{name}.")
+
+
+def reference_content() -> dict[str, list[dict[str, str]]]:
+    """Return the reference for a program: lists of entries under `columns`, `experiment`, `picture` and `run`."""
+    return {name: [entry._asdict() for entry in entries] for name, _, entries in _groups()}
+
+
+def _groups() -> tuple[tuple[str, str, list[Entry]], ...]:
+    """Name, title and entries of each part of the reference."""
+    not_shared = ", ".join(name for name, column in COLUMNS.items() if not column.shared)
+    title = f"Columns of trials.csv; all but {not_shared} may be set in experiment.yaml for all trials"
+    run_title = "Keys of config/config.yaml, also --config key=value of snakemake"
+    columns = [Entry(c.name, c.unit, c.default, c.bounds, c.meaning, c.measured) for c in COLUMNS.values()]
+    picture = [setting_entries(of_kind, "calibration.", f" (kind: {kind})") for kind, of_kind in CALIBRATIONS.items()]
+    picture.append(setting_entries(AxisSettings, "axis."))
+    return (
+        ("columns", title, columns),
+        ("experiment", "Keys of experiment.yaml", list(setting_entries(ExperimentSettings))),
+        ("picture", "Keys of calibration and axis in experiment.yaml", list(chain(*picture))),
+        ("run", run_title, list(setting_entries(RunSettings))),
+    )
+
+
+def reference_page() -> str:
+    """Return the reference as the page `docs/settings.md`."""
+    parts = [
+        "# Every column and key",
+        "",
+        "Generated from the declarations that validate them: `vinetrack settings` prints the same,",
+        "`vinetrack settings --json -` prints it for a program, and `vinetrack settings --page docs/settings.md`",
+        "writes this page. A column, or a key of `experiment.yaml`, may state another unit in its name",
+        "(`pressure_psi`, `diameter_in`, …): it is converted, and `vinetrack check` reports the conversion.",
+        "A blank cell means the default.",
+        "",
+    ]
+    for _, title, entries in _groups():
+        heading, _, shared = title.partition("; ")
+        parts += [f"## {heading}", ""]
+        parts += [f"{shared[0].upper()}{shared[1:]}.", ""] if shared else []
+        parts += ["| name | default | allowed | meaning, *how to measure it* |", "|---|---|---|---|"]
+        for e in entries:
+            measured = f" *{e.measured}*" if e.measured else ""
+            cells = (f"`{e.name}`", e.default, e.allowed, e.meaning + measured)
+            parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        parts.append("")
+    return "\n".join(parts)
+
+
+def reference_lines() -> list[str]:
+    """Return the reference as aligned lines for the terminal, one per column or key."""
+    head = ("name", "unit", "default", "allowed", "meaning")
+    lines: list[str] = []
+    for _, title, entries in _groups():
+        rows = [(e.name, e.unit, e.default, e.allowed, f"{e.meaning} {e.measured}".rstrip()) for e in entries]
+        lines += [title, *terminal.table(rows, head, indent="  ", align="<<<<<"), ""]
+    return [
+        *lines,
+        "A column may state another unit in its name (pressure_psi, pressure_bar, diameter_in, …): it is converted.",
+    ]
+
+
+def _default(name: str, field: FieldInfo) -> str:
+    value = {"via_px": "none: a straight line", "width_mm": "from the motion"}.get(name, field.default)
+    if field.is_required():
+        return "required"
+    if value is None or isinstance(value, BaseModel):
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _allowed(field: FieldInfo) -> str:
+    """Choices or bounds of a key, read from its annotation."""
+    several = get_origin(field.annotation) in (types.UnionType, Union, tuple)
+    parts: tuple[Any, ...] = get_args(field.annotation) if several else (field.annotation,)
+    choices = [str(choice) for part in parts if get_origin(part) is Literal for choice in get_args(part)]
+    rules = [*field.metadata, *(rule for part in parts for rule in getattr(part, "__metadata__", ()))]
+    rules += [inner for rule in rules if isinstance(rule, FieldInfo) for inner in rule.metadata]
+    words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+    bounds = [f"{words[name]} {getattr(rule, name):g}" for rule in rules for name in words if hasattr(rule, name)]
+    return ", ".join(dict.fromkeys(choices or bounds))

@@ -16,7 +16,7 @@ from typing import Any
 from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputError, Problem, did_you_mean
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
-from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, read_cell, unusual_value_hint, with_names
+from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, read_cell, unusual, with_names
 from vinetrack.experiment.settings import (
     Charuco,
     Checkerboard,
@@ -106,8 +106,8 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         except CellError as error:
             row.add_error(error, name, text)
             continue
-        if column.kind == "number" and (hint := unusual_value_hint(column, row.values[name])):
-            row.add("unusual", f"is unusual: {hint}", name, "warning", value=text)
+        if said := unusual(column, row.values[name]):
+            row.add("unusual", said, name, "warning", value=text)
     if table.extra[index]:
         message = f"has more cells than the header ({table.extra[index][0][:40]!r} …)"
         row.add("more_cells", message, remedy="put text that contains separators, and decimal commas, in quotes")
@@ -268,8 +268,8 @@ def expected_systematic_m(settings: ExperimentSettings, scaled_elsewhere: bool =
 # Columns that a prediction needs; an unknown yield pressure is taken from the scaling prior
 REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 
-# Columns about recordings: optional for a planned trial, and ignored
-_RECORDING_COLUMNS = ("video", "track", "pressure_trace", "capture_fps", "exposure_us", "mm_per_px", "steady")
+# Columns about recordings: optional for a planned trial, and ignored but for the rate
+_RECORDING_COLUMNS = ("video", "track", "pressure_trace", "exposure_us", "mm_per_px", "steady", "capture_fps")
 
 
 @dataclass(frozen=True)
@@ -312,11 +312,8 @@ def planned_trial(
     >>> planned_trial(texts).trials[0].vine
     '24mm-200um-280mm'
     """
-    settings = settings or ExperimentSettings()
     table = table_of_texts([{"trial": "planned", **{name: text.strip() for name, text in values.items()}}])
-    rows, problems = _checked_rows(table, settings, needed)
-    problems = [replace(p, file="", trial="", column=option(p.column) if p.column else "") for p in problems]
-    return PlannedTrials(tuple(_trials(rows, settings, problems)), settings, None, tuple(problems))
+    return _planned(table, settings or ExperimentSettings(), needed)
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
@@ -334,13 +331,10 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
         header.append(Problem("missing", f"has no column {', '.join(absent)}", file=file.name, remedy=remedy))
     if absent or not table.rows:
         raise ExperimentError(header)
-    rows, problems = _checked_rows(table, settings, REQUIRED_FOR_PREDICTION)
-    problems = [*header, *(replace(problem, file=file.name) for problem in problems)]
-    trials = _trials(rows, settings, problems)
-    if not every_row:
-        first = {trial.condition: trial for trial in reversed(trials)}
-        trials = [trial for trial in trials if trial is first[trial.condition]]
-    return PlannedTrials(tuple(trials), settings, file.parent, tuple(problems))
+    planned = _planned(table, settings, REQUIRED_FOR_PREDICTION, header, file.name)
+    first = {trial.condition: trial for trial in reversed(planned.trials)}
+    trials = [trial for trial in planned.trials if every_row or trial is first[trial.condition]]
+    return replace(planned, trials=tuple(trials), folder=file.parent)
 
 
 def table_of_texts(rows: Sequence[dict[str, str]]) -> Table:
@@ -349,9 +343,15 @@ def table_of_texts(rows: Sequence[dict[str, str]]) -> Table:
     return Table(columns, tuple(rows), (0,) * len(rows), ((),) * len(rows), ",", ".")
 
 
-def _checked_rows(table: Table, settings: ExperimentSettings, needed: Sequence[str]) -> tuple[list[Row], list[Problem]]:
-    """Read and check the rows in use; return them with their problems, those of recordings left out."""
+def _planned(
+    table: Table, settings: ExperimentSettings, needed: Sequence[str], header: Sequence[Problem] = (), file: str = ""
+) -> PlannedTrials:
+    """Check the rows in use, and make named trials of them without their recordings, unless there is an error; a yield
+    pressure that is not given is NaN. Problems name the sheet, or without a file the options.
+    """
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
+    remedy = "remove `use: no` from at least one row"
+    problems = [] if rows else [Problem("no_rows", "has no trial in use", remedy=remedy)]
     for row in rows:
         row.add_blank(needed, "give it")
         if row.travel_ratio != 2:
@@ -359,21 +359,15 @@ def _checked_rows(table: Table, settings: ExperimentSettings, needed: Sequence[s
             row.add("a_body", "is that of a body that moves as a whole", "travel_ratio", remedy=remedy)
         check_wall(row)
         check_pressures(row)
-    if not rows:
-        remedy = "remove `use: no` from at least one row"
-        return rows, [Problem("no_rows", "has no trial in use", remedy=remedy)]
-    return rows, [p for row in rows for p in row.problems if p.column not in _RECORDING_COLUMNS]
-
-
-def _trials(rows: Sequence[Row], settings: ExperimentSettings, problems: Sequence[Problem]) -> list[Trial]:
-    """Return named trials without their recordings; a yield pressure that is not given is NaN. Refuse errors."""
+        problems += [problem for problem in row.problems if problem.column not in _RECORDING_COLUMNS]
+    if not file:
+        problems = [replace(p, trial="", column=option(p.column) if p.column else "") for p in problems]
+    problems = [*header, *(replace(problem, file=file) for problem in problems)]
     if any(problem.severity == "error" for problem in problems):
         raise ExperimentError(problems)
-    trials = []
     for row in rows:
-        unused = {*_RECORDING_COLUMNS} - {"capture_fps"}
-        values = {name: value for name, value in row.values.items() if name not in unused}
-        if "yield_pressure_kPa" not in values:
-            values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)
-        trials.append(make_trial(replace(row, values=values), Path(), settings))
-    return list(with_names(trials))
+        row.values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS[:-1]}
+        if "yield_pressure_kPa" not in row.values:
+            row.values |= dict.fromkeys(("yield_pressure_kPa", "yield_pressure_sigma_kPa"), math.nan)
+    trials = with_names([make_trial(row, Path(), settings) for row in rows])
+    return PlannedTrials(trials, settings, None, tuple(problems))

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.effects import EffectError, catalogue, own_effects
-from vinetrack.experiment.folder import Experiment
-from vinetrack.experiment.provenance import describe_run
+from vinetrack.experiment.folder import Experiment, describe_run
 from vinetrack.experiment.settings import FigureSettings
 from vinetrack.figures.diagnosis_figures import DiagnosisTables
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, campaign_figures, draw, figures_of
