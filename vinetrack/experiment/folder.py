@@ -112,33 +112,32 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     table = _read_sheet(folder, problems)
     rows = [read_row(table, i, settings or ExperimentSettings()) for i in range(len(table.rows))] if table else []
     absent: set[str] = set()
-    for row in rows:
-        if row.in_use:
-            check_row(row, folder)
-            # A value that the sheet lacks may stand in the settings, so this needs readable settings.
-            absent |= find_missing(row, folder, table.columns) if table and settings else set()
-    problems += _name_problems(rows)
+    in_use = [row for row in rows if row.in_use]
+    for row in in_use:
+        check_row(row, folder)
+        # A value that the sheet lacks may stand in the settings, so this needs readable settings.
+        absent |= find_missing(row, folder, table.columns) if table and settings else set()
     problems += [_absent_column(name) for name in COLUMNS if name in absent]
     corrections, faults = read_corrections(folder)
     problems += [*faults, *_unmatched(corrections, rows)]
-    sheet_is_sound = not any(problem.severity == "error" for problem in problems)
-    for row in rows:
-        if sheet_is_sound and row.in_use and not row.failed:
+    sheet_is_sound = not (_names_repeat(rows) or any(problem.severity == "error" for problem in problems))
+    for row in in_use:
+        if sheet_is_sound and not row.faulty:
             _take_pressure_from_recording(row, folder)
             check_pressures(row)
     problems += [problem for row in rows for problem in row.problems]
     strict = strict if strict is not None else settings is not None and settings.strict
-    if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
+    if settings is None or not sheet_is_sound or (strict and any(row.faulty for row in in_use)):
         raise ExperimentError(problems)
-    trials = [make_trial(row, folder, settings) for row in rows if row.in_use and not row.failed]
+    trials = [make_trial(row, folder, settings) for row in in_use if not row.faulty]
     trials = [replace(trial, corrections=corrections.get(trial.name, ())) if trial.video else trial for trial in trials]
-    errors = {row.name: [p.reason for p in row.problems if p.severity == "error"] for row in rows if row.in_use}
+    reasons = {row.name: "; ".join(p.reason for p in row.problems if p.severity == "error") for row in in_use}
     return Experiment(
         name=Path(os.path.normpath(folder.absolute())).name or "experiment",
         folder=folder,
         settings=settings,
         trials=with_names(trials),
-        failed={name: "; ".join(reasons) for name, reasons in errors.items() if reasons},
+        failed={name: reason for name, reason in reasons.items() if reason},
         left_out={row.name: "left out by the sheet (use: no)" for row in rows if not row.in_use},
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
@@ -201,21 +200,18 @@ def _absent_column(name: str) -> Problem:
     return Problem("missing", "is missing", name, file=SHEET, remedy=remedy)
 
 
-def _name_problems(rows: list[Row]) -> list[Problem]:
-    """Report repeated names (errors) and names that differ only in case (warnings)."""
-    problems, seen = [], dict[str, Row]()
+def _names_repeat(rows: list[Row]) -> bool:
+    """Whether two rows have the same name, which is an error; names that differ only in case are a warning."""
+    repeat, seen = False, dict[str, Row]()
     for row in rows:
         first = seen.setdefault(row.name.lower(), row)
-        if first is row:
-            continue
-        severity, remedy = "error", "give every trial a name of its own"
-        message = f"is also the name of line {first.line}"
         if first.name != row.name:
-            severity, remedy = "warning", ""
             message = f"differs from {first.name!r} on line {first.line} in case only, which some file systems ignore"
-        place: dict[str, Any] = {"file": SHEET, "trial": row.name, "line": row.line, "value": row.name}
-        problems.append(Problem("twice", message, "trial", severity=severity, remedy=remedy, **place))
-    return problems
+            row.add("twice", message, "trial", "warning", value=row.name)
+        elif first is not row:
+            remedy, repeat = "give every trial a name of its own", True
+            row.add("twice", f"is also the name of line {first.line}", "trial", value=row.name, remedy=remedy)
+    return repeat
 
 
 def _take_pressure_from_recording(row: Row, folder: Path) -> None:
@@ -227,25 +223,21 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     try:
         pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
     except TrackError as error:
-        row.add_error(error, column, row.values[column])
-        return
+        return row.add_error(error, column, row.values[column])
     if pressure is None:
         remedy = "fill it in, or give the track a column pressure_kPa"
-        row.add("blank", "is blank, and the track carries no pressure", "pressure_kPa", remedy=remedy)
-        return
+        return row.add("blank", "is blank, and the track carries no pressure", "pressure_kPa", remedy=remedy)
     nominal_kPa = float(f"{float(pressure[0]) / 1000:.3g}")
     if nominal_kPa < 0:
         remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, below zero"
-        row.add("blank", "is blank", "pressure_kPa", value="", remedy=remedy)
-        return
+        return row.add("blank", "is blank", "pressure_kPa", value="", remedy=remedy)
     row.values["pressure_kPa"] = nominal_kPa
 
 
 # ------------------------------------------------------------------------------
 # Manual corrections of tracked points: `corrections.csv` beside the trial sheet.
 #
-# One line per point: `trial, frame, action, edge_px`. The tracker applies the action and flags the point `corrected`;
-# the position that it had found itself is kept in the results.
+# The tracker applies the action and flags the point `corrected`; the position it had found itself stays in the results.
 
 CORRECTIONS_FILE = "corrections.csv"
 CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")
@@ -255,7 +247,6 @@ Corrections = dict[str, tuple[Correction, ...]]
 
 def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
     """Read the corrections of an experiment, by name of trial, and what is wrong with their file."""
-    problems: list[Problem] = []
     if not os.path.lexists(folder / CORRECTIONS_FILE):
         return {}, []
     try:
@@ -266,6 +257,7 @@ def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
         remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
         return {}, [Problem("missing", "is missing", missing[0], file=CORRECTIONS_FILE, remedy=remedy)]
     by_trial: dict[str, dict[int, Correction]] = {}
+    problems: list[Problem] = []
     for row, line in zip(table.rows, table.lines, strict=True):
         by_frame = by_trial.setdefault(row["trial"], {})
         column = "action"
@@ -300,12 +292,12 @@ def _unmatched(corrections: Corrections, rows: list[Row]) -> Iterator[Problem]:
 def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
     """Return the content of `corrections.csv` for these corrections."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(CORRECTION_COLUMNS)
-    for trial, of_trial in corrections.items():
-        for correction in of_trial:
-            edge = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""
-            writer.writerow([trial, correction.frame, correction.action, edge])
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(CORRECTION_COLUMNS)
+    for trial, given in corrections.items():
+        for one in given:
+            edge = f"{one.edge_px:.2f}" if math.isfinite(one.edge_px) else ""
+            table.writerow([trial, one.frame, one.action, edge])
     return out.getvalue()
 
 
@@ -389,18 +381,16 @@ def check_experiment(
             message, remedy = tables.missing_file_message(path)
             problems.append(Problem("no_file", message, key, file=SETTINGS, value=relative, remedy=remedy))
     problems += [*_order_problems(experiment.trials), *_in_no_row(experiment)]
-    trial_problems: list[Problem] = []
+    of_trials: list[Problem] = []
     readable: list[Trial] = []
     named_videos = {trial.video for trial in experiment.trials if trial.video}
     for trial in experiment.trials:
-        of_trial = _check_track(trial) if trial.track else []
-        if trial.video:
-            of_trial = _check_video(trial.video, named_videos)
-            readable += [] if of_trial else [trial]
-        trial_problems += [replace(problem, trial=trial.name) for problem in of_trial]
+        found = _check_video(trial.video, named_videos) if trial.video else _check_track(trial)
+        of_trials += [replace(problem, trial=trial.name) for problem in found]
+        readable += [trial] if trial.video and not found else []
     if readable and open_videos is not None:
-        trial_problems += open_videos(experiment, readable)
-    return problems + [_with_location(problem, experiment) for problem in trial_problems]
+        of_trials += open_videos(experiment, readable)
+    return problems + [_with_location(problem, experiment) for problem in of_trials]
 
 
 def _with_location(problem: Problem, experiment: Experiment) -> Problem:

@@ -48,11 +48,6 @@ class Row:
         return {problem.column for problem in self.problems if problem.severity == "error"}
 
     @property
-    def failed(self) -> bool:
-        """Whether the row has an error."""
-        return bool(self.faulty)
-
-    @property
     def in_use(self) -> bool:
         """Whether the trial is to be analysed; False for `use: no`."""
         return bool(self.values.get("use", True))
@@ -60,11 +55,11 @@ class Row:
     @property
     def travel_ratio(self) -> float:
         """Travel ratio of row or settings; 2 by default."""
-        return float(self.values.get("travel_ratio", 2.0))
+        return self.number("travel_ratio", 2.0)
 
-    def number(self, column: str) -> float:
-        """Return the number of a column; NaN where it is blank."""
-        return float(self.values.get(column, math.nan))
+    def number(self, column: str, blank: float = math.nan) -> float:
+        """Return the number of a column."""
+        return float(self.values.get(column, blank))
 
     def add(self, code: str, message: str, column: str = "", severity: str = "error", **details: Any) -> None:
         """Record a problem of this row."""
@@ -78,9 +73,8 @@ class Row:
     def add_blank(self, columns: Sequence[str], remedy: str = "fill it in") -> None:
         """Report required columns that have no value, unless another problem already concerns them."""
         code = "blank" if self.line else "missing"  # a row that stands in no file has no blank cells
-        known = {*self.values, *self.faulty}
         for name in columns:
-            if name not in known:
+            if name not in {*self.values, *self.faulty}:
                 self.add(code, f"is {code}", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
 
 

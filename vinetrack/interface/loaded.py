@@ -271,7 +271,7 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
         check_wall(row)
         check_pressures(row)
         problems += [replace(problem, file="the frame") for problem in row.problems]
-        if not row.failed:
+        if not row.faulty:
             # Marks the trial as a track measured elsewhere, which determines the default of its smooth errors.
             row.values["track"] = row.name
             trials.append(replace(make_trial(row, Path(), settings), track=None))
