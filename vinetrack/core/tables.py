@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 
 # ------------------------------------------------------------------------------
 # Checks of files before they are opened: only regular files are, since reading a pipe would block.
-#
-# A path in a sheet stays inside the experiment folder, but a link there may lead out, for example to recordings on
-# another disk. Its target must be a regular file or a folder, like every entry of the folder itself.
 
 # Message for a FIFO, a socket, a terminal or a device such as `/dev/zero`
 NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"

@@ -37,6 +37,7 @@ class Column:
     field: str
     kind: str
     unit_key: str
+    scale: Unit
     low: float
     high: float
     above_low: bool
@@ -50,11 +51,6 @@ class Column:
     default: str
     meaning: str
     measured: str
-
-    @property
-    def scale(self) -> Unit:
-        """The unit; one without a name for text and for numbers that have none."""
-        return UNITS.get(self.unit_key, NO_UNIT)
 
     @property
     def unit(self) -> str:
@@ -96,6 +92,7 @@ def _read_columns() -> dict[str, Column]:
     for row in rows:
         row |= {"above_low": row["low"].startswith(">"), "low": row["low"].lstrip(">"), "slips": row["slips"].split()}
         row |= {"shared": row["shared"] == "yes", "high": float(row["high"] or math.inf)}
+        row["scale"] = UNITS.get(row["unit_key"], NO_UNIT)
         row |= {name: float(row[name] or -math.inf) for name in ("low", "usual_from")}
     return {row["name"]: Column(**row) for row in rows}
 
@@ -121,10 +118,8 @@ def option(column: str) -> str:
 
 
 # ------------------------------------------------------------------------------
-# Reading and checking of single values of the trial sheet.
-#
-# A cell of `trials.csv` and a value of `experiment.yaml` pass the same checks and get the same remedies. Values stay
-# in the unit of their column until `vinetrack.experiment.sheet.make_trial` converts them to SI.
+# Reading and checking of single values, in cells of `trials.csv` and in `experiment.yaml` alike, in the unit of their
+# column.
 
 SHORTEST_AXIS_PX = 10  # Chosen: the direction of a shorter axis is too uncertain
 SMALLEST_POINT_SPACING_PX = 2  # Smallest distance between neighbouring points of a curved path (chosen)
@@ -254,9 +249,7 @@ def _read_bends(text: str, decimal: str) -> tuple[Bend, ...]:
 
 
 # ------------------------------------------------------------------------------
-# Names of vines and conditions, unique for each set of nominal settings.
-#
-# Names list the settings and are valid file names: `24mm-200um-280mm` is a vine, `24mm-200um-280mm_28kPa_35.6g` a
+# Names of vines and conditions list their settings: `24mm-200um-280mm` is a vine, `24mm-200um-280mm_28kPa_35.6g` a
 # condition.
 
 

@@ -179,11 +179,10 @@ class Limits(_LimitedColumns):
             low, high = read_range(column, value)
             steps = np.geomspace(low, high, 5) if low > 0 else np.linspace(low, high, 5)
             return tuple(sorted({low, *(float(f"{step:.3g}") for step in steps[1:-1]), high}))
-        if not isinstance(value, list | tuple):
-            return (read_limit(column, value),)
-        if not value:
+        limits = value if isinstance(value, list | tuple) else [value]
+        if not limits:
             raise CellError("is empty", "name at least one value, or remove the key", code="empty")
-        return tuple(sorted({read_limit(column, limit) for limit in value}))
+        return tuple(sorted({read_limit(column, limit) for limit in limits}))
 
 
 _SharedColumns: Any = _columns(SHARED)
@@ -370,7 +369,11 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
     line = next((document.lines[start] for start in starts if start in document.lines), 0)
     place: dict[str, Any] = {"file": file, "line": line, "column": ".".join(str(part) for part in location)}
     if detail["type"] == "extra_forbidden":
-        names = list(_group(model, found).model_fields)
+        group: Any = model
+        if len(found) > 1:
+            of_axis = AxisSettings if found[0] == "axis" else type(model.model_fields[found[0]].default)
+            group = CALIBRATIONS[found[1]] if found[0] == "calibration" else of_axis
+        names = list(group.model_fields)
         if same := [name for name in names if location[-1] in other_units(name)]:
             return Problem("twice", f"is {same[0]} again", remedy="keep one of the two", **place)
         remedy = did_you_mean(str(location[-1]), names) or "remove it"
@@ -384,15 +387,6 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
     words = re.sub(r"a valid (tuple|list)", "a list", detail["msg"])
     words = re.sub(r"a valid dictionary.*", "a group of keys", words)
     return Problem("not_allowed", f"is not allowed: {words[:1].lower()}{words[1:]}", **place)
-
-
-def _group(model: type[BaseModel], location: tuple[Any, ...]) -> type[BaseModel]:
-    """Return the model of the group of keys that holds a location, as pydantic gives it."""
-    if len(location) == 1:
-        return model
-    if location[0] == "calibration":
-        return CALIBRATIONS[location[1]]
-    return AxisSettings if location[0] == "axis" else type(model.model_fields[location[0]].default)
 
 
 # ------------------------------------------------------------------------------
@@ -447,14 +441,11 @@ def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
         return [_converted(element, unit, name) for element in value]
     if isinstance(value, str) and ":" in value:
         return ":".join(_converted(part, unit, name, decimal) for part in value.split(":"))
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return value
     try:
-        given = parse_number(value, decimal) if isinstance(value, str) else float(value)
+        number = convert(parse_number(str(value), decimal), unit, split_unit(name)[1])
     except TableError:
         return value
-    text = f"{convert(given, unit, split_unit(name)[1]):.15g}"
-    return text.replace(".", decimal or ".") if isinstance(value, str) else float(text)
+    return f"{number:.15g}".replace(".", decimal or ".") if isinstance(value, str) else float(f"{number:.15g}")
 
 
 def _conversion(name: str, unit: str, **place: Any) -> Problem:
@@ -464,9 +455,7 @@ def _conversion(name: str, unit: str, **place: Any) -> Problem:
 
 
 # ------------------------------------------------------------------------------
-# Reference of all columns of `trials.csv` and all keys of `experiment.yaml` and `config/config.yaml`.
-#
-# Generated from the declarations that validate them, so that reference and validation agree.
+# Reference of all columns and keys, generated from the declarations that validate them.
 
 
 class Entry(NamedTuple):

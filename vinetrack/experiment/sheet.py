@@ -231,15 +231,14 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
             value = safe_join(folder, value)
         fields[column.field] = column.to_si(float(value)) if column.kind in ("number", "choice") else value
     # Without a recording the trial is planned, and what will limit its positions is not known.
-    planned = "track" not in values and "video" not in values and settings.position_systematic_mm is None
-    scaled_elsewhere = "track" in values or "mm_per_px" in values
+    scaled_elsewhere = "video" not in values or "mm_per_px" in values
     return Trial(
         **fields,
         ambient_pressure_Pa=settings.ambient_pressure_kPa * 1000,
         mass_loss=settings.mass_loss,
         tail_slack=settings.tail_slack,
         tail_store=settings.tail_store,
-        position_systematic_m=math.nan if planned else expected_systematic_m(settings, scaled_elsewhere),
+        position_systematic_m=expected_systematic_m(settings, scaled_elsewhere),
     )
 
 
