@@ -62,13 +62,14 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 class Progress(Generic[Item]):
-    """A bar with the time left, or a spinner; on standard error, if that is a terminal."""
+    """A bar with the time left, or a spinner for work of unknown length; on standard error, if that is a terminal."""
 
-    def __init__(self, items: Iterable[Item], total: int | None, description: str, unit: str = "") -> None:
+    def __init__(self, work: Sequence[Item] | int | None, description: str, unit: str = "trial") -> None:
         from rich import progress as rich
         from rich.console import Console
 
-        self._items = items
+        self._items: Sequence[Item] = () if isinstance(work, int | None) else work
+        total = work if isinstance(work, int | None) else len(work)
         self._spinner = (rich.SpinnerColumn(), "{task.description} … {task.elapsed:.0f} s")
         amount = (rich.BarColumn(), rich.MofNCompleteColumn(), unit, rich.TimeRemainingColumn(compact=True), "left")
         self._count = ("{task.description}:", *amount)
@@ -106,16 +107,12 @@ class Progress(Generic[Item]):
         self._bar.stop()
 
 
-def progress(work: Sequence[Item] | int, description: str, unit: str = "trial") -> Progress[Item]:
-    """Return a progress bar over the elements of `work`, or over a number of steps."""
-    if isinstance(work, int):
-        return Progress((), work, description, unit)
-    return Progress(work, len(work), description, unit)
+progress = Progress
 
 
 def waiting(description: str) -> Progress[None]:
     """Return a spinner with the elapsed time, for work of unknown length."""
-    return Progress((), None, description)
+    return Progress(None, description)
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:

@@ -27,17 +27,7 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import IMAGES, SIDE_FILES, Correction, Floats, Trial
 from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, unusual, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
-from vinetrack.experiment.sheet import (
-    SHEET,
-    Row,
-    check_pressures,
-    check_row,
-    closest_entry,
-    find_missing,
-    make_trial,
-    read_row,
-    read_sheet,
-)
+from vinetrack.experiment.sheet import SHEET, Row, closest_entry, make_trial, read_row, read_sheet
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
 
 SETTINGS = "experiment.yaml"
@@ -114,9 +104,9 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     absent: set[str] = set()
     in_use = [row for row in rows if row.in_use]
     for row in in_use:
-        check_row(row, folder)
+        row.check(folder)
         # A value that the sheet lacks may stand in the settings, so this needs readable settings.
-        absent |= find_missing(row, folder, table.columns) if table and settings else set()
+        absent |= row.find_missing(folder, table.columns) if table and settings else set()
     problems += [_absent_column(name) for name in COLUMNS if name in absent]
     corrections, faults = read_corrections(folder)
     problems += [*faults, *_unmatched(corrections, rows)]
@@ -124,7 +114,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     for row in in_use:
         if sheet_is_sound and not row.faulty:
             _take_pressure_from_recording(row, folder)
-            check_pressures(row)
+            row.check_pressures()
     problems += [problem for row in rows for problem in row.problems]
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.faulty for row in in_use)):

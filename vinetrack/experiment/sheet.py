@@ -77,6 +77,70 @@ class Row:
             if name not in {*self.values, *self.faulty}:
                 self.add(code, f"is {code}", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
 
+    def check(self, folder: Path) -> None:
+        """Check the row as a whole: one recording or track, paths inside the folder, values that agree."""
+        for name in ("video", "track", "pressure_trace"):
+            if name in self.values:
+                try:
+                    safe_join(folder, self.values[name])
+                except TableError as error:
+                    self.add_error(error, name, self.values[name])
+        if "video" in self.values and "track" in self.values:
+            message, remedy = "has both a video and a track", "keep one of the two"
+            self.add("two_recordings", message, "track", value=self.values["track"], remedy=remedy)
+        elif "video" not in self.values and "track" not in self.values:
+            remedy = "name a recording under video, or a file of positions under track"
+            self.add("no_recording", "has neither a video nor a track", remedy=remedy)
+        self.check_wall()
+        fps, exposure = self.number("capture_fps"), self.number("exposure_us")
+        # An exposure cannot exceed the frame interval. 2 % allows for rounding of both numbers; above 1.5 intervals
+        # rounding cannot be the reason.
+        if exposure > 1.02e6 / fps:
+            intervals = exposure * fps / 1e6
+            message = f"is {intervals:.3g} times the frame interval at {fps:g} frames per second ({1e6 / fps:.4g} µs)"
+            severity, remedy = ("error", "check its unit and capture_fps") if intervals > 1.5 else ("warning", "")
+            self.add("longer_than_a_frame", message, "exposure_us", severity, value=f"{exposure:g}", remedy=remedy)
+
+    def find_missing(self, folder: Path, columns: tuple[str, ...]) -> set[str]:
+        """Report required cells that are blank; return required columns that neither sheet nor settings have."""
+        if "travel_ratio" in self.faulty:
+            return set()
+        required = list(REQUIRED_COLUMNS if self.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
+        if "pressure_kPa" in required and ("pressure_trace" in self.values or "track" in self.values):
+            required.remove("pressure_kPa")
+        self.add_blank([name for name in required if name in columns])
+        if "video" in self.values and "track" not in self.values and not _may_state_rate(folder, self.values["video"]):
+            required.append("capture_fps")
+            remedy = "write the capture rate; the rate stored in the file is that of playback"
+            self.add_blank(["capture_fps"] if "capture_fps" in columns else [], remedy)
+        return set(required) - set(columns) - set(self.values)
+
+    def check_wall(self) -> None:
+        """Report a wall thickness above a quarter of the diameter, which no tube can have."""
+        diameter, thickness = self.number("diameter_mm"), self.number("thickness_um")
+        if thickness / 1000 > diameter / 4:
+            message = f"is more than a quarter of the diameter ({diameter:g} mm)"
+            allowed, remedy = f"at most {250 * diameter:g} µm", "check the units: thickness in µm, diameter in mm"
+            self.add("wall", message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
+
+    def check_pressures(self) -> None:
+        """Warn of pressures that are allowed but implausible."""
+        pressure, yield_pressure = self.number("pressure_kPa"), self.number("yield_pressure_kPa")
+        if self.travel_ratio == 1:
+            message = "is above 0 although the body moves as a whole (travel_ratio 1): is it a vine?"
+            if pressure > 0:
+                self.add("pressure_of_a_body", message, "pressure_kPa", "warning", value=f"{pressure:g}")
+            return
+        if yield_pressure >= pressure:
+            message = f"is not below the pressure of {pressure:g} kPa, so the vine would not grow"
+            message += " (psi? 1 psi is 6.895 kPa)"
+            self.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
+        if pressure > 0 and yield_pressure == 0 and not self.values.get("yield_pressure_sigma_kPa"):
+            message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"
+            remedy = "measure it (raise the pressure until the tip moves), or state its error in "
+            remedy += "yield_pressure_sigma_kPa"
+            self.add("no_yield_pressure", message, "yield_pressure_kPa", "warning", value="0", remedy=remedy)
+
 
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     """Read and check the cells of one row; shared settings fill blank cells. An invalid name gives way to the line."""
@@ -140,46 +204,6 @@ def closest_entry(path: Path, taken: Set[Path] = frozenset()) -> str:
     return names[close[0]] if close else ""
 
 
-def check_row(row: Row, folder: Path) -> None:
-    """Check a row as a whole: one recording or track, paths inside the folder, values that agree with each other."""
-    for name in ("video", "track", "pressure_trace"):
-        if name in row.values:
-            try:
-                safe_join(folder, row.values[name])
-            except TableError as error:
-                row.add_error(error, name, row.values[name])
-    if "video" in row.values and "track" in row.values:
-        message, remedy = "has both a video and a track", "keep one of the two"
-        row.add("two_recordings", message, "track", value=row.values["track"], remedy=remedy)
-    if "video" not in row.values and "track" not in row.values:
-        remedy = "name a recording under video, or a file of positions under track"
-        row.add("no_recording", "has neither a video nor a track", remedy=remedy)
-    check_wall(row)
-    fps, exposure = row.number("capture_fps"), row.number("exposure_us")
-    # An exposure cannot exceed the frame interval. 2 % allows for rounding of both numbers; above 1.5 intervals
-    # rounding cannot be the reason.
-    if exposure > 1.02e6 / fps:
-        intervals = exposure * fps / 1e6
-        message = f"is {intervals:.3g} times the frame interval at {fps:g} frames per second ({1e6 / fps:.4g} µs)"
-        severity, remedy = ("error", "check its unit and capture_fps") if intervals > 1.5 else ("warning", "")
-        row.add("longer_than_a_frame", message, "exposure_us", severity, value=f"{exposure:g}", remedy=remedy)
-
-
-def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
-    """Report required cells that are blank; return required columns that neither sheet nor settings have."""
-    if "travel_ratio" in row.faulty:
-        return set()
-    required = list(REQUIRED_COLUMNS if row.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
-    if "pressure_kPa" in required and ("pressure_trace" in row.values or "track" in row.values):
-        required.remove("pressure_kPa")
-    row.add_blank([name for name in required if name in columns])
-    if "video" in row.values and "track" not in row.values and not _may_state_rate(folder, row.values["video"]):
-        required.append("capture_fps")
-        if "capture_fps" in columns:
-            row.add_blank(["capture_fps"], "write the capture rate; the rate stored in the file is that of playback")
-    return set(required) - set(columns) - set(row.values)
-
-
 def _may_state_rate(folder: Path, video: str) -> bool:
     """Whether a recording is of a kind that can carry its capture rate; whether it does, only opening it shows."""
     try:
@@ -188,31 +212,6 @@ def _may_state_rate(folder: Path, video: str) -> bool:
         return any(file.suffix.lower() in {".dng", *CAMERA_FILES} and file.exists() for file in files)
     except (TableError, OSError, ValueError):
         return False
-
-
-def check_wall(row: Row) -> None:
-    """Report a wall thickness above a quarter of the diameter, which no tube can have."""
-    diameter, thickness = row.number("diameter_mm"), row.number("thickness_um")
-    if thickness / 1000 > diameter / 4:
-        message = f"is more than a quarter of the diameter ({diameter:g} mm)"
-        allowed, remedy = f"at most {250 * diameter:g} µm", "check the units: thickness in µm, diameter in mm"
-        row.add("wall", message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
-
-
-def check_pressures(row: Row) -> None:
-    """Warn of pressures that are allowed but implausible."""
-    pressure, yield_pressure = row.number("pressure_kPa"), row.number("yield_pressure_kPa")
-    if row.travel_ratio == 2 and yield_pressure >= pressure:
-        message = f"is not below the pressure of {pressure:g} kPa, so the vine would not grow (psi? 1 psi is 6.895 kPa)"
-        row.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
-    stated_sigma = row.values.get("yield_pressure_sigma_kPa", 0.0) > 0
-    if row.travel_ratio == 2 and pressure > 0 and yield_pressure == 0 and not stated_sigma:
-        message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"
-        remedy = "measure it (raise the pressure until the tip moves), or state its error in yield_pressure_sigma_kPa"
-        row.add("no_yield_pressure", message, "yield_pressure_kPa", "warning", value="0", remedy=remedy)
-    if row.travel_ratio == 1 and pressure > 0:
-        message = "is above 0 although the body moves as a whole (travel_ratio 1): is it a vine?"
-        row.add("pressure_of_a_body", message, "pressure_kPa", "warning", value=f"{pressure:g}")
 
 
 def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
@@ -350,8 +349,8 @@ def _planned(
         if row.travel_ratio != 2:
             remedy = "predictions are for everting vines (travel_ratio 2)"
             row.add("a_body", "is that of a body that moves as a whole", "travel_ratio", remedy=remedy)
-        check_wall(row)
-        check_pressures(row)
+        row.check_wall()
+        row.check_pressures()
         problems += [problem for problem in row.problems if problem.column not in _RECORDING_COLUMNS]
     if not file:
         problems = [replace(p, trial="", column=option(p.column) if p.column else "") for p in problems]

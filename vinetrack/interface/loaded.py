@@ -29,14 +29,7 @@ from vinetrack.effects import catalogue, own_effects
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
-from vinetrack.experiment.sheet import (
-    REQUIRED_FOR_PREDICTION,
-    check_pressures,
-    check_wall,
-    make_trial,
-    read_row,
-    table_of_texts,
-)
+from vinetrack.experiment.sheet import REQUIRED_FOR_PREDICTION, make_trial, read_row, table_of_texts
 from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.figures.registry import FigureTables, campaign_figures, describe_conditions, draw, label_conditions
 from vinetrack.inference.fit import fit as fit_pairs
@@ -268,8 +261,8 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
         row = read_row(table, i, settings)
         required = REQUIRED_FOR_PREDICTION if row.travel_ratio == 2 else REQUIRED_FOR_PREDICTION[:1]
         row.add_blank(required, "give it as a column of the frame")
-        check_wall(row)
-        check_pressures(row)
+        row.check_wall()
+        row.check_pressures()
         problems += [replace(problem, file="the frame") for problem in row.problems]
         if not row.faulty:
             # Marks the trial as a track measured elsewhere, which determines the default of its smooth errors.
