@@ -25,7 +25,7 @@ import typer
 
 from vinetrack.core.problems import ExperimentError, UserError, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, is_disk_full, write_json
-from vinetrack.experiment.schema import COLUMNS, CellError, Column, option, read_cell
+from vinetrack.experiment.schema import COLUMNS, CellError, Column, option
 
 # ------------------------------------------------------------------------------
 # Output of commands: lines for the user, or with `--json` the same content for a program.
@@ -216,7 +216,7 @@ def _value(line: Mapping[str, str], given: Any) -> Any:
         raise _refused(line, f"{given!r} is neither {line['metavar'].replace('|', ' nor ')}")
     if kind == "column" and given is not None:
         try:
-            return read_cell(COLUMNS[line["field"]], given)
+            return COLUMNS[line["field"]].read(given)
         except CellError as error:
             raise _refused(line, f"{given!r} {error.message}: {error.allowed or error.remedy}") from None
     if kind in ("list", "object") and given is not None:

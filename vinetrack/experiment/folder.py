@@ -25,7 +25,7 @@ import vinetrack
 from vinetrack.core import tables
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import IMAGES, SIDE_FILES, Correction, Floats, Trial
-from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, unusual, with_names
+from vinetrack.experiment.schema import COLUMNS, GROUPINGS, SHARED, with_names
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, Row, closest_entry, make_trial, read_row, read_sheet
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
@@ -151,7 +151,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
             problems.append(Problem.from_error(error, SETTINGS, column=key, value=relative))
     for name in SHARED:
         value = getattr(settings, name)
-        if said := unusual(COLUMNS[name], value):
+        if said := COLUMNS[name].unusual(value):
             problems.append(Problem("unusual", said, name, file=SETTINGS, value=f"{value:g}", severity="warning"))
     return settings
 

@@ -24,6 +24,12 @@ from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import parse_number
 from vinetrack.core.units import NO_UNIT, UNITS, Unit, convert, split_unit
 
+Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
+
+
+class CellError(InputError, ValueError):
+    """A value that its column does not allow; pydantic reports it as an error of its key."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
@@ -41,7 +47,7 @@ class Column:
     low: float
     high: float
     above_low: bool
-    slips: list[str]
+    slips: tuple[str, ...]
     usual_from: float
     unusual_hint: str
     allowed_text: str
@@ -85,15 +91,68 @@ class Column:
         """Return a trial's value of this column."""
         return self.scale.from_si(float(getattr(trial, self.field)))
 
+    def read(self, text: str, decimal: str = ".") -> Value:
+        """Return the value of a non-blank cell, in the unit of its column."""
+        try:
+            match self.kind:
+                case "text" | "path":
+                    return text
+                case "yes_no":
+                    if text.lower() not in ("yes", "y", "true", "1", "no", "n", "false", "0"):
+                        raise CellError("is neither yes nor no", code="not_yes_or_no")
+                    return text.lower() in ("yes", "y", "true", "1")
+                case "window" | "frames":
+                    return _read_span(text, decimal, of_frames=self.kind == "frames")
+                case "bends":
+                    return _read_bends(text, decimal)
+                case "axis":
+                    return _read_axis(text)
+            return self._checked(parse_number(text, decimal))
+        except InputError as error:
+            raise CellError(error.message, error.remedy, self.allowed, error.code) from None
+
+    def read_limit(self, value: Any) -> float:
+        """Read one number of `limits`, checked like a cell of the column."""
+        if isinstance(value, bool | list | tuple | dict):
+            raise CellError("holds something that is not a number", "write numbers only", code="not_a_number")
+        return float(str(self.read(str(value).strip())))
+
+    def _checked(self, value: float) -> float:
+        """Return the value unchanged if its column allows it."""
+        if self.kind == "choice" and value not in (1, 2):
+            raise CellError("is not a travel ratio", code="not_a_choice")
+        if value > self.high:
+            message = f"is above {self.high:g} {self.unit}"
+            raise CellError(message, self._likely_unit(value), code="above_bounds")
+        if value < self.low or (self.above_low and value == self.low):
+            message = f"{'is not above' if self.above_low else 'is below'} {self.low:g} {self.unit}".strip()
+            raise CellError(message, self._likely_unit(value), code="below_bounds")
+        return value
+
+    def unusual(self, value: Any) -> str:
+        """Say so if an allowed number lies below the usual range; zero is deliberate, hence usual."""
+        is_unusual = self.kind == "number" and value is not None and value != 0 and value < self.usual_from
+        return f"is unusual: {self.unusual_hint}" if is_unusual else ""
+
+    def _likely_unit(self, value: float) -> str:
+        """Name the unit in which the value was probably written, if the column would allow it in that unit."""
+        for key in self.slips:
+            unit, factor = UNITS[key].text, convert(1.0, key, self.unit_key)
+            meant = value * factor
+            # It must bring the value into range: enlarge one that is too small, shrink one that is too large.
+            if (factor > 1) == (value < self.high) and max(self.low, 1e-9) <= meant <= self.high:
+                return f"looks like {unit}: {value:g} {unit} is {meant:g} {self.unit}"
+        return ""
+
 
 def _read_columns() -> dict[str, Column]:
     with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
         rows: list[dict[str, Any]] = list(csv.DictReader(file))
     for row in rows:
-        row |= {"above_low": row["low"].startswith(">"), "low": row["low"].lstrip(">"), "slips": row["slips"].split()}
-        row |= {"shared": row["shared"] == "yes", "high": float(row["high"] or math.inf)}
-        row["scale"] = UNITS.get(row["unit_key"], NO_UNIT)
-        row |= {name: float(row[name] or -math.inf) for name in ("low", "usual_from")}
+        row |= {"scale": UNITS.get(row["unit_key"], NO_UNIT), "slips": tuple(row["slips"].split())}
+        row |= {"shared": row["shared"] == "yes", "above_low": row["low"].startswith(">")}
+        row |= {"low": float(row["low"].lstrip(">") or -math.inf), "high": float(row["high"] or math.inf)}
+        row["usual_from"] = float(row["usual_from"] or -math.inf)
     return {row["name"]: Column(**row) for row in rows}
 
 
@@ -124,81 +183,16 @@ def option(column: str) -> str:
 SHORTEST_AXIS_PX = 10  # Chosen: the direction of a shorter axis is too uncertain
 SMALLEST_POINT_SPACING_PX = 2  # Smallest distance between neighbouring points of a curved path (chosen)
 
-Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
-
-
-class CellError(InputError, ValueError):
-    """A value that its column does not allow; pydantic reports it as an error of its key."""
-
-
-def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
-    """Return the value of a non-blank cell, in the unit of its column."""
-    try:
-        match column.kind:
-            case "text" | "path":
-                return text
-            case "yes_no":
-                if text.lower() not in ("yes", "y", "true", "1", "no", "n", "false", "0"):
-                    raise CellError("is neither yes nor no", code="not_yes_or_no")
-                return text.lower() in ("yes", "y", "true", "1")
-            case "window" | "frames":
-                return _read_span(text, decimal, of_frames=column.kind == "frames")
-            case "bends":
-                return _read_bends(text, decimal)
-            case "axis":
-                return _read_axis(text)
-        return _check_number(column, parse_number(text, decimal))
-    except InputError as error:
-        raise CellError(error.message, error.remedy, column.allowed, error.code) from None
-
 
 def read_range(column: Column, value: Any) -> tuple[float, float]:
     """Read `low:high` or two numbers, each checked like a cell of the column and in its unit."""
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
         raise CellError("is not a range", "write low:high, such as 7:40", code="not_a_range")
-    low, high = (read_limit(column, part) for part in parts)
+    low, high = (column.read_limit(part) for part in parts)
     if low > high:
         raise CellError("ends below its start", "write the lower value first", code="reversed")
     return low, high
-
-
-def read_limit(column: Column, value: Any) -> float:
-    """Read one number of `limits`, checked like a cell of the column."""
-    if isinstance(value, bool | list | tuple | dict):
-        raise CellError("holds something that is not a number", "write numbers only", code="not_a_number")
-    return float(str(read_cell(column, str(value).strip())))
-
-
-def _check_number(column: Column, value: float) -> float:
-    """Return the value unchanged if its column allows it."""
-    if column.kind == "choice" and value not in (1, 2):
-        raise CellError("is not a travel ratio", code="not_a_choice")
-    if value > column.high:
-        message = f"is above {column.high:g} {column.unit}"
-        raise CellError(message, _likely_unit(column, value), code="above_bounds")
-    if value < column.low or (column.above_low and value == column.low):
-        message = f"{'is not above' if column.above_low else 'is below'} {column.low:g} {column.unit}".strip()
-        raise CellError(message, _likely_unit(column, value), code="below_bounds")
-    return value
-
-
-def unusual(column: Column, value: Any) -> str:
-    """Say so if an allowed number lies below the usual range; zero is deliberate, hence usual."""
-    is_unusual = column.kind == "number" and value is not None and value != 0 and value < column.usual_from
-    return f"is unusual: {column.unusual_hint}" if is_unusual else ""
-
-
-def _likely_unit(column: Column, value: float) -> str:
-    """Name the unit in which the value was probably written, if the column would allow it in that unit."""
-    for key in column.slips:
-        unit, factor = UNITS[key].text, convert(1.0, key, column.unit_key)
-        meant = value * factor
-        # The intended unit must bring the value into range: enlarge one that is too small, shrink one that is too
-        # large.
-        if (factor > 1) == (value < column.high) and max(column.low, 1e-9) <= meant <= column.high:
-            return f"looks like {unit}: {value:g} {unit} is {meant:g} {column.unit}"
-    return ""
 
 
 def _read_span(text: str, decimal: str, of_frames: bool) -> tuple[float, float]:

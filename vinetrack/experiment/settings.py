@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, Self, Union, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
@@ -26,16 +26,7 @@ from vinetrack.core import terminal
 from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
 from vinetrack.core.tables import Table, TableError, YamlDocument, parse_number, read_yaml
 from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
-from vinetrack.experiment.schema import (
-    COLUMNS,
-    LIMITED,
-    SHARED,
-    SMALLEST_POINT_SPACING_PX,
-    CellError,
-    read_cell,
-    read_limit,
-    read_range,
-)
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, SMALLEST_POINT_SPACING_PX, CellError, read_range
 
 
 def _no_yes_or_no(value: Any) -> Any:
@@ -50,7 +41,6 @@ Count = Annotated[int, BeforeValidator(_no_yes_or_no)]
 Positive = Annotated[Number, Field(gt=0)]
 Share = Annotated[Number, Field(gt=0, le=1)]
 Pixel = tuple[Number, Number]
-Model = TypeVar("Model", bound=BaseModel)
 
 
 class _Strict(BaseModel):
@@ -59,6 +49,14 @@ class _Strict(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True, use_attribute_docstrings=True
     )
+
+    @classmethod
+    def read_from(cls, document: YamlDocument, file: str) -> Self:
+        """Return a document as settings; raise an ExperimentError with all its problems."""
+        try:
+            return cls.model_validate(document.content)
+        except ValidationError as error:
+            raise ExperimentError([_as_problem(cls, document, file, detail) for detail in error.errors()]) from None
 
 
 class _TwoEnds(_Strict):
@@ -182,7 +180,7 @@ class Limits(_LimitedColumns):
         limits = value if isinstance(value, list | tuple) else [value]
         if not limits:
             raise CellError("is empty", "name at least one value, or remove the key", code="empty")
-        return tuple(sorted({read_limit(column, limit) for limit in limits}))
+        return tuple(sorted({column.read_limit(limit) for limit in limits}))
 
 
 _SharedColumns: Any = _columns(SHARED)
@@ -240,7 +238,7 @@ class ExperimentSettings(_SharedColumns):
             return value
         if isinstance(value, bool | list | dict):
             raise CellError("is not a single value", "write one, as in the sheet", code="not_a_value")
-        return read_cell(column, str(value).strip())
+        return column.read(str(value).strip())
 
     @field_validator("model", "candidates", "effects")
     @classmethod
@@ -344,20 +342,12 @@ def read_experiment_settings(path: Path, warnings: list[Problem] | None = None) 
         return ExperimentSettings()
     document = read_yaml(path)
     _to_key_units(document, path.name, [] if warnings is None else warnings)
-    return _validate(ExperimentSettings, document, path.name)
+    return ExperimentSettings.read_from(document, path.name)
 
 
 def run_settings(values: dict[str, Any]) -> RunSettings:
     """Validate settings of a run given as a mapping, such as Snakemake's `config`."""
-    return _validate(RunSettings, YamlDocument(values, {}), "config.yaml")
-
-
-def _validate(model: type[Model], document: YamlDocument, file: str) -> Model:
-    """Return the document as a settings object; raise an ExperimentError with all its problems."""
-    try:
-        return model.model_validate(document.content)
-    except ValidationError as error:
-        raise ExperimentError([_as_problem(model, document, file, detail) for detail in error.errors()]) from None
+    return RunSettings.read_from(YamlDocument(values, {}), "config.yaml")
 
 
 def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detail: Any) -> Problem:

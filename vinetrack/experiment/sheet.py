@@ -16,7 +16,7 @@ from typing import Any
 from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputError, Problem, did_you_mean
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
-from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, read_cell, unusual, with_names
+from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, with_names
 from vinetrack.experiment.settings import (
     Charuco,
     Checkerboard,
@@ -160,11 +160,11 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
                 row.values[name] = shared
             continue
         try:
-            row.values[name] = read_cell(column, text, table.decimal)
+            row.values[name] = column.read(text, table.decimal)
         except CellError as error:
             row.add_error(error, name, text)
             continue
-        if said := unusual(column, row.values[name]):
+        if said := column.unusual(row.values[name]):
             row.add("unusual", said, name, "warning", value=text)
     if table.extra[index]:
         message = f"has more cells than the header ({table.extra[index][0][:40]!r} …)"
