@@ -12,7 +12,6 @@ import io
 import math
 import os
 import platform
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -312,24 +311,22 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
     """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines; NaN if there
     are fewer than eight trials (derived), or each vine has only one pressure.
     """
-    from pandas import Series  # which is loaded already: scipy.stats takes a second
+    from pandas import DataFrame  # which is loaded already: scipy.stats takes a second
 
     ranks, _ = trial_order(trials)
-    pairs: list[Floats] = []
-    for vine in dict.fromkeys(trial.vine for trial in trials):
-        members = [i for i, trial in enumerate(trials) if trial.vine == vine and math.isfinite(trial.pressure_Pa)]
-        pressures = np.array([trials[i].pressure_Pa for i in members])
-        if len(members) > 1 and np.ptp(pressures) > 0:
-            both = np.array([Series(values).rank() for values in (ranks[members], pressures)])
-            pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
-    if sum(pair.shape[1] for pair in pairs) < 8:
-        return math.nan
-    order, pressure = np.hstack(pairs)
-    return float(order @ pressure / math.sqrt(float(order @ order) * float(pressure @ pressure)))
+    rows = [(trial.vine, rank, trial.pressure_Pa) for trial, rank in zip(trials, ranks, strict=True)]
+    frame = DataFrame(rows, columns=["vine", "order", "pressure"]).dropna()
+    frame = frame[frame.groupby("vine")["pressure"].transform("nunique") > 1]
+    by_vine = frame.groupby("vine")
+    count = by_vine["order"].transform("size")
+    within = by_vine.rank().sub((count + 1) / 2, axis=0).div(count, axis=0)
+    return float(within["order"].corr(within["pressure"], min_periods=8))
 
 
 def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
     """Warn of confounding: order with pressure, and specimen or day with condition."""
+    from pandas import DataFrame
+
     correlation = order_pressure_correlation(trials)
     if abs(correlation) >= CONFOUNDING_CORRELATION:
         message = (
@@ -340,14 +337,11 @@ def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
         )
         remedy = "run the trials in random order, or repeat six of them in random order, and number them under order"
         yield Problem("confounded", message, "order", file=SHEET, severity="warning", remedy=remedy)
-    for column in GROUPINGS:
+    frame = DataFrame(map(vars, trials), columns=["vine", "condition", *GROUPINGS])
+    for column in GROUPINGS if trials else ():
         # Every condition has a single specimen or day, while they differ within a vine.
-        values = {(trial.vine, trial.condition, getattr(trial, column)) for trial in trials}
-        if not values or any(not value for *_, value in values):
-            continue
-        in_condition = Counter(condition for _, condition, _ in values)
-        in_vine = Counter(vine for vine, _ in {(vine, value) for vine, _, value in values})
-        if max(in_condition.values()) == 1 and max(in_vine.values()) > 1:
+        in_condition, in_vine = (frame.groupby(of)[column].nunique().max() for of in ("condition", "vine"))
+        if (frame[column] != "").all() and in_condition == 1 and in_vine > 1:
             message = f"differs for every condition: a difference between {column}s would look like a physical effect"
             remedy = f"spread every condition over two {column}s"
             yield Problem("confounded", message, column, file=SHEET, severity="warning", remedy=remedy)
