@@ -40,8 +40,5 @@ DRAG_EXAMPLE = {"thickness_um": 50.0, "diameter_mm": 24.0, "length_mm": 150.0, "
 
 def scale_of(diameter_mm: float, thickness_um: float) -> int | None:
     """Return the scale R of the vine of Table I with this size, to within 1 %; None for any other."""
-    for scale, printed_mm in DIAMETER_MM.items():
-        near = abs(diameter_mm / printed_mm - 1) < 0.01
-        if near and abs(thickness_um / THICKNESS_UM[scale] - 1) < 0.01:
-            return scale
-    return None
+    off = {R: (abs(diameter_mm / DIAMETER_MM[R] - 1), abs(thickness_um / THICKNESS_UM[R] - 1)) for R in DIAMETER_MM}
+    return next((scale for scale, parts in off.items() if all(part < 0.01 for part in parts)), None)
