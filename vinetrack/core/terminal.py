@@ -112,7 +112,7 @@ progress = Progress
 
 def waiting(description: str) -> Progress[None]:
     """Return a spinner with the elapsed time, for work of unknown length."""
-    return Progress(None, description)
+    return Progress(None, description, unit="")
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:

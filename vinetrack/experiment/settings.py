@@ -500,27 +500,23 @@ def _groups() -> tuple[tuple[str, str, list[Entry]], ...]:
 
 def reference_page() -> str:
     """Return the reference as the page `docs/settings.md`."""
-    parts = [
-        "# Every column and key",
-        "",
-        "Generated from the declarations that validate them: `vinetrack settings` prints the same,",
-        "`vinetrack settings --json -` prints it for a program, and `vinetrack settings --page docs/settings.md`",
-        "writes this page. A column, or a key of `experiment.yaml`, may state another unit in its name",
-        "(`pressure_psi`, `diameter_in`, …): it is converted, and `vinetrack check` reports the conversion.",
-        "A blank cell means the default.",
-        "",
-    ]
+    page = """\
+# Every column and key
+
+Generated from the declarations that validate them: `vinetrack settings` prints the same,
+`vinetrack settings --json -` prints it for a program, and `vinetrack settings --page docs/settings.md`
+writes this page. A column, or a key of `experiment.yaml`, may state another unit in its name
+(`pressure_psi`, `diameter_in`, …): it is converted, and `vinetrack check` reports the conversion.
+A blank cell means the default.
+"""
     for _, title, entries in _groups():
         heading, _, shared = title.partition("; ")
-        parts += [f"## {heading}", ""]
-        parts += [f"{shared[0].upper()}{shared[1:]}.", ""] if shared else []
-        parts += ["| name | default | allowed | meaning, *how to measure it* |", "|---|---|---|---|"]
+        page += f"\n## {heading}\n\n" + (f"{shared[0].upper()}{shared[1:]}.\n\n" if shared else "")
+        page += "| name | default | allowed | meaning, *how to measure it* |\n|---|---|---|---|\n"
         for e in entries:
-            measured = f" *{e.measured}*" if e.measured else ""
-            cells = (f"`{e.name}`", e.default, e.allowed, e.meaning + measured)
-            parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-        parts.append("")
-    return "\n".join(parts)
+            cells = (f"`{e.name}`", e.default, e.allowed, f"{e.meaning} *{e.measured}*" if e.measured else e.meaning)
+            page += "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+    return page
 
 
 def reference_lines() -> list[str]:
@@ -530,10 +526,8 @@ def reference_lines() -> list[str]:
     for _, title, entries in _groups():
         rows = [(e.name, e.unit, e.default, e.allowed, f"{e.meaning} {e.measured}".rstrip()) for e in entries]
         lines += [title, *terminal.table(rows, head, indent="  ", align="<<<<<"), ""]
-    return [
-        *lines,
-        "A column may state another unit in its name (pressure_psi, pressure_bar, diameter_in, …): it is converted.",
-    ]
+    hint = "A column may state another unit in its name (pressure_psi, pressure_bar, diameter_in, …)"
+    return [*lines, f"{hint}: it is converted."]
 
 
 def _default(name: str, field: FieldInfo) -> str:
