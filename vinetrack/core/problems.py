@@ -86,20 +86,19 @@ class ExperimentError(UserError):
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     """Format problems, errors first and shared ones once, as at most `limit` lines; the last counts the rest."""
     groups: dict[Problem, list[Problem]] = {}
-    for problem in problems:  # those that differ only in trial, line and measured number are one
+    # Those that differ only in trial, line and measured number are one.
+    for problem in sorted(problems, key=lambda problem: problem.severity != "error"):
         message = "" if problem.of_a_measurement else problem.message
         groups.setdefault(replace(problem, trial="", line=0, message=message), []).append(problem)
     merged = [
         group[0] if len(group) == 1 else replace(group[0], line=0, trial=f"{group[0].trial} and {len(group) - 1} more")
         for group in groups.values()
     ]
-    ordered = sorted(merged, key=lambda problem: problem.severity != "error")
-    lines, remaining = list(map(str, ordered)), ordered[limit - 1 :]
-    if len(ordered) <= limit:
+    lines, remaining = list(map(str, merged)), merged[limit - 1 :]
+    if len(lines) <= limit:
         return lines
     errors = sum(problem.severity == "error" for problem in remaining)
-    more = f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"
-    return [*lines[: limit - 1], more]
+    return [*lines[: limit - 1], f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

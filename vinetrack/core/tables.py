@@ -343,21 +343,21 @@ def write_json(path: Path, content: Any) -> None:
 class JsonRecord:
     """A dataclass that a JSON file holds, each field under its name or its alias; absent keys take their defaults."""
 
+    @classmethod
+    @cache
+    def _adapter(cls) -> Any:
+        from pydantic import TypeAdapter
+
+        return TypeAdapter(cls)
+
     def to_json(self) -> dict[str, Any]:
         """As the file holds it."""
-        return dict(_adapter(type(self)).dump_python(self, by_alias=True, warnings=False))  # type: ignore[arg-type]
+        return dict(self._adapter().dump_python(self, by_alias=True, warnings=False))
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Self:
         """Read what `to_json` wrote."""
-        return cast(Self, _adapter(cls).validate_python(entry))  # type: ignore[arg-type]
-
-
-@cache
-def _adapter(record: type) -> Any:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(record)
+        return cast(Self, cls._adapter().validate_python(entry))
 
 
 # ------------------------------------------------------------------------------

@@ -274,8 +274,7 @@ def _unmatched(corrections: Corrections, rows: list[Row]) -> Iterator[Problem]:
     for trial in corrections:
         if not filmed.get(trial):
             message = f"is not {'a recording' if trial in filmed else 'in the sheet'}; its corrections are ignored"
-            place: dict[str, Any] = {"file": CORRECTIONS_FILE, "value": trial, "severity": "warning"}
-            yield Problem("ignored", message, "trial", **place)
+            yield Problem("ignored", message, "trial", file=CORRECTIONS_FILE, value=trial, severity="warning")
 
 
 def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:

@@ -102,7 +102,9 @@ class TwoPoints(_TwoEnds):
     """Distance between the two points."""
 
 
-class _Board(_Strict):
+class Board(_Strict):
+    """A printed target."""
+
     image: Annotated[str, "Film it with the settings of the trials."]
     """Picture or clip of the target, in the plane of growth."""
     squares: Annotated[tuple[Annotated[Count, Field(ge=2)], Annotated[Count, Field(ge=2)]], "Count them."]
@@ -111,7 +113,7 @@ class _Board(_Strict):
     """Side of a square."""
 
 
-class Checkerboard(_Board):
+class Checkerboard(Board):
     """A checkerboard: `squares` across and down."""
 
     kind: Literal["checkerboard"]
@@ -119,7 +121,7 @@ class Checkerboard(_Board):
     """Squares across and down."""
 
 
-class Charuco(_Board):
+class Charuco(Board):
     """A ChArUco board: `squares` across and down, and the OpenCV name of its marker dictionary."""
 
     kind: Literal["charuco"]

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,7 @@ from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, InputErro
 from vinetrack.core.records import CAMERA_FILES, SIDE_FILES, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
 from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, option, with_names
-from vinetrack.experiment.settings import (
-    Charuco,
-    Checkerboard,
-    ExperimentSettings,
-    in_sheet_units,
-    read_experiment_settings,
-)
+from vinetrack.experiment.settings import Board, ExperimentSettings, in_sheet_units, read_experiment_settings
 
 SHEET = "trials.csv"
 
@@ -154,18 +149,15 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         remedy = "at most 100 characters, no spaces or dots, no hyphen first: files are named after it"
         row.add(code, message, "trial", value=name, allowed=COLUMNS["trial"].allowed, remedy=remedy)
     for name, column in COLUMNS.items():
-        text = cells.get(name, "")
-        if not text:
-            if name in SHARED and (shared := getattr(settings, name)) is not None:
-                row.values[name] = shared
-            continue
         try:
-            row.values[name] = column.read(text, table.decimal)
+            if text := cells.get(name, ""):
+                row.values[name] = column.read(text, table.decimal)
+                if said := column.unusual(row.values[name]):
+                    row.add("unusual", said, name, "warning", value=text)
+            elif name in SHARED and (shared := getattr(settings, name)) is not None:
+                row.values[name] = shared
         except CellError as error:
             row.add_error(error, name, text)
-            continue
-        if said := column.unusual(row.values[name]):
-            row.add("unusual", said, name, "warning", value=text)
     if table.extra[index]:
         message = f"has more cells than the header ({table.extra[index][0][:40]!r} …)"
         row.add("more_cells", message, remedy="put text that contains separators, and decimal commas, in quotes")
@@ -180,15 +172,13 @@ def read_sheet(path: Path) -> tuple[Table, list[Problem]]:
         table, problems = in_sheet_units(read_table(path), path.name)
     except TableError as error:
         raise ExperimentError([Problem.from_error(error, path.name)]) from None
+    warning = partial(Problem, file=path.name, severity="warning")
     message = "is not a column of the trial sheet and is ignored"
     left = [column for column in COLUMNS if column not in table.columns]
-    for name in table.columns:
-        if name not in COLUMNS:
-            place: dict[str, Any] = {"file": path.name, "line": 1, "severity": "warning"}
-            problems.append(Problem("unknown_column", message, name, remedy=did_you_mean(name, left), **place))
+    unknown = [name for name in table.columns if name not in COLUMNS]
+    problems += [warning("unknown_column", message, name, line=1, remedy=did_you_mean(name, left)) for name in unknown]
     if table.nameless:
-        message = "has a column without a name, which is ignored"
-        problems.append(Problem("nameless_column", message, file=path.name, severity="warning"))
+        problems.append(warning("nameless_column", "has a column without a name, which is ignored"))
     if not table.rows:
         problems.append(Problem("no_rows", "has no rows", file=path.name, remedy="write one row per trial"))
     return table, problems
@@ -229,15 +219,14 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         if column.kind == "path":
             value = safe_join(folder, value)
         fields[column.field] = column.to_si(float(value)) if column.kind in ("number", "choice") else value
-    # Without a recording the trial is planned, and what will limit its positions is not known.
-    scaled_elsewhere = "video" not in values or "mm_per_px" in values
     return Trial(
         **fields,
         ambient_pressure_Pa=settings.ambient_pressure_kPa * 1000,
         mass_loss=settings.mass_loss,
         tail_slack=settings.tail_slack,
         tail_store=settings.tail_store,
-        position_systematic_m=expected_systematic_m(settings, scaled_elsewhere),
+        # Without a recording the trial is planned, and what will limit its positions is not known.
+        position_systematic_m=expected_systematic_m(settings, "video" not in values or "mm_per_px" in values),
     )
 
 
@@ -248,7 +237,7 @@ def expected_systematic_m(settings: ExperimentSettings, scaled_elsewhere: bool =
     """
     if settings.position_systematic_mm is not None:
         return settings.position_systematic_mm / 1e3
-    known = isinstance(settings.calibration, (Charuco, Checkerboard)) and not scaled_elsewhere
+    known = isinstance(settings.calibration, Board) and not scaled_elsewhere
     return 0.0 if known else math.nan
 
 
