@@ -58,9 +58,8 @@ FEWEST_PICTURES = 16  # Fewest pictures for which another thread is used (chosen
 
 
 def n_threads() -> int:
-    """Number of threads that the tracking of a recording may use. It is 1 in a worker process, beside which others
-    track other recordings, and at most OMP_NUM_THREADS where that is set: the workflow sets it to 1 for every
-    recording, since it tracks as many at a time as there are cores.
+    """Number of threads that the tracking of a recording may use: 1 in a worker process, beside which others track, and
+    at most OMP_NUM_THREADS, which the workflow sets to 1, since it tracks as many at a time as there are cores.
     """
     if multiprocessing.parent_process() is not None:
         return 1

@@ -6,6 +6,7 @@ The program calculates in SI. A name that carries a unit ends with it: `pressure
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -155,11 +156,8 @@ def split_unit(name: str) -> tuple[str, str]:
     >>> split_unit("film_density_kg_m3"), split_unit("bends")
     (('film_density', 'kg_m3'), ('bends', ''))
     """
-    parts = name.split("_")
-    for start in range(1, len(parts)):
-        if (ending := "_".join(parts[start:])) in UNITS:
-            return "_".join(parts[:start]), ending
-    return name, ""
+    match = re.fullmatch(rf"(.*?)_({'|'.join(UNITS)})", name)
+    return (match[1], match[2]) if match else (name, "")
 
 
 def other_units(name: str) -> dict[str, str]:

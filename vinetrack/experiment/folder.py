@@ -6,9 +6,7 @@ of a single row makes that trial `failed`, unless the experiment is `strict`.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 import os
 import platform
@@ -279,14 +277,11 @@ def _unmatched(corrections: Corrections, rows: list[Row]) -> Iterator[Problem]:
 
 def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
     """Return the content of `corrections.csv` for these corrections."""
-    out = io.StringIO()
-    table = csv.writer(out, lineterminator="\n")
-    table.writerow(CORRECTION_COLUMNS)
-    for trial, given in corrections.items():
-        for one in given:
-            edge = f"{one.edge_px:.2f}" if math.isfinite(one.edge_px) else ""
-            table.writerow([trial, one.frame, one.action, edge])
-    return out.getvalue()
+    from pandas import DataFrame
+
+    rows = [(trial, one.frame, one.action, one.edge_px) for trial, given in corrections.items() for one in given]
+    table = DataFrame(rows, columns=list(CORRECTION_COLUMNS))
+    return table.to_csv(index=False, float_format="%.2f", lineterminator="\n")
 
 
 # ------------------------------------------------------------------------------
@@ -387,14 +382,11 @@ def _with_location(problem: Problem, experiment: Experiment) -> Problem:
 
 def _in_no_row(experiment: Experiment) -> list[Problem]:
     """Warn of recordings in the folder that neither a row of the sheet nor the calibration names."""
-
-    def normal(name: str) -> Path:
-        return Path(os.path.normpath(experiment.folder / name.replace("\\", "/")))
-
-    named = {normal(path) for path in (*experiment.recordings, *(path for _, path in experiment.settings.paths))}
+    written = (*experiment.recordings, *(path for _, path in experiment.settings.paths))
+    named = {Path(os.path.normpath(path.replace("\\", "/"))) for path in written}
     named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
     named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in SIDE_FILES}
-    found = [name for name in tables.list_recordings(experiment.folder) if normal(name) not in named]
+    found = [name for name in tables.list_recordings(experiment.folder) if Path(name) not in named]
     if not found:
         return []
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
