@@ -11,9 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-# ------------------------------------------------------------------------------
-# Physical constants in SI, and the names of the effects of the base model.
-
 # The four effects of the paper's equation of motion, Eq. (2): the default model, whatever columns the sheet has
 BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
 GRAVITY_M_S2 = 9.81  # Chosen: the rounded value of the paper; standard gravity, 9.80665, is smaller by 0.034 %

@@ -438,10 +438,6 @@ def _check_video(path: Path, named_videos: Set[Path]) -> list[Problem]:
     return [Problem(code, message, "video", value=path.name, remedy=remedy)]
 
 
-# ------------------------------------------------------------------------------
-# Saving a model to the settings.
-
-
 def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
     """Set `model:` in `experiment.yaml`, its byte-order mark and line ends kept; return the path."""
     path, mark = folder / SETTINGS, b"\xef\xbb\xbf"
@@ -456,10 +452,6 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
         text = text.replace("\n", "\r\n")
     tables.write_bytes(path, (mark if before.startswith(mark) else b"") + text.encode("utf-8"))
     return path
-
-
-# ------------------------------------------------------------------------------
-# Provenance of a result: versions of program and libraries, settings, and the hashes of all input files.
 
 
 def describe_run(

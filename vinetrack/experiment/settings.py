@@ -151,10 +151,7 @@ def _columns(names: Iterable[str]) -> Any:
     return create_model("Columns", __base__=_Strict, **fields)
 
 
-_LimitedColumns: Any = _columns((*LIMITED["range"], *LIMITED["choice"]))
-
-
-class Limits(_LimitedColumns):
+class Limits(_columns(chain(*LIMITED.values()))):  # type: ignore[misc]
     """Constraints on further trials, for the design of the next experiment; None: the range of the trials so far.
     Pressure and payload are ranges (`7:40` or two numbers); the others are sets of values to choose from: one value, a
     list, or a range, of which five values are considered.
@@ -167,7 +164,7 @@ class Limits(_LimitedColumns):
     hoop_stress_MPa: Positive = 7.8
     """Largest hoop stress allowed in the film."""
 
-    @field_validator(*LIMITED["range"], *LIMITED["choice"], mode="before")
+    @field_validator(*chain(*LIMITED.values()), mode="before")
     @classmethod
     def _as_in_the_sheet(cls, value: Any, info: Any) -> Any:
         column = COLUMNS[info.field_name]
@@ -185,10 +182,7 @@ class Limits(_LimitedColumns):
         return tuple(sorted({column.read_limit(limit) for limit in limits}))
 
 
-_SharedColumns: Any = _columns(SHARED)
-
-
-class ExperimentSettings(_SharedColumns):
+class ExperimentSettings(_columns(SHARED)):  # type: ignore[misc]
     """Settings shared by all trials of an experiment, in the unit of their name; None where not given. The columns that
     are declared `shared` may be set here for all trials; a cell of the sheet overrides them.
     """
