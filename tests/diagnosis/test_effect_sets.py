@@ -26,7 +26,7 @@ def of(names, log_likelihood: float, inflation: float = 1.0, numbers=()) -> Like
 
 
 def sets_of(known: list[LikelihoodRatio], thresholds=None) -> EffectSets:
-    family = score_test.FamilyTest(3e-3, 1e-4, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
+    family = score_test.FamilyTest(3.9, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
     tests, after = SimpleNamespace(fit=SimpleNamespace(model=()), effects=()), SimpleNamespace(family=family)
     search = SimpleNamespace(tests=tests, tests_after=lambda _fit: after)
     return EffectSets(search, known, lambda _line: None)

@@ -243,7 +243,7 @@ SIGNS = [(-1, 0, 1)[k % 3] for k, size in enumerate(SIZES) for _ in range(size)]
         (np.ones((30, 30)), "a" * 30, 3e-3, 0, 3e-3 / 2),
         (np.diag([1.0, 1.0, 0.0]), "abs", 3e-3, 0, 3e-3 / 4),
     ],
-    ids=["of either sign", "of one sign", "Šidák's share", "the same curve counts once", "the silent take no share"],
+    ids=["of either sign", "of one sign", "equal shares", "the same curve counts once", "the silent take no share"],
 )
 def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, share):
     family = score_test.family_test(cosines, [sign] * len(names), list(names), level)
@@ -251,7 +251,7 @@ def test_thresholds_are_quantiles_of_the_normal(cosines, names, level, sign, sha
 
 
 @pytest.mark.slow
-def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share():
+def test_any_candidate_exceeds_its_threshold_at_about_the_level_and_each_at_its_share():
     """Against two million draws from another generator; the shapes of one effect are alike."""
     draw, level = np.random.default_rng(20620), 3e-3
     own = draw.standard_normal((len(SIZES), 40))[np.repeat(range(len(SIZES)), SIZES)]
@@ -259,14 +259,14 @@ def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share(
     family = score_test.family_test(cosines, SIGNS, NAMES, level)
     limits, signs = np.array([family.threshold(name) for name in NAMES]), np.array(SIGNS)
     draw, root = np.random.default_rng(20621), np.linalg.cholesky(cosines + 1e-9 * np.eye(len(NAMES)))
-    alarms, total, by_many = 0, 0, 0
+    alarms, total, by_many = 0, 0, 0  # by_many: by the candidate of thirty shapes
     for _ in range(40):
         z = draw.standard_normal((50_000, len(NAMES))) @ root.T
         beyond = np.where(signs == 0, np.abs(z), z * signs) > limits
         alarms, total = alarms + int(beyond.any(axis=1).sum()), total + len(z)
         by_many += int(beyond[:, [name == "effect_12" for name in NAMES]].any(axis=1).sum())
-    assert alarms / total == pytest.approx(level, rel=0.05)
-    assert by_many / total == pytest.approx(family.candidate_level, rel=0.25)
+    assert 0.6 * level < alarms / total < 1.1 * level
+    assert 0.5 < by_many / total / (level / len(set(NAMES))) < 2.0
     assert family.threshold("effect_12") > family.threshold("effect_1") + 0.4
 
 

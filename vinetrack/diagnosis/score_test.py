@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtri
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Trial
@@ -653,104 +653,37 @@ def _residual_sum(products: Products, projection: Projection, state: FitState) -
 # ------------------------------------------------------------------------------
 # Family-wise thresholds of all candidates that give each of them an equal share of the false alarms.
 #
-# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one
-# threshold for all scores the first would take most of the false alarms and raise the threshold of the second. The
-# largest score of each candidate is therefore converted to a p-value of its own, and the family is tested by the
-# smallest (min-p; Westfall & Young, *Resampling-Based Multiple Testing*, 1993): every candidate has the threshold
-# that it alone exceeds with probability q, and q is such that any candidate exceeds its own with probability `level`.
-#
-# The probability that any of many correlated normal scores exceeds its threshold is found by importance sampling
-# (Adler, Blanchet & Liu, Annals of Applied Probability 22, 1167, 2012): a score is chosen in proportion to its tail
-# probability and drawn beyond its threshold, and the others are drawn conditionally on it.
-
-DRAWS, SEED = 2000, 20  # Draws of the scores, and the seed (measured)
+# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one threshold
+# for all scores the first would take most of the false alarms and raise the threshold of the second. Each candidate
+# therefore has the same probability of exceeding its own threshold (Bonferroni), and of its shapes so many count as are
+# effectively independent.
 
 
 @dataclass(frozen=True)
 class FamilyTest:
-    """Thresholds of all candidates, in standard deviations of a score. `candidate_level` is the probability with which
-    each candidate alone exceeds its threshold; `thresholds` are by name of effect.
-    """
+    """Thresholds of all candidates, in standard deviations of a score; `thresholds` are by name of effect."""
 
-    level: float
-    candidate_level: float
+    single_shape_threshold: float  # of a candidate with one shape and a size of either sign
     thresholds: Mapping[str, float]
 
     def threshold(self, name: str) -> float:
         """Threshold of a candidate; of one without shapes, that of a single two-sided score."""
         return self.thresholds.get(name, self.single_shape_threshold)
 
-    @property
-    def single_shape_threshold(self) -> float:
-        """Threshold of a candidate with one shape and a size of either sign (two-sided)."""
-        return -float(ndtri(self.candidate_level / 2))
-
-
-class _Scores:
-    """Correlated normal scores, one-sided or two-sided, and the probability that any exceeds its threshold."""
-
-    def __init__(self, cosines: Floats, signs: Sequence[int]) -> None:
-        self.informative = np.diag(cosines) > 0
-        self.cosines, self.signs = cosines, np.array(signs)
-        values, vectors = np.linalg.eigh(cosines)
-        draw = np.random.default_rng(SEED)
-        self.normal = draw.standard_normal((DRAWS, len(signs))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        self.tail_uniform, self.random_sign = draw.random(DRAWS), draw.choice([-1.0, 1.0], DRAWS)
-        self.choice_uniform = (np.arange(DRAWS) + 0.5) / DRAWS
-        self.choice_uniform = draw.permutation(self.choice_uniform)
-
-    def exceedance(self, indices: NDArray[np.intp], thresholds: Floats) -> float:
-        """Probability that any of these scores exceeds its threshold."""
-        signs = self.signs[indices]
-        tails = ndtr(-thresholds)
-        weights = np.where(signs == 0, 2.0, 1.0) * tails
-        total = float(weights.sum())
-        if len(indices) == 1 or total == 0:
-            return total
-        chosen = np.minimum(np.searchsorted(np.cumsum(weights) / total, self.choice_uniform), len(indices) - 1)
-        side = np.where(signs[chosen] == 0, self.random_sign, signs[chosen])
-        scores = self.normal[:, indices]
-        beyond = -ndtri(self.tail_uniform * tails[chosen]) * side
-        shift = beyond - scores[np.arange(DRAWS), chosen]
-        # The other scores move with the chosen one by their correlation with it.
-        scores = scores + self.cosines[np.ix_(indices, indices)][chosen] * shift[:, None]
-        exceed = np.where(signs == 0, np.abs(scores), scores * signs) > thresholds
-        return total * float(np.mean(1.0 / np.maximum(exceed.sum(axis=1), 1)))
-
 
 def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> FamilyTest:
-    """Compute the threshold of every candidate. Shapes: cosines (n_shapes, n_shapes)."""
-    if not effects:
-        return FamilyTest(level, level, {})
-    scores = _Scores(cosines, signs)
-    names = np.array(effects)
-    shapes = {name: np.flatnonzero((names == name) & scores.informative) for name in dict.fromkeys(effects)}
-    shapes = {name: indices for name, indices in shapes.items() if indices.size}
-    if not shapes:
-        return FamilyTest(level, level, {})
-    tables = {name: _exceedance_table(scores, indices, level, len(shapes)) for name, indices in shapes.items()}
-    all_shapes = np.concatenate(list(shapes.values()))
-
-    def thresholds(log_q: float) -> dict[str, float]:
-        squares = {name: float(np.interp(-log_q, -logs, nodes)) for name, (nodes, logs) in tables.items()}
-        return {name: math.sqrt(square) for name, square in squares.items()}
-
-    low, high = math.log(level / len(shapes)), math.log(level)
-    # 30: bisection steps for ln q (derived)
-    for _ in range(30):
-        middle = (low + high) / 2
-        by_name = thresholds(middle)
-        by_shape = np.concatenate([np.full(indices.size, by_name[name]) for name, indices in shapes.items()])
-        low, high = (middle, high) if scores.exceedance(all_shapes, by_shape) < level else (low, middle)
-    return FamilyTest(level, math.exp(low), thresholds(low))
-
-
-def _exceedance_table(
-    scores: _Scores, indices: NDArray[np.intp], level: float, candidates: int
-) -> tuple[Floats, Floats]:
-    """Squares of thresholds of a candidate, increasing, and ln of the probability that it exceeds each."""
-    n_tests = 2.0 * len(indices) * candidates
-    # 6: thresholds at which a candidate's exceedance probability p is computed (chosen)
-    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(max(level, 1e-290) / n_tests)), 6)
-    probabilities = [scores.exceedance(indices, np.full(indices.size, node)) for node in nodes]
-    return nodes**2, np.log(np.maximum(probabilities, 1e-300))
+    """Thresholds that any candidate exceeds with probability `level`, or less where candidates resemble each other.
+    Shapes: cosines (n_shapes, n_shapes).
+    """
+    informative = np.diag(cosines) > 0
+    shapes = {name: [k for k, other in enumerate(effects) if other == name and informative[k]] for name in effects}
+    shapes = {name: of_effect for name, of_effect in shapes.items() if of_effect}
+    share = level / max(len(shapes), 1)
+    thresholds = {}
+    for name, of_effect in shapes.items():
+        sides = 2 if signs[of_effect[0]] == 0 else 1
+        # Effective number of independent shapes: Galwey, Genetic Epidemiology 33, 559 (2009).
+        eigenvalues = np.maximum(np.linalg.eigvalsh(cosines[np.ix_(of_effect, of_effect)]), 0.0)
+        count = float(np.sum(np.sqrt(eigenvalues)) ** 2 / np.sum(eigenvalues))
+        thresholds[name] = -float(ndtri(share / sides / count))
+    return FamilyTest(-float(ndtri(share / 2)), thresholds)
