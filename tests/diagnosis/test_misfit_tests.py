@@ -26,9 +26,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference import robust_covariance
-from vinetrack.inference.fit_result import YIELD_PRESSURE
 from vinetrack.inference.optimiser import relative_residual
-from vinetrack.inference.solving import solve_onward
 from vinetrack.laboratory.tracks import campaign, damping_values, isometric_vine
 from vinetrack.tracks.position_noise import ar1_noise
 
@@ -267,23 +265,6 @@ def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
     assert found.chi2_per_dof < 1.3
     for key, size in values.items():
         assert abs(found[key].value - size) < 4 * found[key].sigma
-
-
-@pytest.mark.slow
-def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_found(monkeypatch):
-    """A friction at rest beside the yield pressure that was found without it would hold the vine back altogether."""
-    base = vt.fit(vt.base_model(), grown({"pressure_damping.beta": 1.5e-5}, seed=33), profile=False)
-    start = {"pressure_damping.beta": 1e-5}
-    climb = candidate_fits.SubsetFitter(base).fit_hypothesis((vt.effects.pressure_damping,), start, iterations=9)
-    yields_Pa = {number.name: number.value for number in base.numbers if number.key == YIELD_PRESSURE}
-    assert climb.yields_Pa.keys() == yields_Pa.keys()
-    assert any(abs(climb.yields_Pa[name] - value) > 1.0 for name, value in yields_Pa.items())
-    watched = Mock(wraps=solve_onward)
-    monkeypatch.setattr("vinetrack.inference.fit.solve_onward", watched)
-    assert candidate_fits.full_fit(base, climb) is not None
-    layout, theta = watched.call_args_list[0].args[0].layout, watched.call_args_list[0].args[2]
-    begun = dict(zip((number.name for number in layout.free), layout.values(theta), strict=True))
-    assert climb.yields_Pa == pytest.approx({name: begun[name] for name in climb.yields_Pa})
 
 
 P_S_TRUE = 11e3

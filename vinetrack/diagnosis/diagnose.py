@@ -256,7 +256,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
                     z,
                     tests.predicted_size(effect, shape),
                     in_answer_set=in_answer_set,
-                    reason=_contains_answer(effect, step) or _subset_fit_behind(step, effect.name),
+                    reason=_contains_answer(effect, step),
                     largest={} if tests.poorly_fitted else upper_limits,
                 )
             )
@@ -290,15 +290,6 @@ def _contains_answer(effect: Effect, step: SelectionStep) -> Remark:
     """Say that an effect contains one of the answer set: it can fit no worse, and need not be fitted."""
     contained = [name for name in effect.replaces if name in step.answer_names]
     return remark(CONTAINS, name=contained[0]) if contained else Remark()
-
-
-def _subset_fit_behind(step: SelectionStep, name: str) -> Remark:
-    """Say how far a candidate is behind the best, where it was fitted to one trial of every condition only."""
-    subset_fits = step.search.subset_fits if step.search else {}
-    if name not in subset_fits:
-        return Remark()
-    behind = subset_fits[name].deviance - min(subset_fit.deviance for subset_fit in subset_fits.values())
-    return remark("behind_in_one_trial_each", delta_chi2=behind) if behind > 0 else Remark()
 
 
 def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:

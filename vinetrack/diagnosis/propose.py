@@ -22,12 +22,7 @@ import numpy as np
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.candidate_fits import (
-    SubsetFitter,
-    best_subset_fit,
-    full_fit,
-    start_values,
-)
+from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.force_laws import FORMS
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
 from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, VARIABLES, Domain, LearnedForce
@@ -38,9 +33,10 @@ from vinetrack.diagnosis.likelihood_ratio import (
     answer_set,
     likelihood_ratio,
 )
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, RankedLaw, missing_force
-from vinetrack.diagnosis.score_test import shapes_of
 from vinetrack.dynamics.model import Model, check_needs, make_model
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
@@ -84,18 +80,16 @@ def add(
 
 
 def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
-    """Fit a model with an effect added, from several starts."""
-    report(f"fitting it with {effect.name}")
-    fitter = SubsetFitter(before)
-    starts = [((effect,), start_values(shape, shape.step * 10)) for shape in shapes_of(effect)]
-    subset_fit = best_subset_fit(fitter, starts, float("inf"))
-    after = full_fit(before, subset_fit) if subset_fit is not None else None
-    if after is None:
-        raise FitError(f"The model with {effect.name} cannot be simulated from any start.")
-    if after.log_likelihood < before.log_likelihood:
-        from_before = refit(before, before.model + effect)
-        after = max((after, from_before), key=lambda fit: fit.log_likelihood)
-    return after
+    """Fit a model with an effect added, as a diagnosis does; from the effect's own values where that gains nothing."""
+    tests = misfit_tests(before, (effect,), FALSE_ALARM_LEVEL_FIRST_ROUND)
+    fits = [ratio.fit for ratio in CandidateFits(tests, report).fit(all_of_them=True)]
+    if not fits or fits[0].log_likelihood < before.log_likelihood:
+        try:
+            fits.append(refit(before, before.model + effect))
+        except SimulationError as error:
+            if not fits:
+                raise FitError(f"The model with {effect.name} cannot be simulated from any start.") from error
+    return max(fits, key=lambda fit: fit.log_likelihood)
 
 
 # ------------------------------------------------------------------------------

@@ -107,8 +107,8 @@ class EffectSets:
             if names in self.extended:
                 continue
             self.extended.add(names)
-            search = CandidateFits(self.search.tests_after(base.fit), self.report, max_full_fits=n_partners)
-            search.fit_singles()
+            search = CandidateFits(self.search.tests_after(base.fit), self.report)
+            search.fit()
             for name, log_likelihood, larger, simpler in search.nested_tried:
                 self.nested_tried.add(("+".join(sorted((*base.names, name))), log_likelihood, larger, simpler))
             ranked = sorted(search.fitted.values(), key=lambda partner: -partner.fit.log_likelihood)
@@ -528,8 +528,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
 
     # The most promising single effects, and differences between trials.
     search = CandidateFits(tests, report)
-    search.fit_singles()
-    hypotheses = search.fit_to_all_trials()
+    hypotheses = search.fit()
     best_gain = max((hypothesis.delta_chi2 for hypothesis in hypotheses), default=0.0)
     between = between_fits(fit, trial_differences, best_gain, report)
     unstated_names = {difference.name for difference in significant_differences if not difference.stated}
@@ -545,8 +544,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return rounds
 
     # All single effects: linear predictions rank candidates well near the truth, not far from it.
-    search.fit_singles(all_of_them=True)
-    hypotheses = [*search.fit_to_all_trials(all_of_them=True), *between]
+    hypotheses = [*search.fit(all_of_them=True), *between]
     rounds = _single_effect_rounds(tests, search, hypotheses)
     if rounds is not None:
         return rounds

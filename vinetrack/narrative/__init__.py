@@ -14,7 +14,6 @@ SENTENCES = {
     "too_weak_here": "in these conditions the largest plausible size would not be detected",
     "contains": "it contains {name} as a limit",
     "contains_and_fits_no_better": "it contains {name} as a limit and fits no better",
-    "behind_in_one_trial_each": "fitted to one trial of every condition, worse by Δχ² = {delta_chi2:.0f}",
     "size_may_be_zero": "its size, {symbol} = {value:.2g} ± {sigma:.2g}, is compatible with none",
     "outside_plausible_range": "its size lies outside the plausible range",
     "misfit_remains": "a significant misfit remains once it is added",
