@@ -13,14 +13,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.likelihood_ratio import (
     Difference,
@@ -36,9 +35,7 @@ from vinetrack.diagnosis.result import (
     BETWEEN_TRIALS,
     N_BY_VINE,
     ORDER_DRIFT,
-    REFITTED,
     SPECIMEN,
-    Candidate,
 )
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
@@ -361,26 +358,3 @@ def _fitted(before: Fit, difference: Difference) -> Fit | None:
         return fit if fit.converged else refit(fit, most_iterations=30, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
-
-
-def between_candidates(
-    fitted: Sequence[LikelihoodRatio], answer: Sequence[str], rejected: Mapping[str, Remark]
-) -> list[Candidate]:
-    """Rows of the ranking of candidates for the differences that were fitted."""
-    return [
-        Candidate(
-            hypothesis.names[0],
-            BETWEEN_TRIALS,
-            REFITTED,
-            hypothesis.delta_chi2,
-            hypothesis.sigma,
-            hypothesis.numbers,
-            hypothesis.plausible,
-            hypothesis.names[0] in answer,
-            rejected.get(hypothesis.names[0], hypothesis.reason),
-            {},
-            hypothesis.others if hypothesis.names[0] in answer else (),
-        )
-        for hypothesis in fitted
-        if hypothesis.effects[-1].kind == BETWEEN_TRIALS
-    ]

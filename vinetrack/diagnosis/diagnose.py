@@ -17,9 +17,8 @@ import numpy as np
 from vinetrack.core.problems import Remark, in_words, remark
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
+from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.replicates import (
@@ -44,7 +43,7 @@ from vinetrack.diagnosis.result import (
     Round,
 )
 from vinetrack.diagnosis.score_test import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, testable
-from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, contradictions, select_effects
+from vinetrack.diagnosis.selection import SelectionStep, contradictions, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -210,9 +209,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     rejected = dict(step.rejected)
     singles = {hypothesis.names[0]: hypothesis for hypothesis in step.fitted if len(hypothesis.names) == 1}
     weights = weights_of(list(singles.values()))
-    rows = [
-        _slack_candidate(hypothesis, step) for hypothesis in step.answer_set if hypothesis.effects[-1] is TAIL_SLACK
-    ]
+    rows = []
     for effect in tests.effects:
         upper_limits, is_detectable = tests.upper_limits(effect)
         if effect.name in tests.sensitivities.silent:
@@ -260,7 +257,23 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
                     largest={} if tests.poorly_fitted else upper_limits,
                 )
             )
-    rows += between_candidates(step.fitted, step.answer_names, rejected)
+    # Differences between trials, and a tail that goes slack
+    rows += [
+        Candidate(
+            name,
+            single.effects[0].kind,
+            REFITTED,
+            single.delta_chi2,
+            single.sigma,
+            single.numbers,
+            single.plausible,
+            name in step.answer_names,
+            rejected.get(name, single.reason),
+            along=single.others if name in step.answer_names else (),
+        )
+        for name, single in singles.items()
+        if name not in {effect.name for effect in tests.effects}
+    ]
     rows += [
         Candidate(name, "", NOT_TESTABLE, reason=reason)
         for name, reason in not_testable.items()
@@ -269,14 +282,6 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Ca
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
     gain = {id(row): row.delta_chi2 if math.isfinite(row.delta_chi2) else -math.inf for row in rows}
     return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -gain[id(row)]))
-
-
-def _slack_candidate(hypothesis: LikelihoodRatio, step: SelectionStep) -> Candidate:
-    """The rule that a tail cannot push, as a candidate without a size."""
-    name = hypothesis.names[-1]
-    return Candidate(
-        name, "physical", REFITTED, hypothesis.delta_chi2, hypothesis.sigma, (), True, name in step.answer_names
-    )
 
 
 def _predicted_gain(step: SelectionStep, name: str, z: float) -> float:

@@ -44,7 +44,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
 from vinetrack.diagnosis.locate import drift
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
-    FALSE_ALARM_LEVEL_LATER_ROUNDS,
     SEARCH_SIGMAS,
     MisfitTests,
     exceeds_slow_errors,
@@ -469,20 +468,21 @@ TAIL_SLACK = Effect(
 )
 
 
-def slack_fit(fit: Fit) -> LikelihoodRatio | None:
+def slack_fit(fit: Fit, report: Report) -> LikelihoodRatio | None:
     """Refit the model with tails that may go slack; None where no taut tail has a payload that could run ahead, or the
     fit fails. Effects of trials that scatter much may have absorbed the misfit: the refit then starts without them.
     """
     trials = (one.trial for one in fit.trials)
     if not any(trial.payload_kg > 0 and trial.tail_slack != "free" and trial.travel_ratio != 1 for trial in trials):
         return None
+    report("letting the tail go slack")
     data = [replace(one, trial=replace(one.trial, tail_slack="free")) for one in fit.predictor.data]
     try:
         slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
         after = refit(slack, thorough=False, afresh=has_excess_scatter(fit))
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
-    return likelihood_ratio(fit, (TAIL_SLACK,), after)
+    return likelihood_ratio(fit, (TAIL_SLACK,), with_host(after, fit.predictor.host))
 
 
 MAX_BACKWARD_STEPS = 2  # Times that a search over sets goes on from a smaller set (chosen)
@@ -522,20 +522,18 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     if not tests.rejects_model and not tests.needs_search and not stated_difference:
         unstated = tuple(between_fits(fit, significant_differences, 0.0, report))
         return [SelectionStep(ADEQUATE, tests, unstated_differences=unstated)]
-    slack = _slack_rounds(tests, effects, report) if tests.rejects_model else None
-    if slack is not None and not _may_be_improved(slack[0].answer_set) and not slack[-1].tests.needs_search:
-        return slack
 
-    # The most promising single effects, and differences between trials.
+    # The most promising single effects, a tail that may go slack, and differences between trials.
     search = CandidateFits(tests, report)
-    hypotheses = search.fit()
+    slack = slack_fit(fit, report) if tests.rejects_model else None
+    alone = [] if slack is None else [slack]
+    hypotheses = [*search.fit(), *alone]
     best_gain = max((hypothesis.delta_chi2 for hypothesis in hypotheses), default=0.0)
     between = between_fits(fit, trial_differences, best_gain, report)
     unstated_names = {difference.name for difference in significant_differences if not difference.stated}
     unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in unstated_names)
+    alone += between
     hypotheses += between
-    if slack is not None and not _is_better(hypotheses, slack[0].answer_set[0]):
-        return slack
     only_suspected = not tests.rejects_model and not stated_difference
     if only_suspected and (not hypotheses or best_of(hypotheses).sigma < SEARCH_SIGMAS):
         return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
@@ -544,7 +542,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return rounds
 
     # All single effects: linear predictions rank candidates well near the truth, not far from it.
-    hypotheses = [*search.fit(all_of_them=True), *between]
+    hypotheses = [*search.fit(all_of_them=True), *alone]
     rounds = _single_effect_rounds(tests, search, hypotheses)
     if rounds is not None:
         return rounds
@@ -552,7 +550,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
         return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
 
     # Sets of effects.
-    hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in between]
+    hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in alone]
     credible = [hypothesis for hypothesis in hypotheses if hypothesis.credible]
     if not credible or not _any_exceeds_threshold(credible, tests):
         # A score that no refit confirms counts only if another test rejects the model too.
@@ -572,31 +570,6 @@ def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
         return True
     best = best_of(hypotheses).fit
     return exceeds_slow_errors(best) or has_excess_scatter(best)
-
-
-def _is_better(hypotheses: Sequence[LikelihoodRatio], reference: LikelihoodRatio) -> bool:
-    """Whether the best of these hypotheses has a clearly higher likelihood than the reference."""
-    if not hypotheses:
-        return False
-    return best_of(hypotheses).fit.log_likelihood > reference.fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN
-
-
-def _slack_rounds(tests: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
-    """Rounds in which a tail that may go slack explains the misfit; None where it does not. The rule is tried first: a
-    tail cannot push, and the rule has no parameter that could absorb another effect. If trials scatter much, their
-    effects may have adapted to the rule, and it stands only if no single effect fits better.
-    """
-    slack = slack_fit(tests.fit)
-    if slack is None or not _exceeds_threshold(slack, tests):
-        return None
-    report("letting the tail go slack")
-    slack = replace(slack, fit=with_host(slack.fit, tests.fit.predictor.host))
-    # Any additional freedom may improve a model that is far off: the rule counts only if every test passes with it.
-    after = misfit_tests(slack.fit, effects, FALSE_ALARM_LEVEL_LATER_ROUNDS)
-    if after.rejects_model or after.omnibus_rejects or after.exceeds_slow_errors:
-        return None
-    first = SelectionStep(MISSING, tests, (slack,), (slack,), (), slack.names)
-    return [first, SelectionStep(ADEQUATE, after)]
 
 
 def _exceeds_threshold(hypothesis: LikelihoodRatio, tests: MisfitTests) -> bool:
