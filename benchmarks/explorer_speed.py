@@ -41,7 +41,7 @@ def computed_ms(results: Path) -> tuple[int, float]:
     spent = []
     for k in range(22):
         started = time.perf_counter()
-        predict_choice(campaign, start.with_sizes({SIZE[5:]: 1.1 + 0.01 * k}), campaign.floors_m)
+        predict_choice(campaign, start.with_sizes({SIZE[5:]: 1.1 + 0.01 * k}))
         spent.append(1e3 * (time.perf_counter() - started))
     return len(campaign.trials), statistics.median(spent[2:])
 

@@ -36,7 +36,7 @@ HEADERS = {
 }
 MODEL_HEADERS = {
     "comparison.csv": "model,condition,rms_position_m,rms_final_velocity_m_s,replicate_floor_m,ratio,worst_at_s,"
-    "worst_at_m,replicate_floor_sigma_m\n",
+    "worst_at_m,expected_m,expected_low_m,expected_high_m\n",
     "model_check.csv": "vine,n_steady,n_trajectory,B_steady,B_trajectory,z\n",
     "audit.csv": "trial,condition,term,size,force_N,share_of_drive,shift_m,time_s,lead_position_m,y_over_L,"
     "slack_from_s,note\n",

@@ -93,7 +93,8 @@ def test_an_unforeseen_fault_fails_its_trial_or_stage(tmp_path, monkeypatch):
 
 # `vinetrack diagnose` and `vinetrack add` from a folder of tracks to files and sentences.
 LADDER = (
-    "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m,partial"
+    "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,"
+    "expected_m,expected_low_m,expected_high_m,partial"
 )
 
 

@@ -77,9 +77,9 @@ def test_in_sample_error_and_floor_are_those_of_the_comparison(fits, pairs):
     table = compare(fits[0], pairs).table
     errors = in_sample(fits[0])
     assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
-    assert errors.floor[0] == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
+    assert errors.floor_m == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
     # Laid on another model, replicates differ as much.
-    assert in_sample(fits[1]).floor[0] == pytest.approx(errors.floor[0], rel=0.03)
+    assert in_sample(fits[1]).floor_m == pytest.approx(errors.floor_m, rel=0.03)
     assert (excess(5.0, 3.0), excess(1.0, 3.0)) == (4.0, 0.0)
     assert math.isnan(excess(1.0, math.nan))
 
@@ -92,6 +92,21 @@ def test_replicates_that_differ_by_their_noise_alone_have_a_floor_of_that_size_h
     assert compare(found, pairs_of(virtual)).table["replicate_floor_m"].between(0.7 * noise_m, 1.3 * noise_m).all()
 
 
+def test_an_adequate_model_is_off_by_as_much_as_the_scatter_of_trials_makes_expect():
+    """The error of all trials, 600 mm of growth away from any noise, is that of their pressures and B."""
+    ratios, inside = [], []
+    for seed in range(5):
+        virtual = grown(sheet((2,), replicates=3), 7200 + seed, damping_scatter=0.04, pressure_scatter=0.01)
+        table = compare(fitted(pairs_of(virtual)), pairs_of(virtual)).table
+        ratios += [float(np.mean(table["rms_position_m"] ** 2) / np.mean(table["expected_m"] ** 2))]
+        inside += table["rms_position_m"].between(table["expected_low_m"], table["expected_high_m"]).tolist()
+    assert 0.6 < np.mean(ratios) < 1.3
+    assert np.mean(inside) > 0.85
+    # Trials without replicates do not say what to expect.
+    alone = pairs_of(virtual)[::3]
+    assert compare(fitted(alone), alone).table["expected_m"].isna().all()
+
+
 @pytest.mark.slow
 def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(pairs):
     lower = [pair for pair in pairs if "R4_48" not in pair[0].name and pair[0].name.endswith("_1")]
@@ -99,7 +114,7 @@ def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vi
     assert sorted(one.trial.name for one in left_out(found).trials) == sorted(trial.name for trial, _ in lower)
     assert sorted(one.trial.name for one in highest_pressure(found).trials) == ["R2_48kPa_1", "R4_38kPa_1"]
     # Without replicates there is no floor.
-    assert math.isnan(in_sample(found).floor[0])
+    assert math.isnan(in_sample(found).floor_m)
     assert math.isnan(ladder([found], [""])["excess_left_out_m"].iloc[0])
 
 

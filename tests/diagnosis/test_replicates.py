@@ -42,15 +42,6 @@ def grown(name: str, speed: float) -> TrialFit:
     return trial_fit(name, time_s, 2.0 * speed * (since_s - 0.02 * (1 - np.exp(-since_s / 0.02))), 1.9, 0.0, 0.0)
 
 
-def test_its_error_is_that_of_a_standard_deviation_known_from_so_many_replicates():
-    speeds = 1 + 0.02 * np.random.default_rng(20001).standard_normal((60, 3))
-    aligned = [replicates_of([grown(f"t{i}", speed=v) for i, v in enumerate(three)]) for three in speeds]
-    floors_m = np.array([one.floor_m for one in aligned])
-    # σ/√(2ν) with ν = 2 is half of σ; the scatter of a standard deviation of ν = 2 is 0.52 of its mean.
-    assert floors_m.std() / floors_m.mean() == pytest.approx(0.52, abs=0.12)
-    np.testing.assert_allclose([one.floor_sigma_m for one in aligned], floors_m / 2)
-
-
 SPEED_M_S = 2.0
 
 

@@ -90,7 +90,14 @@ def next_experiment() -> dict:
 def ladder(*added: str) -> pd.DataFrame:
     rows = [
         {"model": "+".join(BASE), "added": name, "rms_in_sample_m": 9e-3 / 5**i, "rms_left_out_m": 10e-3 / 5**i}
-        | {"rms_highest_pressure_m": 11e-3 / 5**i, "floor_m": 1.5e-3, "excess_left_out_m": 5e-3 / 5**i}
+        | {
+            "rms_highest_pressure_m": 11e-3 / 5**i,
+            "floor_m": 1.5e-3,
+            "expected_m": 1.6e-3,
+            "expected_low_m": 1.2e-3,
+            "expected_high_m": 2.2e-3,
+            "excess_left_out_m": 5e-3 / 5**i,
+        }
         for i, name in enumerate(added)
     ]
     return pd.DataFrame(rows)

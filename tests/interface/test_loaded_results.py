@@ -150,7 +150,7 @@ def test_the_report_quotes_the_final_model_first(report, loaded):
     last = loaded.ladder.iloc[-1]
     first_mm, last_mm = (number(1e3 * loaded.ladder["rms_left_out_m"].iloc[k]) for k in (0, -1))
     assert f"{first_mm} → {last_mm} mm" in report
-    assert f"replicate scatter {number(1e3 * last['floor_m'])} mm" in report
+    assert f"an adequate model {number(1e3 * last['expected_m'])} mm" in report
     for entry in diagnosis.parameters:
         assert estimate_text(entry).partition(" = ")[2].partition(" (")[0].split(" N·")[0].split(" kPa")[0] in report
     assert report.index("The final model:") < report.index("The initial model, which the diagnosis refutes")
@@ -164,10 +164,10 @@ def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):
     for row in compared.itertuples():
         line = next(line for line in said.splitlines() if str(row.condition) in line)
         assert f"{1e3 * row.rms_position_m:.3f}" in line
-        assert f"{1e3 * row.replicate_floor_m:.3f}" in line
+        assert f"{1e3 * row.expected_high_m:.3f}" in line
     campaign = open_campaign(small_run)
     assert campaign.stored.numbers == loaded.fit.numbers
-    assert dict(campaign.floors_m) == compared.set_index("condition")["replicate_floor_m"].to_dict()
+    assert dict(campaign.highest_m) == compared.set_index("condition")["expected_high_m"].to_dict()
 
 
 def test_the_worst_condition_is_one(loaded, report, small_run):

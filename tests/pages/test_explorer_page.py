@@ -204,7 +204,6 @@ def assert_shows(numbers: Browser, table: pd.DataFrame, rel: float) -> None:
     """The bars, the headline and the residuals drawn."""
     expected = compared_mm(table, "rms_position_m")
     assert bars_mm(numbers, "now") == pytest.approx(expected, rel=rel)
-    assert bars_mm(numbers, "floor") == pytest.approx(compared_mm(table, "replicate_floor_m"), rel=rel)
     overall = float(np.sqrt(np.mean(np.square(list(expected.values())))))
     assert f"off by {overall:.3g} mm" in numbers.text("headline")
     for trial, drawn in zip(numbers.page.shown.trials, numbers.model("residual_curves").data["ys"], strict=True):
@@ -237,6 +236,7 @@ def test_every_step_of_a_user_shows_the_errors_of_a_comparison_and_what_add_find
     numbers = Browser(fitted(open_campaign(results)))
     opened = pd.read_csv(results / "comparison.csv")
     assert_shows(numbers, opened, 1e-6)
+    assert bars_mm(numbers, "highest") == pytest.approx(compared_mm(opened, "expected_high_m"))
 
     numbers.model(f"tick_{EFFECT}").active = True
     with_effect = settled(numbers)
@@ -385,7 +385,7 @@ def test_a_refused_fit_still_shows_the_trials_a_folder_without_any_is_refused(ca
     shutil.copytree(campaign.folder, folder)
     (folder / "fit.json").write_text(json.dumps({"model": [], "refused": "no reason"}))
     bare = open_campaign(folder)
-    assert (bare.stored.refused, bare.floors_m) == ("no reason", {})
+    assert (bare.stored.refused, bare.highest_m) == ("no reason", {})
     assert choice_in_use(bare).numbers["eversion_damping.n"] == 0.37
     true = {one.stated.name: one for one in grow(bare.experiment.trials, read_ground_truth(DEMO))}
     assert len(bare.trials) == 6

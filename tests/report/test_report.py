@@ -264,7 +264,13 @@ FIT |= {"messages": ["a message"], "warnings": ["a warning"], "left_out": {"b": 
 
 
 def result(**changes: object) -> dict[str, object]:
-    at = {"rms_final_velocity_m_s": 0.25, "replicate_floor_m": 1e-3, "worst_at_s": 0.07, "worst_at_m": 0.123}
+    at = {
+        "rms_final_velocity_m_s": 0.25,
+        "replicate_floor_m": 1e-3,
+        **dict.fromkeys(("expected_m", "expected_low_m", "expected_high_m"), 1e-3),
+        "worst_at_s": 0.07,
+        "worst_at_m": 0.123,
+    }
     compared = pd.DataFrame({"condition": ["c0", "c1"], "rms_position_m": [3e-3, 4e-3], "ratio": [3.0, 4.0], **at})
     check = {"vine": ["v"], "n_steady": 0.37, "n_trajectory": 0.49, "B_steady": 6.44, "B_trajectory": 6.1, "z": 5.1}
     return {"fit": FitSummary.from_json({**FIT, **changes}), "comparison": compared, "check": pd.DataFrame(check)}
@@ -273,7 +279,7 @@ def result(**changes: object) -> dict[str, object]:
 def test_the_page_shows_comparison_numbers_check_and_warnings():
     html = page(**result())
     text = re.sub(r"\s+", " ", re.sub("<[^>]+>", " ", html[html.index('id="model"') :]))
-    assert "c1 4.00 1.00 4.0 0.250 70.0 123" in text
+    assert "c1 4.00 1.00 mm (1.00 to 1.00) 1.00 0.250 70.0 123" in text
     assert "B v 6.44 ± 0.12 6.200 to 6.680 N·(s/m)ⁿ" in text
     assert "P_y all 3.00 open kPa" in text
     assert "B 3.0 %; pressure 1.0 % (fixed)" in text

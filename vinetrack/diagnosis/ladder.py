@@ -22,7 +22,16 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.core.terminal import plot
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_by_condition
+from vinetrack.diagnosis.replicates import (
+    Expected,
+    Replicates,
+    by_condition,
+    expected_error,
+    first_that_counts,
+    replicate_scatter,
+    replicates_by_condition,
+    residual_courses,
+)
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, catalogue, find_effect
@@ -89,7 +98,7 @@ def initial_fit(
 
 COMPARISON_COLUMNS = (
     *("model", "condition", "rms_position_m", "rms_final_velocity_m_s", "replicate_floor_m", "ratio", "worst_at_s"),
-    *("worst_at_m", "replicate_floor_sigma_m"),
+    *("worst_at_m", "expected_m", "expected_low_m", "expected_high_m"),
 )
 FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at which the final speed is taken (chosen)
 
@@ -129,6 +138,8 @@ def compare(
 
     fitted = {trial.name for trial in fit.trials}
     chosen = [(trial, track) for trial, track in pairs_of(experiment, tracks)[0] if trial.name in fitted]
+    courses, _ = residual_courses(fit)
+    scatter, of_condition = replicate_scatter(fit, courses), by_condition(courses)
     predicted = predict_prepared(fit, prepared_pairs(chosen), from_rest=True)
     final = _final_speed_errors(
         fit, predicted, {trial.name: track for trial, track in chosen}, kinematics or {}, final_at_fraction
@@ -141,6 +152,7 @@ def compare(
                 "model": "+".join(fit.model.names),
                 "condition": condition,
                 **position_errors(together),
+                **_expected(expected_error(of_condition[condition], scatter)),
                 "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
@@ -166,8 +178,12 @@ def position_errors(together: Replicates) -> dict[str, float]:
         "ratio": rms_m / floor_m if floor_m > 0 else math.nan,
         "worst_at_s": worst_at_s,
         "worst_at_m": worst_at_m,
-        "replicate_floor_sigma_m": together.floor_sigma_m,
     }
+
+
+def _expected(expected: Expected) -> dict[str, float]:
+    """Columns of what an adequate model would show."""
+    return {"expected_m": expected.rms_m, "expected_low_m": expected.low_m, "expected_high_m": expected.high_m}
 
 
 def _worst(together: Replicates) -> tuple[float, float]:
@@ -249,7 +265,7 @@ def trajectory_table(together: Replicates) -> pd.DataFrame:
 
 LADDER_COLUMNS = (
     *("model", "added", "rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m"),
-    *("floor_sigma_m", "partial"),
+    *("expected_m", "expected_low_m", "expected_high_m", "partial"),
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
@@ -272,32 +288,29 @@ class Errors:
         return rms_of(self.trials)
 
     @property
-    def floor(self) -> tuple[float, float]:
-        """Replicate floor over all conditions with replicates, and its standard error, m; NaN where none has any. Root
-        of the mean variance of the conditions, weighted by their numbers of trials; the standard error of a variance s²
-        of ν degrees of freedom is s²√(2/ν).
+    def floor_m(self) -> float:
+        """Replicate floor over all conditions with replicates, m; NaN where none has any. Root of the mean variance of
+        the conditions, weighted by their numbers of trials.
         """
         groups = [group for group in replicates_by_condition(self.trials).values() if math.isfinite(group.floor_m)]
-        if not groups:
-            return math.nan, math.nan
-        counts = np.array([len(group.trials) for group in groups])
-        squares = counts / np.sum(counts) * [group.floor_m**2 for group in groups]
-        floor_m = math.sqrt(float(np.sum(squares)))
-        error_m2 = math.sqrt(float(np.sum(squares**2 * 2 / (counts - 1))))
-        return floor_m, error_m2 / (2 * floor_m) if floor_m > 0 else 0.0
+        counts = [len(group.trials) for group in groups]
+        return math.sqrt(np.average([group.floor_m**2 for group in groups], weights=counts)) if groups else math.nan
 
 
 def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
     """Compute the errors of the initial model and of every enlarged one, the last `partial` of them without a claim.
-    The floor is that of the initial model for all: replicates laid on another model scatter by the same within a few
-    per cent. `attrs["notes"]` are remarks about trials that could not be predicted.
+    The floor, and the error expected of an adequate model, are those of the initial model for all: replicates laid on
+    another model scatter by the same within a few per cent. `attrs["notes"]` are remarks about trials that could not be
+    predicted.
     """
     import pandas as pd
 
     rows: list[dict[str, object]] = []
     notes: list[Remark] = []
     inside = [in_sample(each) for each in fits]
-    floor_m, floor_sigma_m = inside[0].floor
+    floor_m = inside[0].floor_m
+    courses, _ = residual_courses(fits[0])
+    expected = _expected(expected_error(courses, replicate_scatter(fits[0], courses)))
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)
         rows.append(
@@ -309,7 +322,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
                 "rms_highest_pressure_m": highest.rms_m,
                 "floor_m": floor_m,
                 "excess_left_out_m": excess(outside.rms_m, floor_m),
-                "floor_sigma_m": floor_sigma_m,
+                **expected,
                 "partial": place >= len(fits) - partial,
             }
         )

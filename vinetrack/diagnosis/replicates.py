@@ -243,14 +243,6 @@ class Replicates:
         use = self.moving & (self.present > 1)
         return math.sqrt(np.average(self.variance_m2[use], weights=self.present[use])) if use.any() else math.nan
 
-    @property
-    def floor_sigma_m(self) -> float:
-        """Standard error of the floor, m; NaN for one trial alone: σ/√(2ν) for a variance of ν degrees of freedom, one
-        for each replicate beyond the first. Deviations vary slowly: a trial counts once, however many its frames.
-        """
-        degrees = len(self.trials) - 1
-        return self.floor_m / math.sqrt(2 * degrees) if degrees > 0 else math.nan
-
 
 def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
     """Residuals of a model for the trials of one condition at common times. Each instant uses the nearest frame of each
@@ -335,7 +327,8 @@ def orthogonal_part(columns: Floats, others: Floats) -> Floats:
 @dataclass(frozen=True)
 class ResidualCourse:
     """One trial from its first motion on: residual and its responses to deviations of pressure and ln B, as columns of
-    `values_m`, shape (n_points, 3); coordinates along the growth; variances of a frame's noise and of the origin.
+    `values_m`, shape (n_points, 3); coordinates along the growth; variance of a single position, and of the noise of
+    means, times their number of frames, and of the origin.
     """
 
     trial: Trial
@@ -343,6 +336,7 @@ class ResidualCourse:
     time_s: Floats
     lead_position_m: Floats
     lead_velocity_m_s: Floats
+    position_m2: float
     noise_m2: float
     origin_m2: float
 
@@ -388,6 +382,7 @@ def _course(aligned: AlignedTrials, i: int, trial: TrialFit) -> ResidualCourse:
         time_s=trial.time_s[moved] - trial.release_s,
         lead_position_m=trial.predicted_position_m[moved] - trial.origin_m,
         lead_velocity_m_s=trial.predicted_velocity_m_s[moved],
+        position_m2=trial_data.mean_noise_m**2 + trial_data.position_systematic_m**2,
         noise_m2=noise_m2,
         origin_m2=noise_m2 / max(trial_data.n_rest, 1),
     )
@@ -479,3 +474,33 @@ def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
     )
     pressure, damping, residual = np.exp(np.clip(best.x, lower_bounds, upper_bounds)).tolist()
     return Scatter(pressure, damping, residual, dof)
+
+
+class Expected(NamedTuple):
+    """Error of position that an adequate model shows, rms, m, and the ends of its 95 % range; NaN if not known."""
+
+    rms_m: float
+    low_m: float
+    high_m: float
+
+
+def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> Expected:
+    """Error of an adequate model over these trials, of equal weight, that scatter like their replicates. A residual
+    S u + e, with u ~ N(0, Σ), has the mean square tr(GΣ) + σ², G = SᵀS/n, of variance 2 tr((GΣ)²): as many degrees of
+    freedom (Satterthwaite) as a trial has, so many has every replicate that Σ was estimated from. The range is of F.
+    """
+    from scipy.stats import f as fisher
+
+    if not scatter.dof:
+        return Expected(math.nan, math.nan, math.nan)
+    mean_m2 = variance_m4 = 0.0
+    for course in courses:
+        response_m = course.values_m[:, 1:]
+        shared = response_m.T @ response_m / len(response_m) * (scatter.pressure**2, scatter.damping**2)
+        residual_m2 = scatter.residual**2 * float(np.trace(shared))
+        mean_m2 += float(np.trace(shared)) + residual_m2 + course.position_m2
+        independent_m4 = residual_m2**2 / MAX_STRETCHES + course.position_m2**2 / len(response_m)
+        variance_m4 += 2 * (float(np.trace(shared @ shared)) + independent_m4)
+    count, degrees = len(courses), 2 * mean_m2**2 / variance_m4
+    ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * degrees / count)
+    return Expected(*(math.sqrt(mean_m2 / count * part) for part in (1.0, *ends)))

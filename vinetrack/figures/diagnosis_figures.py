@@ -17,7 +17,7 @@ from vinetrack.core.units import number
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
 from vinetrack.narrative.diagnosis_text import drift_condition
-from vinetrack.narrative.verdict_text import estimates_text, listed_names
+from vinetrack.narrative.verdict_text import EXPECTED, estimates_text, expected_text, listed_names
 from vinetrack.results.folder_layout import Results, empty_table, read_diagnosis, read_result
 
 if TYPE_CHECKING:
@@ -47,9 +47,8 @@ _ERRORS = {
 def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
     """Root mean square error of position of the initial model and with every effect that was added, on a
     logarithmic axis: in sample; on conditions left out of the fit in turn; and on the left-out highest pressure of
-    each vine. The dotted line is the replicate scatter over all conditions: when the error has fallen to it,
-    nothing is left to explain. With few replicates it is uncertain, so an error may end below it; at the highest
-    pressures replicates often scatter less.
+    each vine. The band holds the error that an adequate model would show in 95 % of such campaigns, in trials whose
+    pressure and B scatter as replicates do: an error in it does not refute a model, nor prove that nothing is missing.
     """
     if not len(ladder):
         return None
@@ -60,18 +59,15 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
         if np.isfinite(errors_mm).any():
             label = f"{name}: {' → '.join(map(number, errors_mm))} mm"
             ax.plot(errors_mm, marker=marker, color=colour, ls=line, ms=7, zorder=3, label=label)
-    floors_mm = [floor for floor in st.column(ladder, "floor_m", 1e3) if floor > 0]
-    for floor in floors_mm[-1:]:
-        ax.axhline(floor, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
+    if expected := expected_text(*ladder[EXPECTED].iloc[-1]):
+        middle, low, high = 1e3 * ladder[EXPECTED].iloc[-1]
+        ax.axhspan(low, high, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
+        ax.axhline(middle, color=st.MUTED, lw=1.3, ls=(0, (1.5, 1.5)), zorder=1)
         frame = (("axes fraction", "data"), "offset points")
-        words = f"replicate scatter: {number(floor)} mm"
-        ax.annotate(words, (0.015, floor), (0, -4), *frame, color=st.MUTED, va="top", fontsize=9)
+        words = f"an adequate model: {expected}"
+        ax.annotate(words, (0.015, low), (0, 4), *frame, color=st.MUTED, va="bottom", fontsize=9)
     ax.margins(y=0.15)
     st.plain_log_ticks(ax, "y")
-    for floor in floors_mm[-1:]:  # an error in the shaded range says nothing about the model
-        low, high = ax.get_ylim()
-        ax.axhspan(low, floor, color=st.MUTED, alpha=0.16, lw=0, zorder=0)
-        ax.set_ylim(low, high)
     partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
     labels = ["initial\nmodel"]
     for added, part in list(zip(ladder["added"], partial, strict=True))[1:]:

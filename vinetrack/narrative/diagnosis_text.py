@@ -22,9 +22,11 @@ from vinetrack.diagnosis.result import (
 from vinetrack.effects import Effect, remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.narrative.verdict_text import (
+    EXPECTED,
     MOST_NAMED,
     SHARED_REMEDIES,
     estimates_text,
+    expected_text,
     listed_names,
     odd_deciding_in_words,
     odd_in_words,
@@ -454,8 +456,10 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     for row in ladder.to_dict("records"):
         model = (str(row["added"]) or "initial model") + (", partial" if row.get("partial") else "")
         errors = (row[f"{key}_m"] for key in ("rms_in_sample", "rms_left_out", "rms_highest_pressure", "floor"))
-        body.append((model, *(f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)))
-    return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
+        cells = (f"{1e3 * error:.2f}" if math.isfinite(error) else "–" for error in errors)
+        body.append((model, *cells, expected_text(*(row[name] for name in EXPECTED)) or "–"))
+    headings = ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm", "an adequate model")
+    return list(table(body, headings))
 
 
 def gain_in_words(before: Fit, after: Fit) -> str:

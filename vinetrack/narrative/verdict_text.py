@@ -243,9 +243,17 @@ def _errors(ladder: pd.DataFrame | None) -> str:
     if not math.isfinite(float(first[key])):
         key, what = "rms_in_sample_m", "error of position"
     then = f" → {number(1e3 * float(last[key]))}" if len(ladder) > 1 else ""
-    floor = 1e3 * float(last["floor_m"])
-    scatter = f", replicate scatter {number(floor)} mm" if math.isfinite(floor) else ""
-    return f"{what} {number(1e3 * float(first[key]))}{then} mm{scatter}"
+    adequate = f", of an adequate model {expected}" if (expected := expected_text(*last[EXPECTED])) else ""
+    return f"{what} {number(1e3 * float(first[key]))}{then} mm{adequate}"
+
+
+EXPECTED = ["expected_m", "expected_low_m", "expected_high_m"]  # Columns of the error of an adequate model
+
+
+def expected_text(error_m: float, low_m: float, high_m: float) -> str:
+    """Error that an adequate model would show, with its 95 % range, mm; blank where it is not known."""
+    middle, low, high = (number(1e3 * end_m) for end_m in (error_m, low_m, high_m))
+    return f"{middle} mm ({low} to {high})" if math.isfinite(error_m) else ""
 
 
 def settled_rows(table: pd.DataFrame) -> pd.DataFrame:

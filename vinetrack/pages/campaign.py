@@ -17,7 +17,7 @@ import numpy as np
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.replicates import first_that_counts, replicates_of
+from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
@@ -26,7 +26,7 @@ from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
-from vinetrack.narrative.verdict_text import spaced_name
+from vinetrack.narrative.verdict_text import EXPECTED, spaced_name
 from vinetrack.pages.local_page import THREAD_PREFIX
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result
 
@@ -95,7 +95,8 @@ class Campaign:
     trials: tuple[ExplorerTrial, ...]
     left_out: Mapping[str, str]
     bands: Mapping[str, Floats]
-    floors_m: Mapping[str, float]
+    highest_m: Mapping[str, float]
+    expected_m: tuple[float, ...]
     stored: FitSummary
     effects: Mapping[str, Effect]
     unusable: Mapping[str, str]
@@ -156,11 +157,12 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"
         raise ResultsError(f"{folder} has no trial to explore: {why}")
     stored = read_fit(results)
-    floors_m: dict[str, float] = {}
+    highest_m: dict[str, float] = {}
     if not stored.refused:
-        table = read_result(results.comparison).astype({"condition": str, "replicate_floor_m": float})
-        floors_m = dict(zip(table["condition"], table["replicate_floor_m"], strict=True))
-    compared = {name: read_result(results.trajectories(name)) for name in floors_m}
+        table = read_result(results.comparison).astype({"condition": str, "expected_high_m": float})
+        highest_m = dict(zip(table["condition"], table["expected_high_m"], strict=True))
+    compared = {name: read_result(results.trajectories(name)) for name in highest_m}
+    ladder = read_result(results.ladder)[EXPECTED].to_numpy(dtype=float).tolist() if results.ladder.exists() else []
     bands = {}
     for condition, table in compared.items():
         # The replicates at the times of the longest trial of each condition, where they are known
@@ -181,7 +183,8 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         trials=tuple(_align_trials(data, compared)),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
         bands=bands,
-        floors_m=floors_m,
+        highest_m=highest_m,
+        expected_m=tuple(ladder[0]) if ladder else (math.nan,) * 3,
         stored=stored,
         effects=effects,
         in_use=stored.names if stored.names and set(stored.names) <= set(effects) else tuple(experiment.settings.model),
@@ -245,18 +248,15 @@ def _settings(trial: Trial) -> dict[str, str]:
 @dataclass(frozen=True)
 class Prediction:
     """A model's prediction of every trial of a campaign, in its order, and by condition the root mean square error of
-    position and the scatter of replicates, m.
+    position, m.
     """
 
     trials: tuple[TrialFit, ...]
     errors_m: Mapping[str, float]
-    floors_m: Mapping[str, float]
 
 
-def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[str, float] | None = None) -> Prediction:
-    """Predict every trial by a choice. The scatter of replicates hardly depends on it, and takes as long: while a
-    slider is dragged it is given.
-    """
+def predict_choice(campaign: Campaign, choice: ModelChoice) -> Prediction:
+    """Predict every trial by a choice."""
     data = []
     for aligned in campaign.trials:
         trial = aligned.data.trial
@@ -271,9 +271,7 @@ def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[st
     for name, trials in members.items():
         squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
         errors_m[name] = math.sqrt(float(np.mean(squares)))
-    if floors_m is None:
-        floors_m = {name: replicates_of(trials).floor_m for name, trials in members.items()}
-    return Prediction(tuple(predicted), errors_m, floors_m)
+    return Prediction(tuple(predicted), errors_m)
 
 
 def overall_m(errors: Mapping[str, float]) -> float:
@@ -519,7 +517,7 @@ class BackgroundFit:
         return self._job is not None and self.fitted is None and not self.failure
 
     def _work(self, watch: Watch) -> Evaluated:
-        self.prediction = predict_choice(self.campaign, self.initial, self.campaign.floors_m)
+        self.prediction = predict_choice(self.campaign, self.initial)
         self._notify()
         return first_fit(self.campaign, self.initial, watch)
 

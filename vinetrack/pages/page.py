@@ -26,7 +26,7 @@ from vinetrack.figures.style import TOKENS, follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
-from vinetrack.narrative.verdict_text import Row, quantity_text, verdict_table
+from vinetrack.narrative.verdict_text import Row, expected_text, quantity_text, verdict_table
 from vinetrack.pages.campaign import (
     BackgroundFit,
     Campaign,
@@ -66,17 +66,16 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosi
 def headline(
     campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
 ) -> str:
-    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
+    """Return the error of the model now and as the page opened, and that of an adequate model, as a heading."""
     now, before = (overall_m({} if one is None else one.errors_m) for one in (prediction, opened_with))
-    floor = overall_m(campaign.floors_m if prediction is None else prediction.floors_m)
     words = model_text(choice.effects)
     return panel(
         "headline",
         model=words[:1].upper() + words[1:],
         now=_in_mm(now),
         before=_in_mm(before),
-        floor=_in_mm(floor),
-        at_floor=now <= 1.15 * floor,  # chosen: an error up to 1.15 times the replicate scatter counts as equal to it
+        expected=expected_text(*campaign.expected_m),
+        as_expected=now <= campaign.expected_m[-1],
         refused=campaign.stored.refused,
         named=model_text(campaign.experiment.settings.model),
         in_use=model_text(campaign.in_use),
@@ -94,19 +93,12 @@ def described(choice: ModelChoice, prediction: Prediction, numbers: Iterable[Num
     return words | {number.title: quantity_text(number) for number in numbers}
 
 
-def numbers_panel(
-    campaign: Campaign, fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequence[tuple[str, str, str]]
-) -> str:
+def numbers_panel(fits: Sequence[Evaluated], sizes_changed: bool, compared: Sequence[tuple[str, str, str]]) -> str:
     """Return two models compared, the last fit of this page as it is printed, and all its fits."""
     if not fits:
         return panel("numbers", compared=compared)
     fit = fits[-1].fit
-    floor = overall_m(campaign.floors_m)
-    ladder = []
-    for fitted in fits:
-        rms = overall_m(fitted.prediction.errors_m)
-        beyond = math.sqrt(max(rms**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
-        ladder.append((model_text(fitted.choice.effects), _in_mm(rms), _in_mm(beyond) or "–"))
+    ladder = [(model_text(each.choice.effects), _in_mm(overall_m(each.prediction.errors_m))) for each in fits]
     return panel(
         "numbers",
         compared=compared,
@@ -373,8 +365,7 @@ class Page:
     def _predict(self, choice: ModelChoice) -> None:
         """Predict and draw a choice; if that fails, show the error and keep the former prediction."""
         try:
-            floors_m = self.campaign.floors_m if self.shown is None else self.shown.floors_m
-            self.shown = predict_choice(self.campaign, choice, floors_m)
+            self.shown = predict_choice(self.campaign, choice)
         except FitError as error:
             self._message = str(error)
             self._update_status()
@@ -397,7 +388,7 @@ class Page:
             if self.held is not None:
                 held, now = self.held[1], self._described(self.shown)
                 compared = [(title, held.get(title, "–"), now.get(title, "–")) for title in held | now]
-        set_text(self.numbers, numbers_panel(self.campaign, self.fits, self._sizes_changed, compared))
+        set_text(self.numbers, numbers_panel(self.fits, self._sizes_changed, compared))
         diagnosis, rows, pairs, advice = self.diagnosis, list[Row](), list[str](), None
         if diagnosis is not None:
             rows = verdict_table(diagnosis)

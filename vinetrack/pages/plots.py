@@ -176,7 +176,7 @@ class Plots:
         self._reference = ColumnDataSource({"xs": [], "ys": []})
         self._model = ColumnDataSource({"xs": [], "ys": []}, name="model_curves")
         self._residuals = ColumnDataSource(self._lines(()), name="residual_curves")
-        self._bars = ColumnDataSource(self._error_bars({}, {}, {}, ()), name="error_bars")
+        self._bars = ColumnDataSource(self._error_bars({}, {}, ()), name="error_bars")
         self.motion, self.residual = self._draw_motion(), self._draw_residual()
         self.errors = self._draw_errors()
 
@@ -216,9 +216,9 @@ class Plots:
         solid = {"fill_color": vine_colour(), "fill_alpha": "alpha", "line_color": None}
         bars = fig.hbar(right="now", height=0.44, **solid, **common)
         mark = {"marker": "dash", "angle": math.pi / 2, "size": 17, "line_color": INK, "line_width": 2.6}
-        for drawn in (bars, fig.scatter(x="floor", **mark, **common), held):
+        for drawn in (bars, fig.scatter(x="highest", **mark, **common), held):
             drawn.nonselection_glyph = drawn.selection_glyph = None
-        columns = {"now": "now", "for comparison": "before", "replicates": "floor"}
+        columns = {"now": "now", "for comparison": "before", "an adequate model, at most": "highest"}
         tips = [("", "@label"), *((words, f"@{column}{{0.000}} mm") for words, column in columns.items())]
         fig.add_tools(HoverTool(renderers=[bars], tooltips=tips), TapTool(renderers=[bars, held]))
         self._bars.selected.on_change("indices", self._tapped)
@@ -276,10 +276,10 @@ class Plots:
             "ys": [1e3 * (model.predicted_position_m - trial.origin_m)[trial.rows] for trial, model in drawn],
         }
 
-    def _error_bars(self, now_m: Errors, before_m: Errors, floors_m: Errors, conditions: Sequence[str]) -> Columns:
+    def _error_bars(self, now_m: Errors, before_m: Errors, conditions: Sequence[str]) -> Columns:
         """One row per condition, the first at the bottom, mm; those not in `conditions` are faint."""
         names = list(reversed(self.campaign.conditions))
-        errors = {"now": now_m, "before": before_m, "floor": floors_m}
+        errors = {"now": now_m, "before": before_m, "highest": self.campaign.highest_m}
         return {
             "condition": names,
             "label": [self.campaign.labels[name] for name in names],
@@ -315,8 +315,8 @@ class Plots:
         other = None if reference is now else reference
         self._reference.data = {"xs": [], "ys": []} if other is None else self._model_lines(other, shown)
         before_m = {} if reference is None else reference.errors_m
-        rows = self._error_bars(now.errors_m, before_m, now.floors_m, conditions)
-        known = [value for key in ("now", "before", "floor") for value in rows[key] if math.isfinite(value)]
+        rows = self._error_bars(now.errors_m, before_m, conditions)
+        known = [value for key in ("now", "before", "highest") for value in rows[key] if math.isfinite(value)]
         self.errors.x_range.end = round_up(1.04 * max(known, default=1.0), (1, 1.5, 2, 3, 4, 5, 6, 8, 10))
         self._bars.data = rows
 

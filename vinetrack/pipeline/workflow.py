@@ -494,7 +494,8 @@ def comparison_lines(folder: Path) -> list[str]:
     columns = (  # heading, unit, column, factor, decimals
         ("rms position", "mm", "rms_position_m", 1e3, 3),
         ("replicates", "mm", "replicate_floor_m", 1e3, 3),
-        ("ratio", "", "ratio", 1, 1),
+        ("adequate from", "mm", "expected_low_m", 1e3, 3),
+        ("to", "mm", "expected_high_m", 1e3, 3),
         ("rms final speed", "m/s", "rms_final_velocity_m_s", 1, 3),
         ("worst at", "ms", "worst_at_s", 1e3, 1),
         ("", "mm", "worst_at_m", 1e3, 1),
@@ -503,5 +504,5 @@ def comparison_lines(folder: Path) -> list[str]:
     for _, _, name, factor, decimals in columns:
         cells.append([f"{factor * v:.{decimals}f}" if math.isfinite(v) else "–" for v in compared[name].tolist()])
     headings, units, *_ = zip(*columns, strict=True)
-    lines = table(zip(*cells, strict=True), ("condition", *headings), ("", *units), align="<>>>>>>")
+    lines = table(zip(*cells, strict=True), ("condition", *headings), ("", *units), align="<>>>>>>>")
     return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)]

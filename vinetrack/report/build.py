@@ -39,8 +39,10 @@ from vinetrack.narrative.diagnosis_text import (
     status_tally,
 )
 from vinetrack.narrative.verdict_text import (
+    EXPECTED,
     bounds_text,
     estimates_text,
+    expected_text,
     is_finite,
     listed_names,
     quantity_text,
@@ -616,13 +618,13 @@ def model_errors(table: pd.DataFrame) -> str:
     worst = table.sort_values("rms_position_m").iloc[-1]
     conditions = "one condition" if len(table) == 1 else f"{len(table)} conditions"
     sentence = f"Over {conditions} the model is off by {_rms_mm(table['rms_position_m'])} mm"
-    known = table[table["replicate_floor_m"] > 0]
-    if len(known):
-        sentence += f", and replicates scatter by {_rms_mm(known['replicate_floor_m'])} mm"
+    sentence += " (root mean square)"
+    if known := int(np.isfinite(table["expected_m"]).sum()):
+        above = int((table["rms_position_m"] > table["expected_high_m"]).sum())
+        sentence += f"; in {above} of {known} that is more than an adequate model would show"
     return (
-        f"{sentence} (root mean square). Worst is {worst['condition']}, by "
-        f"{number(1e3 * worst['rms_position_m'])} mm, with the maximum after "
-        f"{number(1e3 * worst['worst_at_m'])} mm of growth."
+        f"{sentence}. Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, with the maximum "
+        f"after {number(1e3 * worst['worst_at_m'])} mm of growth."
     )
 
 
@@ -631,12 +633,11 @@ def final_errors(diagnosis: Diagnosis) -> str:
     if diagnosis.ladder is None or not len(diagnosis.ladder):
         return ""
     last = settled_rows(diagnosis.ladder).iloc[-1]
-    inside, outside, floor = (
-        number(1e3 * float(last[key])) for key in ("rms_in_sample_m", "rms_left_out_m", "floor_m")
-    )
+    inside, outside = (number(1e3 * float(last[key])) for key in ("rms_in_sample_m", "rms_left_out_m"))
+    adequate = f"; an adequate model would be off by {expected}" if (expected := expected_text(*last[EXPECTED])) else ""
     return (
         f"With {listed_names(diagnosis.effects)} the error of the model is {inside} mm, and {outside} mm on "
-        f"conditions left out of the fit; replicate scatter is {floor} mm (root mean square)."
+        f"conditions left out of the fit{adequate} (root mean square)."
     )
 
 
@@ -694,7 +695,11 @@ def build_report(content: ReportContent) -> str:
     )
     environment.filters |= {"number": number, "with_error": with_error, "interval": interval}
     environment.globals |= {"rows": rows, "display_unit": display_unit, "bounds_text": bounds_text}
-    environment.globals |= {"listed_names": listed_names, "inline_picture": inline_picture}
+    environment.globals |= {
+        "listed_names": listed_names,
+        "expected_text": expected_text,
+        "inline_picture": inline_picture,
+    }
     environment.globals |= {"data_uri": data_uri, "base64_uri": base64_uri}
     settings = content.provenance.get("settings") or {}
     sections = {name: figure.section for name, figure in all_figures().items()}
