@@ -168,21 +168,6 @@ def test_printed_lines_have_the_printed_slope():
     assert_nothing_is_cut_off(fig)
 
 
-def test_published_errors_stand_beside_ours():
-    at = [("Fig. 4", kPa) for kPa in (7.0, 14.0, 28.0)] + [("Fig. 5", kPa) for kPa in (14.0, 28.0, 41.0)]
-    rows = [(*one, name, 0.01 * (k + 1), 0.1 * (k + 1)) for one, (k, name) in product(at, enumerate(NAMES))]
-    columns = ["figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s"]
-    paper = pd.DataFrame({"row": ["position_rms_7kPa", "final_speed_rms_41kPa"], "ours": [0.32, 0.07]})
-    fig = paper_figures.draw_paper_rms(paper, pd.DataFrame(rows, columns=columns))
-    left, right = fig.axes
-    published, ours = (line.get_ydata() for line in left.lines[:2])
-    assert list(published) == [1.90, 0.29, 0.31]
-    assert ours[0] == 0.32
-    assert np.isnan(ours[1])
-    assert "m/s" in right.get_ylabel()
-    assert_nothing_is_cut_off(fig)
-
-
 def test_final_speeds_stand_beside_eq2_where_payloads_differ():
     row = {"vine": "v", "final_at_mm": 120.0, "n_final": 4, "final_lead_velocity_sigma_m_s": 0.02}
     at = product((14.0, 28.0), (0.0, 20.0, 35.6))

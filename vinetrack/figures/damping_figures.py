@@ -1,5 +1,5 @@
-"""The damping law: points with both fits of F = B·x_ssⁿ, and what depends on the size of the vine; and the paper's
-figures and Table II redrawn, with the consequences of terms neglected in Eq. (2).
+"""The damping law: points with both fits of F = B·x_ssⁿ, what depends on the size of the vine, and figures of the paper
+redrawn, with the consequences of terms neglected in Eq. (2).
 
 On logarithmic axes the law is a straight line of slope n, the same for all vines. Against sizes both straight lines and
 power laws are drawn, because neither is known to be right.
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
 
 _METHOD_LINES = {"log_log": st.DASHED, "both_axes": "-"}
 
@@ -128,9 +129,10 @@ _SIZES = {
 
 
 @figure("scaling", "damping", "Damping against size", data="scaling.json")
-def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None, note: str = "") -> Figure | None:
+def draw_scaling(scaling: dict[str, Any]) -> Figure | None:
     """B of each vine against its size, on logarithmic axes: against diameter for vines that are scaled copies of
-    each other, against wall thickness for vines of one diameter. Solid: power law; dashed: straight line.
+    each other, against wall thickness for vines of one diameter (Fig. 7 of the paper). Full: power law; dashed:
+    straight line.
     """
     titles = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
     kinds = [kind for kind in titles if scaling.get(kind)]
@@ -141,13 +143,10 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
         families = scaling[kind][:4]  # four families have twelve lines of legend above the axes
         ax.set(xscale="log", yscale="log", xlabel=_SIZES[families[0]["along"]][0], ylabel="B (N·(s/m)ⁿ)")
         for i, family in enumerate(families):
-            _draw_B_family(ax, family, i)
-        pairs = [pair for family in families for pair in zip(family["vines"], family["sizes"], strict=True)]
-        printed = [(size, published["B"][vine]) for vine, size in pairs if published and vine in published["B"]]
-        if published and printed:
-            places = zip(*printed, strict=True)
-            ax.plot(*places, "D", mfc="none", mec=st.MUTED, ms=11, mew=1.3, label=published["source"])
-        sizes = sorted({size for _, size in pairs})
+            B, B_95 = (np.array(family[name], dtype=float) for name in ("B", "B_95"))
+            bars = np.clip([B - B_95[:, 0], B_95[:, 1] - B], 0, None)
+            _draw_family(ax, family["sizes"], B, bars, family, i, f"B with 95 % interval, N = {B.size} vines")
+        sizes = sorted({size for family in families for size in family["sizes"]})
         ax.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
         st.plain_log_ticks(ax)
         if len(sizes) <= 8:
@@ -155,79 +154,66 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
         left_out = len(scaling[kind]) - len(families)
         title = titles[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
         st.legend_above(ax, title=title, alignment="left")
-    st.note_below(fig, note)
     return fig
 
 
-def _draw_B_family(ax: Axes, family: dict[str, Any], index: int) -> None:
-    sizes, B, B_95 = (np.array(family[name], dtype=float) for name in ("sizes", "B", "B_95"))
-    refused = f"\nno line: {family['refused']}" if family.get("refused") else ""
-    bars = np.clip([B - B_95[:, 0], B_95[:, 1] - B], 0, None)
-    label = f"B with 95 % interval, N = {B.size} vines{refused}"
-    st.error_points(ax, sizes, B, bars, index, label, elinewidth=1.3, zorder=3)
-    colour, span = st.VINE_COLOURS[index], np.geomspace(sizes.min() / 1.15, sizes.max() * 1.15, 100)
-    if power := family["power"]:
-        label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}), R² {number(power['R2'])}"
+def _draw_family(
+    ax: Axes, sizes: list[float], values: ArrayLike, errors: ArrayLike, trend: dict[str, Any], index: int, label: str
+) -> None:
+    """Points of one family of vines, its power law (full) and its straight line (dashed)."""
+    refused = f"\nno line: {trend['refused']}" if trend.get("refused") else ""
+    st.error_points(ax, sizes, values, errors, index, label + refused, elinewidth=1.3, zorder=3)
+    colour, span = st.VINE_COLOURS[index], np.geomspace(min(sizes) / 1.15, 1.15 * max(sizes), 100)
+    if power := trend["power"]:
+        label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}){_quality(power)}"
         ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.5, label=label)
-    if line := family["line"]:
+    if line := trend["line"]:
         straight = line["intercept"] + line["slope"] * span
-        drawn = straight > 0.5 * B.min()
-        label = f"straight line, intercept {number(line['intercept'])}, R² {number(line['R2'])}"
+        drawn = straight > 0.5 * np.min(values)
+        label = f"straight line, intercept {number(line['intercept'])}{_quality(line)}"
         ax.plot(span[drawn], straight[drawn], color=colour, lw=1.3, ls=st.DASHED, label=label)
 
 
+def _quality(line: dict[str, Any]) -> str:
+    return f", R² {number(line['R2'])}, p = {number(line['p'], 2)}"
+
+
 @figure("speed_scaling", "damping", "Steady speed against size", data="conditions.csv")
-def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure | None:
+def draw_speed_scaling(scaling: dict[str, Any]) -> Figure | None:
     """Steady tail speed of scaled copies (one t/D) at one pressure without payload, against diameter, and the same
-    divided by the diameter. Points are means over a vine's steady trials with their standard errors (that of a
-    single trial does not include replicate scatter); straight lines (full) and power laws (dashed) are fitted to
-    the means of vines, so N is the number of vines, and p is the probability of a slope at least as large if there
-    is none. Pressures that agree within 1 % count as one.
+    divided by the diameter (Fig. 8 of the paper). Points are means over a vine's steady trials with their standard
+    errors (that of a single trial does not include replicate scatter); power laws (full) and straight lines (dashed)
+    are fitted to the means of vines, so N is the number of vines, and p is the probability of a slope at least as
+    large if there is none. Pressures that agree within 1 % count as one.
     """
     families = (scaling.get("steady_speed") or [])[:5]  # each pressure has three lines of legend above the axes
     if not families:
         return None
     fig = st.new_figure(11.0, 5.2 + 0.45 * len(families))
-    left, right = fig.subplots(1, 2)
-    for i, family in enumerate(families):
-        _draw_speed_family(left, family, "x_ss{}_m_s", family, i)
-        _draw_speed_family(right, family, "x_ss_over_diameter{}_1_s", family["over_diameter"], i)
     left_out = len(scaling["steady_speed"]) - len(families)
     more = f", {left_out} more pressures in scaling.json" if left_out > 0 else ""
-    labels = {"Speed": "steady tail speed x_ss (m/s)", "Speed over diameter": "x_ss / diameter (1/s)"}
-    for ax, (title, label) in zip((left, right), labels.items(), strict=True):
+    panels = (
+        ("Speed", "steady tail speed x_ss (m/s)", "x_ss{}_m_s"),
+        ("Speed over diameter", "x_ss / diameter (1/s)", "x_ss_over_diameter{}_1_s"),
+    )
+    for ax, (title, label, key) in zip(fig.subplots(1, 2), panels, strict=True):
         ax.set(xlabel="diameter (mm)", ylabel=label)
+        for i, family in enumerate(families):
+            values, errors = (np.array(family[key.format(part)], dtype=float) for part in ("", "_sigma"))
+            n = f"{st.counted([values.size], 'vine')} of {st.counted(family['n_steady'], 'trial')}"
+            trend = family["over_diameter"] if "over" in key else family
+            _draw_family(ax, family["sizes"], values, errors, trend, i, f"{family['pressure_kPa']:.4g} kPa, N = {n}")
         st.up_from_zero(ax, x=True)
         st.legend_above(ax, title=title + more, alignment="left", fontsize=9)
-    if any(count == 1 for family in families for count in family["n_steady"]):
-        note = f"{note} The error bar of a single trial does not include replicate scatter.".strip()
-    st.note_below(fig, note)
     return fig
 
 
-def _draw_speed_family(ax: Axes, family: dict[str, Any], key: str, lines: dict[str, Any], index: int) -> None:
-    names = "sizes", key.format(""), key.format("_sigma")
-    sizes, values, errors = (np.array(family[name], dtype=float) for name in names)
-    line, power, trend = lines["line"], lines["power"], f"no trend: {lines['refused']}"
-    if not lines["refused"]:
-        slope = f"{number(power['slope'], 2)} ({interval(power['slope_95'])}), p = {number(power['p'], 2)}"
-        trend = f"power (dashed) {slope}\nline (full): R² {number(line['R2'])}, p = {number(line['p'], 2)}"
-    n = f"{st.counted([sizes.size], 'vine')} of {st.counted(family['n_steady'], 'trial')}"
-    label = f"{family['pressure_kPa']:.4g} kPa, N = {n}\n{trend}"
-    st.error_points(ax, sizes, values, errors, index, label, elinewidth=1.3)
-    colour, span = st.VINE_COLOURS[index], np.linspace(0.8 * sizes.min(), 1.1 * sizes.max(), 100)
-    if line:
-        ax.plot(span, line["intercept"] + line["slope"] * span, color=colour, lw=1.5)
-    if power:
-        ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.3, ls=st.DASHED)
-
-
 @figure("efficiency", "damping", "Energy efficiency", data="conditions.csv")
-def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure | None:
-    """Energy efficiency against wall thickness and diameter at one pressure, payload, length and growth: kinetic
-    energy of all moving mass divided by the work of the gas P₀Ay; of the payload alone; and with the work of the
-    weight added to the denominator. Points are means with standard errors; the powers of wall and diameter are
-    fitted together, on logarithms, so that each is that of one size with the other held constant.
+def draw_efficiency(scaling: dict[str, Any]) -> Figure | None:
+    """Energy efficiency against wall thickness and diameter at one pressure, payload, length and growth (Fig. 9 of the
+    paper): kinetic energy of all moving mass divided by the work of the gas P₀Ay; of the payload alone; and with the
+    work of the weight added to the denominator. Points are means with standard errors; the powers of wall and diameter
+    are fitted together, on logarithms, so that each is that of one size with the other held constant.
     """
     families = scaling.get("efficiency") or []
     if not families:
@@ -249,12 +235,10 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure | None:
         row[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0, fontsize=9)
     for ax, key in zip(axes[0], shown, strict=True):
         ax.set_title(definitions[key], fontsize=10.5)
-    counts = family["n_efficiency"]
     load = f" with {family['payload_g']:.4g} g" if family["payload_g"] else " without payload"
     more = f"; {n_left} more {'family' if n_left == 1 else 'families'} in scaling.json" if n_left else ""
     title = f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
-    fig.suptitle(f"{title}{st.per_point(counts)}{more}", fontsize=11, x=0.01, ha="left")
-    st.note_below(fig, note)
+    fig.suptitle(f"{title}{st.per_point(family['n_efficiency'])}{more}", fontsize=11, x=0.01, ha="left")
     return fig
 
 
@@ -277,14 +261,7 @@ def _draw_efficiency(ax: Axes, family: dict[str, Any], key: str, x: str) -> None
 
 
 # ------------------------------------------------------------------------------
-# The paper's figures and Table II redrawn, with the consequences of terms neglected in Eq. (2).
-
-# Departures from Eq. (2) that the paper's errors are compared with; where they are two, the smaller effect first
-CAUSES = {
-    "chamber not refilled": ("depletion_slow", "depletion_fast"),
-    "tail that cannot push": ("slack",),
-    "both": ("depletion_slow_slack", "depletion_fast_slack"),
-}
+# Figures of the paper redrawn, with the consequences of terms neglected in Eq. (2).
 
 
 @figure("paper_fig6", "paper", "Fig. 6: growth force and steady speed", data="damping_points.csv")
@@ -427,54 +404,6 @@ def draw_paper_reservoir(paper_pressures: pd.DataFrame) -> Figure:
     return fig
 
 
-@figure("paper_table2", "paper", "Table II, drawn", data="paper.csv")
-def draw_paper_rms(paper: pd.DataFrame, paper_departures: pd.DataFrame) -> Figure:
-    """Errors of Eq. (2): published, ours, and those that departures from Eq. (2) would cause. Ours, with trials
-    simulated by Eq. (2), come only from scatter of vines and pressures. A departure that changes nothing at a
-    pressure is not drawn there.
-    """
-    fig = st.new_figure(11.0, 4.9)
-    axes = fig.subplots(1, 2)
-    ours = paper.drop_duplicates("row").set_index("row")["ours"]
-    panels = (
-        ("Fig. 4", "rms of position (cm)", published.POSITION_RMS_CM, "position_rms", "rms_position_m", 100),
-        ("Fig. 5", "rms of speed at 12 cm (m/s)", published.FINAL_SPEED_RMS_M_S, "final_speed_rms",
-         "rms_final_lead_velocity_m_s", 1),
-    )  # fmt: skip
-    for ax, (name, label, printed, row, column, factor) in zip(axes, panels, strict=True):
-        ax.set(ylabel=label, title=f"{name} and Table II")
-        found = [float(ours.get(f"{row}_{kPa:g}kPa", np.nan)) for kPa in printed]
-        departures = paper_departures[paper_departures["figure"] == name]
-        _draw_rms_panel(ax, printed, found, departures.assign(size=factor * departures[column]))
-    _legend_below(fig, axes[0])
-    return fig
-
-
-def _draw_rms_panel(ax: Axes, printed: dict[int, float], ours: list[float], departures: pd.DataFrame) -> None:
-    least = 0.01  # 0.1 mm and 1 cm/s, a hundredth of the printed errors
-    places = np.arange(len(printed), dtype=float)
-    ax.set_yscale("log")
-    ax.plot(places - 0.3, list(printed.values()), "D", color=st.INK, ms=8, label="published")
-    ax.plot(places - 0.15, ours, "o", mfc="none", mec=st.BLUE, mew=1.8, ms=8, label="ours")
-    by_name = _by_departure(departures)
-
-    def sizes(name: str) -> np.ndarray:
-        near = [by_name[name].loc[np.isclose(by_name[name]["pressure_kPa"], kPa), "size"] for kPa in printed]
-        return np.array([float(size.iloc[0]) if len(size) else np.nan for size in near])
-
-    for k, ((label, names), colour) in enumerate(zip(CAUSES.items(), (st.ORANGE, st.GREEN, st.PURPLE), strict=True)):
-        low, high = np.maximum(sizes(names[0]), least), sizes(names[-1])
-        shown = high >= least
-        middle = np.sqrt(low * np.maximum(high, least))
-        bars = [(middle - low)[shown], (high - middle)[shown]]
-        style: dict[str, Any] = {"fmt": "_", "color": colour, "ms": 11, "mew": 2, "elinewidth": 7, "label": label}
-        ax.errorbar((places + 0.15 * k)[shown], middle[shown], yerr=bars, **style)
-    ax.set_xticks(places, [f"{kPa:g} kPa" for kPa in printed])
-    ax.grid(visible=False, axis="x")
-    ax.set_xlim(-0.6, len(printed) - 0.4)
-    st.plain_log_ticks(ax, "y")
-
-
 @figure("paper_fig5", "paper", "Fig. 5: final speed and payload", data="paper_speeds.csv")
 def draw_paper_speeds(paper_speeds: pd.DataFrame, paper_speed_curves: pd.DataFrame) -> Figure | None:
     """Speed of the leading edge after 12 cm of growth against payload, 24 mm × 150 µm: means of our trials with
@@ -499,57 +428,4 @@ def draw_paper_speeds(paper_speeds: pd.DataFrame, paper_speed_curves: pd.DataFra
     counts = reached["n_final"].astype(int).tolist()
     title = f"{reached['vine'].iloc[0]}, after {reached['final_at_mm'].iloc[0]:.4g} mm\n{st.per_point(counts)}"
     st.legend_above(ax, 2, title=title, alignment="left", fontsize=9)
-    note = (
-        "B of this vine and the payloads other than 35.6 g are not printed; the paper shows its points only in a plot"
-    )
-    st.note_below(fig, note)
     return fig
-
-
-@figure("paper_fig7", "paper", "Fig. 7: B against scale and wall", data="scaling.json")
-def draw_paper_sizes(scaling: dict[str, Any], damping: dict[str, Any], paper: pd.DataFrame) -> Figure | None:
-    """B against diameter for scaled copies, and against wall thickness for 12 mm vines, with 95 % intervals;
-    diamonds are published values. On logarithmic axes a power law is straight. Only one of the walls has a
-    published B: simulated vines have B in proportion to the wall.
-    """
-    laws = {name: vine for law in damping.values() for name, vine in (law.get("vines") or {}).items()}
-    scales = {name: published.scale_of(vine["diameter_mm"], vine["thickness_um"]) for name, vine in laws.items()}
-    B = {name: published.DAMPING_B[scale] for name, scale in scales.items() if scale is not None}
-    note = (
-        "Of the 12 mm vines only that of 100 µm has a printed B. Virtual vines with other walls were simulated with B "
-        "proportional to the wall: their straight line is an input"
-    )
-    printed = {"B": B, "source": f"{published.SOURCE}, printed"}
-    return draw_scaling(scaling, printed, note if _is_virtual(paper) else "")
-
-
-@figure("paper_fig8", "paper", "Fig. 8: steady speed and scale", data="conditions.csv")
-def draw_paper_steady_speeds(scaling: dict[str, Any], paper: pd.DataFrame) -> Figure | None:
-    """Steady tail speed of the four scales at 24 kPa, and divided by the diameter, with straight lines (full) and
-    power laws (dashed) through the means of vines.
-    """
-    families = _near(scaling["steady_speed"], published.STEADY_SPEED_KPA)
-    note = (
-        "Alvarez et al. (2025): linear, R² = 0.935, from which p = 0.033 (printed: 0.32). The B printed in Fig. 6 do "
-        "not give linearly increasing speeds"
-    )
-    virtual = ": virtual vines simulated with them cannot test one figure against the other"
-    return draw_speed_scaling({"steady_speed": families}, note + (virtual if _is_virtual(paper) else ""))
-
-
-@figure("paper_fig9", "paper", "Fig. 9: energy efficiency", data="conditions.csv")
-def draw_paper_efficiency(scaling: dict[str, Any]) -> Figure | None:
-    """Energy efficiency at 34 kPa with 35.6 g after 150 mm of growth, defined in three ways. Simulated vines of
-    other walls than those of Table I have B in proportion to the wall.
-    """
-    note = "Alvarez et al. (2025): higher for thinner walls, no clear trend with diameter; values are only plotted"
-    return draw_efficiency({"efficiency": _near(scaling["efficiency"], published.EFFICIENCY_KPA)}, note)
-
-
-def _is_virtual(paper: pd.DataFrame) -> bool:
-    """Whether the trials were simulated from the paper's numbers."""
-    return bool(paper["mark"].str.startswith("simulated").any())
-
-
-def _near(families: list[dict[str, Any]], pressure_kPa: float) -> list[dict[str, Any]]:
-    return [family for family in families if abs(family["pressure_kPa"] / pressure_kPa - 1) < 0.02]

@@ -281,12 +281,6 @@ def page_legend(fig: Figure, handles: Sequence[Any] | None, n_columns: int, **ke
     fig.legend(handles=handles, loc="outside upper left", ncols=n_columns, fontsize=9, **keywords)
 
 
-def note_below(fig: Figure, note: str) -> None:
-    """Put a sentence below the figure, wrapped to its width at 12.5 characters per inch; nothing if it is blank."""
-    if note:
-        fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * 12.5)), fontsize=10)
-
-
 def up_from_zero(ax: Axes, *, x: bool = False) -> None:
     """Let the axes begin at zero and end 8 % above the largest value, however little the data vary."""
     ax.set_ylim(0, 1.08 * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)

@@ -23,7 +23,6 @@ from vinetrack.core.records import split_flags
 from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.experiment.schema import LIMITED
-from vinetrack.figures.damping_figures import CAUSES
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.figures.registry import all_figures
 from vinetrack.figures.style import RULE_NAMES, TOKENS, page_tokens, rows
@@ -407,34 +406,33 @@ def table_one(by_row: Mapping[str, Any]) -> ReportTable:
 
 def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[ReportTable]:
     """Return Table II of the paper, positions and speeds, with ours and the effects of departures from Eq. (2)."""
-    about_positions = (
+    causes = {
+        "chamber not refilled": ("depletion_slow", "depletion_fast"),
+        "tail that cannot push": ("slack",),
+        "both": ("depletion_slow_slack", "depletion_fast_slack"),
+    }
+    head = ("pressure, kPa", "printed", "here", *causes)
+    positions = (
         "Here: mean of the trials minus Eq. (2) with the printed numbers. The last three columns: the error that a "
         "departure from Eq. (2) would cause, simulated for a vine of 280 mm."
     )
-    about_speeds = "At 12 cm, over payloads; B of this vine is not printed and is scaled in proportion to the wall."
-    positions = ("position_rms", published.POSITION_RMS_CM, about_positions)
-    speeds = ("final_speed_rms", published.FINAL_SPEED_RMS_M_S, about_speeds)
-    head = ("pressure, kPa", "printed", "here", *CAUSES)
+    speeds = "At 12 cm, over payloads; B of this vine is not printed and is scaled in proportion to the wall."
+    cm, m_s = published.POSITION_RMS_CM, published.FINAL_SPEED_RMS_M_S
     made = []
-    for title, figure, column, factor, (row, printed, note) in (
-        ("rms of position, cm", "Fig. 4", "rms_position_m", 100, positions),
-        ("rms of final speed, m/s", "Fig. 5", "rms_final_lead_velocity_m_s", 1, speeds),
+    for title, figure, row, column, factor, printed, note in (
+        ("position, cm", "Fig. 4", "position_rms", "rms_position_m", 100, cm, positions),
+        ("final speed, m/s", "Fig. 5", "final_speed_rms", "rms_final_lead_velocity_m_s", 1, m_s, speeds),
     ):
         body = []
         for kPa, error in printed.items():
             of_figure = departures[(departures["figure"] == figure) & np.isclose(departures["pressure_kPa"], kPa)]
-            caused = [
-                _range((factor * of_figure.loc[of_figure["departure"].isin(names), column]).tolist())
-                for names in CAUSES.values()
-            ]
-            body.append((f"{kPa:g}", f"{error:g}", number(_value(by_row.get(f"{row}_{kPa:g}kPa"))), *caused))
-        made.append(ReportTable(f"Table II, {title}", head, body, frozenset(range(len(head))), note))
+            cells = [f"{kPa:g}", f"{error:g}", number(_value(by_row.get(f"{row}_{kPa:g}kPa")))]
+            for names in causes.values():
+                sizes = sorted(factor * of_figure.loc[of_figure["departure"].isin(names), column])
+                cells.append(" to ".join(dict.fromkeys(map(number, sizes))) or "–")  # the same size once
+            body.append(tuple(cells))
+        made.append(ReportTable(f"Table II, rms of {title}", head, body, frozenset(range(len(head))), note))
     return made
-
-
-def _range(sizes: Sequence[float]) -> str:
-    """One size, or two as a range, the smaller first; – for none."""
-    return " to ".join(dict.fromkeys(map(number, sorted(sizes)))) or "–"
 
 
 def every_row(table: pd.DataFrame) -> list[ReportTable]:
