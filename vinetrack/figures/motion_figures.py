@@ -19,101 +19,62 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# ------------------------------------------------------------------------------
-# All trials: speed against growth in small panels, replicates superposed, steady windows thick.
-#
-# The abscissa is growth rather than time, because trials last between milliseconds and seconds but grow equally far.
-# With few conditions every condition has a panel with its own speed axis, since steady speed rises about as P^2.7; with
-# more, every vine has one on a shared logarithmic axis, with trials coloured by pressure.
+_MOST_PANELS = 60  # Chosen: in rows of eight they are 1.4 in wide, the narrowest that has room for its label
+
+
+def _small_panels(labels: Sequence[str], x_label: str, y_label: str, title: str) -> tuple[Figure, list[Axes], float]:
+    """A page of small panels, about 1.3 times as high as wide, each with its label; the panels and their font size."""
+    n = len(labels)
+    n_columns = min(math.ceil(math.sqrt(1.3 * n)), 8) if n > 3 else n
+    font = 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
+    panel_in = min(11.0 / n_columns, 6.0)
+    row_in = min(max(0.78 * panel_in, 1.35), 3.6)
+    fig = st.new_figure(n_columns * panel_in, math.ceil(n / n_columns) * row_in + 0.95)
+    panels = st.panel_grid(fig, n, n_columns)
+    for ax, label in zip(panels, labels, strict=True):
+        st.small_title(ax, label, fontsize=st.fitting_size(label, 72 * (panel_in - 0.45), font, bold=False), pad=3)
+        ax.tick_params(labelsize=font - 0.5)
+        ax.locator_params(nbins=4)
+    fig.supxlabel(x_label, fontsize=11)
+    fig.supylabel(y_label, fontsize=11)
+    fig.suptitle(textwrap.fill(title, int(n_columns * panel_in * 11)), fontsize=11, x=0.01, ha="left")
+    return fig, panels, font
+
+
+def _points_each(n_trials: int) -> int:
+    """Points of each curve: 12,000 in all keep the SVG below a megabyte."""
+    return min(max(12_000 // n_trials, 25), 150)
 
 
 @figure("overview", "damping", "All trials at a glance", data="trials.csv")
 def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure | None:
-    """Speed of the leading edge against growth, replicates superposed. Thick: the steady window of the gated rule."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    max_panels = 120  # Chosen: twelve rows of ten panels; further vines are left out, and the title says so
-    shown = trials[trials["status"] != "left_out"]
-    tables = {name: kinematics[name] for name in shown["trial"] if len(kinematics.get(name, ())) > 1}
-    if not tables:
+    """Speed of the leading edge against growth, one panel per condition in the order of the sheet, each with its own
+    speed axis; replicates are superposed. Thick: the steady window of the gated rule. The fastest per cent of points
+    may lie outside a panel.
+    """
+    drawn = trials[[len(kinematics.get(name, ())) > 1 for name in trials["trial"]]]
+    if drawn.empty:
         return None
-    n_points = min(max(12_000 // len(tables), 15), 150)  # 12,000 points in all keep the SVG below a megabyte
-    curves = {}
-    for name, table in tables.items():
-        part = st.thinned(table, n_points)
-        curves[name] = part.assign(growth_mm=1e3 * (part["lead_position_m"] - part["lead_position_m"].min()))
-    # 60 (chosen): in rows of nine they are 1.2 in wide, the narrowest that has room for its label
-    by_condition = shown["condition"].nunique() <= 60
-    if by_condition:
-        order = {name: i for i, name in enumerate(dict.fromkeys(shown["vine"]))}
-        ordered = shown.assign(order=shown["vine"].map(order)).sort_values(["order", "pressure_kPa"], kind="stable")
-        groups = ordered.groupby("condition", sort=False)
-        panels = [(str(part["condition_label"].iloc[0]), part) for _, part in groups]
-    else:
-        panels = [(str(vine), part) for vine, part in shown.groupby("vine", sort=False)][:max_panels]
-    n_columns = st.page_columns(len(panels), 10)
-    font = st.panel_font(n_columns)
-    row_in = min(max(0.72 * 11.0 / n_columns, 1.15), 3.6)
-    fig = st.new_figure(11.0, math.ceil(len(panels) / n_columns) * row_in + 1.15)
-    axes = st.panel_grid(fig, len(panels), n_columns, sharex=True, sharey=not by_condition)
-    colours: dict[str, Any] = {}
-    if by_condition:
-        styles = st.vine_styles(shown["vine"])
-        colours = {row.trial: styles[row.vine].colour for row in st.rows(shown)}
-    else:
-        scale = ScalarMappable(Normalize(shown["pressure_kPa"].min(), shown["pressure_kPa"].max()), "cividis")
-        bar = fig.colorbar(scale, ax=fig.axes, fraction=0.02, pad=0.01, aspect=40)
-        bar.set_label("pressure (kPa)")
-        bar.outline.set_visible(False)
-        colours = {row.trial: scale.to_rgba(row.pressure_kPa) for row in st.rows(shown)}
-    for ax, (label, part) in zip(axes, panels, strict=True):
-        drawn = part[part["trial"].isin(curves)]
-        for row in st.rows(drawn):
-            curve, colour = curves[row.trial], colours[row.trial]
-            ax.plot(curve["growth_mm"], curve["lead_velocity_m_s"], color=colour, lw=0.8, alpha=0.5)
-            steady = curve[curve["time_s"].between(row.steady_from_s, row.steady_to_s)]
-            if len(steady) > 1:
-                at = steady["growth_mm"], steady["lead_velocity_m_s"]
-                ax.plot(*at, color=colour, lw=2.2, solid_capstyle="butt")
-        words = textwrap.shorten(label, 30, placeholder="…") if font > 8 else label
-        st.small_title(ax, words, fontsize=font, pad=3)
+    conditions = list(drawn.groupby("condition", sort=False))
+    shown = conditions[:_MOST_PANELS]
+    styles, n_points = st.vine_styles(trials["vine"]), _points_each(len(drawn))
+    title = f"{len(drawn)} of {len(trials)} trials; thick: steady by the gated rule"
+    title += f"; the first {len(shown)} of {len(conditions)} conditions" if len(conditions) > len(shown) else ""
+    labels = [str(part["condition_label"].iloc[0]) for _, part in shown]
+    fig, panels, font = _small_panels(labels, "growth (mm)", "leading-edge speed (m/s)", title)
+    for ax, (_, part) in zip(panels, shown, strict=True):
+        fastest_m_s = 0.0
+        for row in st.rows(part):
+            curve, colour = st.thinned(kinematics[row.trial], n_points), styles[row.vine].colour
+            grown_mm, speed_m_s = st.column(curve, "lead_position_m", 1e3), st.column(curve, "lead_velocity_m_s")
+            grown_mm = grown_mm - grown_mm.min()
+            steady = curve["time_s"].between(row.steady_from_s, row.steady_to_s).to_numpy()
+            ax.plot(grown_mm, speed_m_s, color=colour, lw=0.8, alpha=0.5)
+            ax.plot(grown_mm[steady], speed_m_s[steady], color=colour, lw=2.2, solid_capstyle="butt")
+            fastest_m_s = max(fastest_m_s, float(np.percentile(speed_m_s, 99)))
+        ax.set(xlim=(0, None), ylim=(0, 1.15 * fastest_m_s or None))
         st.corner_text(ax, 0.98, 0.05, f"N = {len(part)}", ha="right", fontsize=font - 1)
-        if n_failed := int((part["status"] == "failed").sum()):
-            st.corner_text(ax, 0.98, 0.2, f"{n_failed} failed", ha="right", fontsize=font - 1, color=st.VERMILLION)
-        st.small_ticks(ax, font - 0.5)
-        if by_condition:
-            _limit_speed(ax, [curves[name] for name in drawn["trial"]])
-    for ax in axes[-n_columns:]:
-        ax.tick_params(labelbottom=True)
-    axes[0].set_xlim(0, 1.02 * max(float(curve["growth_mm"].max()) for curve in curves.values()))
-    if not by_condition:
-        _limit_speed(axes[0], list(curves.values()), logarithmic=True)
-    what = "one panel per condition, each with its own speed axis" if by_condition else "one panel per vine"
-    missing = len(shown) - len(curves)
-    title = f"{len(curves)} {'trial' if len(curves) == 1 else 'trials'}, {what}; thick: steady by the gated rule"
-    title += f"; {missing} without positions" if missing else ""
-    title += f"; the first {max_panels} panels" if len(panels) == max_panels else ""
-    st.page_labels(fig, "growth (mm)", "leading-edge speed (m/s)", title)
     return fig
-
-
-def _limit_speed(ax: Axes, curves: Sequence[pd.DataFrame], logarithmic: bool = False) -> None:
-    """Set limits that are robust to outliers: the fastest per cent of points may lie outside the panel."""
-    if not curves:
-        ax.set_yticks([])
-        return
-    speeds_m_s = [st.column(curve, "lead_velocity_m_s") for curve in curves]
-    speed_m_s = np.concatenate(speeds_m_s)
-    moving_m_s = speed_m_s[speed_m_s > 0]
-    top = float(np.percentile(moving_m_s, 99)) if moving_m_s.size else 1.0
-    if logarithmic and moving_m_s.size:
-        medians = [float(np.nanmedian(of_curve)) for of_curve in speeds_m_s]
-        ax.set_yscale("log")
-        ax.set_ylim(0.5 * min(median for median in medians if median > 0), 1.5 * top)
-        st.plain_log_ticks(ax, "y")
-    else:
-        ax.set_ylim(0, 1.15 * top)
 
 
 # ------------------------------------------------------------------------------
@@ -135,68 +96,60 @@ def draw_trial_motion(
     counts += f", {unusable.sum()} left out (×)" if unusable.any() else ""
     counts += f", {by_hand.sum()} corrected by hand (○)" if by_hand.any() else ""
     notes = [(st.MUTED, counts), *(line for row in st.rows(windows) for line in _verdict(row))]
-    line_in = 0.175  # of 8.8 pt
-    text_in, strip_in = line_in * len(notes) + 0.1, 0.24 * max(len(windows), 1)
-    height_in = 1.75 + 2.1 + strip_in + text_in + 1.2
-    fig = st.new_figure(7.2, height_in, layout=None)
-    lead, speed, strip = fig.subplots(3, 1, sharex=True, height_ratios=(1.75, 2.1, strip_in))
-    tall_in = 1.75 + 2.1 + strip_in  # and twice 0.12 in between the panels
-    bottom, top = (text_in + 0.58) / height_in, (text_in + 0.82 + tall_in) / height_in
-    fig.subplots_adjust(left=0.125, right=0.89, bottom=bottom, top=top, hspace=0.36 / tall_in)
-    for ax in (lead, speed):
-        ax.yaxis.set_label_coords(-0.095, 0.5)
-    _draw_position(lead, track, kinematics, unusable, by_hand)
-    lead.set_title(title, pad=8, fontsize=st.fitting_size(title, 0.8 * 72 * 7.2, 11))
-    _draw_speed(speed, kinematics, windows, travel_ratio)
-    _draw_strip(strip, windows)
-    # Ticks of the strip in the panels above; tick by tick, matplotlib would take a tenth of the figure.
-    low, high = strip.get_xlim()
-    ticks = [tick for tick in strip.get_xticks() if low <= tick <= high]
-    strip.set_xlim(low, high)
-    for ax in (lead, speed):
-        ax.xaxis.set_visible(False)
-        across = ax.get_xaxis_transform()
-        ax.vlines(ticks, 0, 1, color=st.GRID, lw=0.7, zorder=0.5, transform=across)
-        style: dict[str, Any] = {"marker": 3, "ms": 3.5, "mew": 0.8, "color": st.INK, "clip_on": False}
-        ax.plot(ticks, [0] * len(ticks), ls="none", transform=across, **style)
+    line_in, strip_in = 0.175, 0.24 * max(len(windows), 1)  # a line of 8.8 pt
+    strip_from = line_in * len(notes) + 0.68
+    speed_from = strip_from + strip_in + 0.12
+    lead_from = speed_from + 2.1 + 0.12
+    fig, sheet = st.new_sheet(7.2, lead_from + 1.75 + 0.38)
+    time_s, position_mm = st.column(track, "time_s"), st.column(track, "lead_position_m", 1e3)
+    known = np.isfinite(position_mm)
+    speed_m_s, two_sigma_m_s = (
+        st.column(kinematics, name, factor)
+        for name, factor in (("lead_velocity_m_s", 1.0), ("lead_velocity_sigma_m_s", 2.0))
+    )
+    over = _with_margin(time_s[known])
+    lead = st.Panel(sheet, (0.9, lead_from, 5.5, 1.75), over, _with_margin(position_mm[known]))
+    speed = st.Panel(sheet, (0.9, speed_from, 5.5, 2.1), over, _speed_limits(speed_m_s, two_sigma_m_s))
+    strip = st.Panel(sheet, (0.9, strip_from, 5.5, strip_in), over, (len(windows) - 0.4, -0.6))
+
+    step = max(len(track) // 300, 1)
+    lead.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=st.MUTED, ms=3.5, mew=0)
+    lead.plot(time_s[unusable], position_mm[unusable], "x", color=st.VERMILLION, ms=4, mew=1)
+    lead.plot(time_s[by_hand], position_mm[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", mew=1)
+    moving_s = st.column(kinematics, "time_s")
+    lead.plot(moving_s, st.column(kinematics, "lead_position_m", 1e3), color=st.INK, lw=1.1)
+    speed.fill(moving_s, speed_m_s - two_sigma_m_s, speed_m_s + two_sigma_m_s, color=st.MUTED, alpha=0.28, lw=0)
+    speed.plot(moving_s, speed_m_s, color=st.INK, lw=1.3)
+    for i, row in enumerate(st.rows(windows)):
+        colour, ends_s = st.RULE_COLOURS[row.rule], [row.from_s, row.to_s]
+        if np.isfinite(row.x_ss_m_s):
+            dashes: Any = "-" if row.accepted else (0, (1.5, 1.2))
+            speed.plot(ends_s, [row.x_ss_m_s / travel_ratio] * 2, color=colour, lw=3.2, alpha=0.9, ls=dashes)
+        if np.isfinite(ends_s).all():
+            fill = colour if row.accepted else "none"
+            strip.fill(ends_s, i - 0.28, i + 0.28, facecolor=fill, edgecolor=colour, lw=1.3)
+        else:
+            strip.plot(over, [i, i], color=st.GRID, lw=1, ls=":")
+        name = "by hand" if row.rule == "user" else row.rule
+        strip.write(over[0], i, name, (-3.5, 0), ha="right", va="center", fontsize=9)
+
+    lead.scale("left", "leading edge (mm)")
+    speed.scale("left", "leading edge (m/s)")
+    if travel_ratio != 1:
+        speed.scale("right", "tail (m/s)", travel_ratio)
+    for panel in (lead, speed):
+        panel.scale("bottom", numbered=False)
+    strip.scale("bottom", "time (s)")
+    lead.write(over[0], lead.y[1], title, (0, 8), fontweight="bold", fontsize=st.fitting_size(title, 415, 11))
     for i, (colour, line) in enumerate(notes):
-        fig.text(0.012, (text_in - 0.05 - i * line_in) / height_in, line, color=colour, fontsize=8.8, va="top")
+        sheet.text(0.09, line_in * (len(notes) - i) + 0.05, line, color=colour, fontsize=8.8, va="top")
     return fig
 
 
-def _draw_position(
-    ax: Axes, track: pd.DataFrame, kinematics: pd.DataFrame, unusable: np.ndarray, by_hand: np.ndarray
-) -> None:
-    time_s, position_mm = st.column(track, "time_s"), st.column(track, "lead_position_m", 1e3)
-    step = max(len(track) // 300, 1)
-    ax.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=st.MUTED, ms=3.5, mew=0)
-    if (unusable & np.isfinite(position_mm)).any():
-        ax.plot(time_s[unusable], position_mm[unusable], "x", color=st.VERMILLION, ms=4, mew=1)
-    if by_hand.any():
-        ax.plot(time_s[by_hand], position_mm[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", mew=1)
-    ax.plot(kinematics["time_s"], 1e3 * kinematics["lead_position_m"], "-", color=st.INK, lw=1.1)
-    ax.set_ylabel("leading edge (mm)")
-
-
-def _draw_speed(ax: Axes, kinematics: pd.DataFrame, windows: pd.DataFrame, travel_ratio: float) -> None:
-    time_s, speed_m_s = st.column(kinematics, "time_s"), st.column(kinematics, "lead_velocity_m_s")
-    two_sigma_m_s = st.column(kinematics, "lead_velocity_sigma_m_s", 2.0)
-    st.band(ax, time_s, speed_m_s - two_sigma_m_s, speed_m_s + two_sigma_m_s, st.MUTED, 0.28)
-    ax.plot(time_s, speed_m_s, color=st.INK, lw=1.3)
-    for row in st.rows(windows):
-        if np.isfinite(row.x_ss_m_s):
-            level = row.x_ss_m_s / travel_ratio
-            style: dict[str, Any] = {"color": st.RULE_COLOURS[row.rule], "ls": "-" if row.accepted else (0, (1.5, 1.2))}
-            ax.plot([row.from_s, row.to_s], [level, level], lw=3.2, alpha=0.9, **style)
-    ax.set_ylim(*_speed_limits(speed_m_s, two_sigma_m_s))
-    ax.set_ylabel("leading edge (m/s)")
-    if travel_ratio != 1:
-        right = ax.twinx()
-        right.set(ylabel="tail (m/s)", ylim=[travel_ratio * limit for limit in ax.get_ylim()])
-        right.grid(visible=False)
-        right.yaxis.set_label_coords(1.07, 0.5)
-        right.spines[["left", "bottom"]].set_visible(False)
-        right.spines["right"].set_visible(True)
+def _with_margin(values: np.ndarray) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    margin = 0.05 * (high - low) or 1.0
+    return low - margin, high + margin
 
 
 def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[float, float]:
@@ -210,19 +163,6 @@ def _speed_limits(speed_m_s: np.ndarray, half_band_m_s: np.ndarray) -> tuple[flo
     band_high = float(np.nanmax(speed_m_s + half_band_m_s, initial=high))
     low, high = max(band_low, low - 0.5 * span), min(band_high, high + 0.5 * span)
     return low - 0.04 * span * (low < 0), high + 0.06 * span
-
-
-def _draw_strip(ax: Axes, windows: pd.DataFrame) -> None:
-    ax.set_xlabel("time (s)")
-    ax.set_ylim(len(windows) - 0.4, -0.6)
-    st.names_on_axis(ax, "y", ["by hand" if rule == "user" else rule for rule in windows["rule"]], fontsize=9)
-    for i, row in enumerate(st.rows(windows)):
-        colour = st.RULE_COLOURS[row.rule]
-        if np.isfinite(row.from_s) and np.isfinite(row.to_s):
-            fill = colour if row.accepted else "none"
-            ax.barh(i, row.to_s - row.from_s, left=row.from_s, height=0.56, color=fill, edgecolor=colour, lw=1.3)
-        else:
-            ax.axhline(i, color=st.GRID, lw=1, ls=":")
 
 
 def _verdict(row: Any) -> list[tuple[str, str]]:
@@ -250,9 +190,8 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
     mean square of model minus measurement, and in brackets its ratio to the replicate scatter.
     """
     corner = (0.03, 0.97, "left", "top")  # which the curve of growth leaves empty
-    added = "; dashed: this model, full: with the effects that were added"
     labels = "time since release (ms)", "growth (mm)"
-    return _model_panels(comparison, trajectories, _draw_positions, corner, *labels, added)
+    return _model_panels(comparison, trajectories, _draw_positions, corner, *labels)
 
 
 @figure("model_residuals", "model", "Residuals of the model", data="comparison.csv", if_refuted=SHOWS_REFUTED)
@@ -263,40 +202,31 @@ def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd
     """
     corner = (0.98, 0.03, "right", "bottom")  # where residuals get extra room
     labels = "growth (mm)", "measurement − model (mm)"
-    return _model_panels(comparison, trajectories, _draw_residuals, corner, *labels, "")
+    return _model_panels(comparison, trajectories, _draw_residuals, corner, *labels)
 
 
 def _model_panels(
     comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame],
     draw: Callable[[Axes, list[pd.DataFrame], str], None], corner: tuple[float, float, str, str], x_label: str,
-    y_label: str, if_added: str,
+    y_label: str,
 ) -> Figure | None:  # fmt: skip
-    known = [row for row in st.rows(comparison) if row.condition in trajectories]
-    farthest = sorted(known, key=lambda row: -np.nan_to_num(row.rms_position_m))[:60]  # in rows of eight, 1.4 in wide
-    shown = [row for row in known if row in farthest]
+    known = comparison[comparison["condition"].isin(list(trajectories))]
+    farthest = known["rms_position_m"].fillna(0.0).sort_values(ascending=False, kind="stable").index[:_MOST_PANELS]
+    shown = list(st.rows(known[known.index.isin(farthest)]))
     if not shown:
         return None
-    n_columns = st.page_columns(len(shown), 8)
     n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
-    n_points = min(max(12_000 // n_trials, 25), 150)
-    styles = st.vine_styles([row.vine for row in shown])
-    font, panel_in, (x, y, ha, va) = st.panel_font(n_columns), min(11.0 / n_columns, 6.0), corner
-    row_in = min(max(0.78 * panel_in, 1.35), 3.6)
-    fig = st.new_figure(n_columns * panel_in, math.ceil(len(shown) / n_columns) * row_in + 0.95)
-    for ax, row in zip(st.panel_grid(fig, len(shown), n_columns), shown, strict=True):
-        parts = _moving(trajectories[row.condition], n_points)
+    styles, (x, y, ha, va) = st.vine_styles([row.vine for row in shown]), corner
+    title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
+    if len(known) > len(shown):
+        title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
+    fig, panels, font = _small_panels([str(row.condition_label) for row in shown], x_label, y_label, title)
+    for ax, row in zip(panels, shown, strict=True):
+        parts = _moving(trajectories[row.condition], _points_each(n_trials))
         draw(ax, parts, styles[row.vine].colour)
-        label = str(row.condition_label)
-        st.small_title(ax, label, fontsize=st.fitting_size(label, 72 * (panel_in - 0.45), font, bold=False), pad=3)
         times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
         words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {len(parts)}"
         st.corner_text(ax, x, y, words, ha=ha, va=va, fontsize=font - 1.5)
-        st.small_ticks(ax, font - 0.5)
-    title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
-    title += if_added if "model_after_m" in trajectories[shown[0].condition] else ""
-    if len(known) > len(shown):
-        title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
-    st.page_labels(fig, x_label, y_label, textwrap.fill(title, int(n_columns * panel_in * 11)))
     return fig
 
 

@@ -35,59 +35,53 @@ if TYPE_CHECKING:
 @st.look()
 def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     """Draw the strip of one tracked recording."""
-    n = len(tracking.pictures)
-    wide_in = 7.2 / n - 0.08
-    tall_in = min(max(picture.shape[0] / picture.shape[1] for _, picture in tracking.pictures), 2.2) * wide_in
+    pictures = tracking.pictures
+    wide_in = 7.2 / len(pictures) - 0.08
+    tall_in = min(max(picture.shape[0] / picture.shape[1] for _, picture in pictures), 2.2) * wide_in
     scaled = np.isfinite(m_per_px)
     below_in = tall_in + (1.35 if scaled else 0.8)
-    height_in = below_in + 2.95
-    fig = st.new_figure(7.2, height_in, layout=None)
-
-    def panel(left_in: float, bottom_in: float, width_in: float, tall_in: float) -> Axes:
-        return fig.add_axes((left_in / 7.2, bottom_in / height_in, width_in / 7.2, tall_in / height_in))
-
-    ax = panel(0.75, below_in, 6.38, 2.6)
-    ax.xaxis.set_label_coords(0.5, -0.115)
-    ax.yaxis.set_label_coords(-0.085, 0.5)
-    _draw_kymograph(ax, tracking)
+    fig, sheet = st.new_sheet(7.2, below_in + 2.95)
+    panel = _draw_kymograph(sheet, tracking, below_in)
     if scaled:
-        scale = panel(0.75, below_in - 0.54, 6.38, 0.0)
-        scale.set(xlabel="along the growth axis (mm)", xlim=[1e3 * m_per_px * px for px in ax.get_xlim()], yticks=[])
-        scale.spines["left"].set_visible(False)
-    st.legend_above(ax, 2)
-    st.small_title(ax, title, loc="right", fontsize=10, color=st.MUTED)
-    for i, (frame, picture) in enumerate(tracking.pictures):
-        _draw_frame(panel(0.04 + 7.2 * i / n, 0.05, wide_in, tall_in), tracking, frame, picture)
+        panel.scale("bottom", "along the growth axis (mm)", 1e3 * m_per_px, grid=False, off_in=0.54)
+    panel.write(panel.x[1], panel.y[1], title, (0, 6), ha="right", fontsize=10, color=st.MUTED)
+    for i, (frame, picture) in enumerate(pictures):
+        height, width = picture.shape
+        px_in = min(wide_in / width, tall_in / height)
+        size_in = width * px_in, height * px_in
+        corner_in = 0.04 + 7.2 * i / len(pictures) + (wide_in - size_in[0]) / 2, 0.05 + (tall_in - size_in[1]) / 2
+        shown = st.Panel(sheet, (*corner_in, *size_in), (-0.5, width - 0.5), (height - 0.5, -0.5))
+        _draw_frame(shown, tracking, frame, picture)
     return fig
 
 
-def _draw_kymograph(ax: Axes, tracking: Tracking) -> None:
+def _draw_kymograph(sheet: Axes, tracking: Tracking, below_in: float) -> st.Panel:
     track, strip = tracking.track, tracking.kymograph
-    small = shrunk(strip, 480)
     timed = np.isfinite(track.time_s).all()
     time_ms = 1e3 * track.time_s if timed else np.arange(float(track.time_s.size))  # frames, where they have no time
-    dark, light = np.nanpercentile(small, [1, 99])
     half_ms = 0.5 * float(np.median(np.diff(time_ms)))
     shown_ms = time_ms[tracking.strip_rows]
-    extent = (-0.5, strip.shape[1] - 0.5, float(shown_ms[-1]) + half_ms, float(shown_ms[0]) - half_ms)
-    ax.imshow(small, aspect="auto", extent=extent, cmap="gray", vmin=dark, vmax=light, interpolation="none")
+    ends_ms = float(shown_ms[-1]) + half_ms, float(shown_ms[0]) - half_ms
+    panel = st.Panel(sheet, (0.75, below_in, 6.38, 2.6), (-0.5, strip.shape[1] - 0.5), ends_ms)
+    small = _shrunk(strip, 480)
+    dark, light = np.nanpercentile(small, [1, 99])
+    panel.picture(small, vmin=dark, vmax=light)
     edge, by_hand = track.edge_px, hand_corrected(track.flag)
     odd = with_flag(track.flag, *set(FLAGS) - {"before_release"}) & ~by_hand
     fine = ~odd & ~by_hand & np.isfinite(edge)
-    ax.plot(edge[fine], time_ms[fine], color=st.ORANGE, lw=1.0, label=f"leading edge, N = {fine.sum()}")
-    if odd.any():
-        at = edge[odd & np.isfinite(edge)], time_ms[odd & np.isfinite(edge)]
-        ax.plot(*at, "x", color=st.SKY, ms=4, mew=1.1, label=f"flagged, N = {odd.sum()}")
-    if by_hand.any():
-        before = edge if track.tracked_px is None else track.tracked_px
-        ax.plot(before[by_hand], time_ms[by_hand], "+", color=st.SKY, ms=5, mew=1.0)
-        label = f"corrected by hand, N = {by_hand.sum()}"
-        ax.plot(edge[by_hand], time_ms[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", label=label)
-    ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)" if timed else "frame")
-    ax.grid(visible=False)
+    panel.plot(edge[fine], time_ms[fine], color=st.ORANGE, lw=1.0, label=f"leading edge, N = {fine.sum()}")
+    panel.plot(edge[odd], time_ms[odd], "x", color=st.SKY, ms=4, mew=1.1, label=f"flagged, N = {odd.sum()}")
+    before = edge if track.tracked_px is None else track.tracked_px
+    panel.plot(before[by_hand], time_ms[by_hand], "+", color=st.SKY, ms=5, mew=1.0)
+    label = f"corrected by hand, N = {by_hand.sum()}"
+    panel.plot(edge[by_hand], time_ms[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", label=label)
+    panel.scale("left", "time (ms)" if timed else "frame", grid=False)
+    panel.scale("bottom", "along the growth axis (px)", grid=False)
+    st.legend_above(sheet, 2, bbox_to_anchor=(0.75, below_in + 2.63), bbox_transform=sheet.transData)
+    return panel
 
 
-def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
+def _shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
     """Return a picture averaged to at most `largest_px` pixels per side. Shape (height, width)."""
     import cv2
 
@@ -95,26 +89,19 @@ def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
-    height, width = picture.shape
-    whole = (-0.5, width - 0.5, height - 0.5, -0.5)
-    ax.imshow(shrunk(picture, 320), cmap="gray", extent=whole, interpolation="none")
-    ax.set(xticks=[], yticks=[])
-    ax.grid(visible=False)
-    if tracking.axis.bends:
-        path = tracking.axis.points(np.arange(0.0, tracking.axis.length_px, 3.0))
-        ax.plot(path[:, 0], path[:, 1], color=st.SKY, linewidth=0.8, linestyle=":")
-    track = tracking.track
+def _draw_frame(panel: st.Panel, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
+    panel.picture(_shrunk(picture, 320))
+    track, axis = tracking.track, tracking.axis
+    if axis.bends:
+        panel.plot(*axis.points(np.arange(0.0, axis.length_px, 3.0)).T, color=st.SKY, lw=0.8, ls=":")
     edge = float(track.edge_px[frame]) if frame < track.edge_px.size else np.nan
     if np.isfinite(edge):
-        half = 0.75 * tracking.axis.width_px
-        half = half if np.isfinite(half) else 0.25 * min(height, width)
-        ends = np.array([tracking.axis.points(np.array(edge), across) for across in (-half, half)])
+        half = 0.75 * axis.width_px if np.isfinite(axis.width_px) else 0.25 * min(picture.shape)
+        ends = np.array([axis.points(np.array(edge), across) for across in (-half, half)])
         unusable = bool(UNUSABLE_FLAGS.intersection(str(track.flag[frame]).split(";")))
-        ax.plot(ends[:, 0], ends[:, 1], color=st.SKY if unusable else st.VERMILLION, linewidth=1.8)
-    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        panel.plot(*ends.T, color=st.SKY if unusable else st.VERMILLION, lw=1.8)
     at = f", {1e3 * track.time_s[frame]:.1f} ms" if np.isfinite(track.time_s[frame]) else ""
-    st.small_title(ax, f"frame {frame}{at}", color=st.INK)
+    panel.write(-0.5, -0.5, f"frame {frame}{at}", (0, 6), fontsize=9)
 
 
 # ------------------------------------------------------------------------------

@@ -179,7 +179,102 @@ def follows_screen(colour: str) -> str:
 
 
 # ------------------------------------------------------------------------------
-# Panels, axes and legends common to all figures.
+# Panels of the figures that every trial has. Axes of matplotlib have some two hundred parts, and take half the time of
+# such a figure. Here one pair without a frame covers the figure, in inches, and panels with few parts lie on it.
+
+
+def new_sheet(width_in: float, height_in: float) -> tuple[Figure, Axes]:
+    """Return an empty figure and its only axes, in inches and without a frame."""
+    fig = new_figure(width_in, height_in, layout=None)
+    ax = fig.add_axes((0, 0, 1, 1))
+    ax.set(xlim=(0, width_in), ylim=(0, height_in))
+    ax.set_axis_off()
+    return fig, ax
+
+
+class Panel:
+    """A rectangle of a sheet with coordinates of its own. `box` is left, bottom, width and height, in; `x` and `y` are
+    the values at its left and right, and at its bottom and top.
+    """
+
+    def __init__(self, sheet: Axes, box: Sequence[float], x: Sequence[float], y: Sequence[float]) -> None:
+        from matplotlib.transforms import Bbox, BboxTransformFrom, BboxTransformTo, TransformedBbox
+
+        self.sheet, self.x, self.y, self.box = sheet, x, y, Bbox.from_bounds(*box)
+        self.inches = BboxTransformFrom(Bbox(np.transpose([x, y]))) + BboxTransformTo(self.box)
+        self.data, self.clip = self.inches + sheet.transData, TransformedBbox(self.box, sheet.transData)
+
+    def plot(self, x: ArrayLike, y: ArrayLike, *form: str, **style: Any) -> None:
+        """Draw a line or points; nothing without points."""
+        if np.size(x):
+            self.sheet.plot(x, y, *form, transform=self.data, **style)[0].set_clip_box(self.clip)
+
+    def fill(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, **style: Any) -> None:
+        """Fill between two curves."""
+        self.sheet.fill_between(x, low, high, transform=self.data, **style).set_clip_box(self.clip)
+
+    def write(self, x: float, y: float, words: str, off_pt: tuple[float, float], **style: Any) -> None:
+        """Write words at a distance from a place."""
+        left, bottom = self.inches.transform((x, y)) + np.divide(off_pt, 72)
+        self.sheet.text(left, bottom, words, **style)
+
+    def picture(self, grey: np.ndarray, **style: Any) -> None:
+        """Fill the panel with a picture. Shape (height, width)."""
+        left, bottom, right, top = self.box.extents
+        style |= {"cmap": "gray", "interpolation": "none", "aspect": "auto"}
+        self.sheet.imshow(grey, extent=(left, right, bottom, top), **style)
+
+    def scale(
+        self, side: str, label: str = "", factor: float = 1.0, *, grid: bool = True, numbered: bool = True,
+        off_in: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Draw the scale of the left, right or bottom, in its values times a factor, at a distance from the panel."""
+        from matplotlib.collections import LineCollection
+        from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+        left, bottom, right, _ = self.box.extents
+        below = side == "bottom"
+        upright: dict[str, Any] = {"va": "center", "rotation": 90}
+        # From where the scale goes in which direction, what is outside, and how far outside its label is
+        start_in, along, out, label_in, place = {
+            "left": ((left, bottom), (0, 1), (-1, 0), 0.52, {"ha": "right", **upright}),
+            "right": ((right, bottom), (0, 1), (1, 0), 0.39, {"ha": "left", **upright}),
+            "bottom": ((left, bottom - off_in), (1, 0), (0, -1), 0.28, {"ha": "center", "va": "top"}),
+        }[side]
+        length_in, depth_in = (abs(np.dot(way, self.box.size)) for way in (along, out))
+        start, end = factor * np.array(self.x if below else self.y)
+        low, high = sorted((start, end))
+        most = min(int(length_in * 72 / (30 if below else 20)), 9)  # as many numbers as on matplotlib's axes
+        values = np.array(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
+        values = values[(values >= low) & (values <= high)]
+
+        def at(values: ArrayLike, outside_in: float) -> np.ndarray:
+            """Places in the sheet, in. Shape (n_values, 2)."""
+            share = (np.atleast_1d(values) - start) / (end - start)
+            return start_in + np.outer(share * length_in, along) + outside_in * np.array(out)
+
+        def lines(ends: Sequence[np.ndarray], colour: str, width_pt: float, order: float) -> None:
+            drawn = LineCollection(list(np.stack(ends, axis=1)), colors=colour, linewidths=width_pt, zorder=order)
+            self.sheet.add_collection(drawn, autolim=False)
+
+        if grid:
+            lines((at(values, 0.0), at(values, -depth_in)), GRID, 0.7, 0.5)
+        lines((at(values, 0.0), at(values, 0.05)), INK, 0.8, 2.5)
+        lines((at(start, 0.0), at(end, 0.0)), INK, 0.8, 2.5)
+        if not numbered:
+            return
+        formatter = ScalarFormatter()
+        formatter.create_dummy_axis()
+        assert formatter.axis is not None
+        formatter.axis.set_view_interval(low, high)
+        for (x, y), number in zip(at(values, 0.1), formatter.format_ticks(values), strict=True):
+            self.sheet.text(x, y, number, None, fontsize=10, **place | {"rotation": 0})
+        x, y = at((start + end) / 2, label_in)[0]
+        self.sheet.text(x, y, f"{label} {formatter.get_offset()}".strip(), None, **place)
+
+
+# ------------------------------------------------------------------------------
+# Axes and legends common to all figures.
 
 
 def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list[Axes]:
@@ -190,32 +285,9 @@ def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list
     return list(axes[:count])
 
 
-def page_columns(n_panels: int, most: int) -> int:
-    """Return the number of panels per row with which the page is about 1.3 times as high as wide."""
-    return min(max(math.ceil(math.sqrt(1.3 * n_panels)), 1), most) if n_panels > 3 else n_panels
-
-
-def panel_font(n_columns: int) -> float:
-    """Return the font size in panels of a page of 11 inches, smaller for narrower panels."""
-    return 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
-
-
-def page_labels(fig: Figure, x_label: str, y_label: str, title: str) -> None:
-    """Label the axes that all panels of a page share, and put a line above them."""
-    fig.supxlabel(x_label, fontsize=11)
-    fig.supylabel(y_label, fontsize=11)
-    fig.suptitle(title, fontsize=11, x=0.01, ha="left")
-
-
 def small_title(ax: Axes, title: str, **style: Any) -> None:
     """Put a remark, rather than a heading, above the axes."""
     ax.set_title(title, **{"fontsize": 9, "fontweight": "normal", **style})
-
-
-def small_ticks(ax: Axes, size: float) -> None:
-    """Make the labels of both axes of a small panel few and small."""
-    ax.tick_params(labelsize=size, colors=INK)
-    ax.locator_params(nbins=4)
 
 
 def corner_text(ax: Axes, x: float, y: float, words: str, **style: Any) -> None:
@@ -273,7 +345,7 @@ def legend_above(ax: Axes, n_columns: int = 1, **keywords: Any) -> None:
     """Put the legend above the axes, where it covers no data."""
     if ax.get_legend_handles_labels()[0]:
         place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.01), "borderaxespad": 0.0}
-        ax.legend(ncols=n_columns, handlelength=1.8, columnspacing=1.4, **place, **keywords)
+        ax.legend(ncols=n_columns, handlelength=1.8, columnspacing=1.4, **place | keywords)
 
 
 def page_legend(fig: Figure, handles: Sequence[Any] | None, n_columns: int, **keywords: Any) -> None:
