@@ -341,17 +341,13 @@ def draw_paper_position(
         printed_cm = published.POSITION_RMS_CM[round(pressure_kPa)]
         ax.set_title(f"{pressure_kPa:g} kPa\nrms: printed {printed_cm:.2f} cm, {ours}", fontsize=10.5)
     axes[0].set_ylabel("growth of the leading edge (cm)")
-    _legend_below(fig, axes[-1])
+    handles, labels = axes[-1].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9.5)
     return fig
 
 
 def _by_departure(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {str(name): part for name, part in table.groupby("departure", sort=False)}
-
-
-def _legend_below(fig: Figure, ax: Axes) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9.5)
 
 
 def _draw_departures(ax: Axes, curves: Mapping[str, pd.DataFrame]) -> None:

@@ -155,7 +155,7 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None
                 style = {"va": "center", "fontsize": 9, "color": st.INK if row.in_answer_set else st.MUTED}
                 words = textwrap.shorten(words, 62, placeholder="…")
                 ax.annotate(words, (row.height, i), (5, 0), textcoords="offset points", **style)
-        st.names_on_axis(ax, "y", [str(name).replace("_", " ") for name in table["effect"]])
+        st.names_beside(ax, [str(name).replace("_", " ") for name in table["effect"]])
         for label, chosen in zip(ax.get_yticklabels(), table["in_answer_set"], strict=True):
             label.set_fontweight("bold" if chosen else "normal")
         ax.set(ylim=(len(table) - 0.4, -0.6), xlim=(0, 1.75 * longest))

@@ -63,7 +63,7 @@ def _draw_kymograph(sheet: Axes, tracking: Tracking, below_in: float) -> st.Pane
     shown_ms = time_ms[tracking.strip_rows]
     ends_ms = float(shown_ms[-1]) + half_ms, float(shown_ms[0]) - half_ms
     panel = st.Panel(sheet, (0.75, below_in, 6.38, 2.6), (-0.5, strip.shape[1] - 0.5), ends_ms)
-    small = _shrunk(strip, 480)
+    small = _shrunk(strip, 480, 480)
     dark, light = np.nanpercentile(small, [1, 99])
     panel.picture(small, vmin=dark, vmax=light)
     edge, by_hand = track.edge_px, hand_corrected(track.flag)
@@ -81,16 +81,16 @@ def _draw_kymograph(sheet: Axes, tracking: Tracking, below_in: float) -> st.Pane
     return panel
 
 
-def _shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """Return a picture averaged to at most `largest_px` pixels per side. Shape (height, width)."""
+def _shrunk(picture: np.ndarray, height: float, width: float) -> np.ndarray:
+    """A picture averaged to at most this size, px. Shape (height, width)."""
     import cv2
 
-    height, width = (min(side, largest_px) for side in picture.shape)
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
+    most = min(round(width), picture.shape[1]), min(round(height), picture.shape[0])
+    return np.asarray(cv2.resize(picture, most, interpolation=cv2.INTER_AREA))
 
 
 def _draw_frame(panel: st.Panel, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
-    panel.picture(_shrunk(picture, 320))
+    panel.picture(_shrunk(picture, *np.multiply(picture.shape, 360 / max(picture.shape))))
     track, axis = tracking.track, tracking.axis
     if axis.bends:
         panel.plot(*axis.points(np.arange(0.0, axis.length_px, 3.0)).T, color=st.SKY, lw=0.8, ls=":")

@@ -235,7 +235,7 @@ def draw_power(power: Power) -> Figure | None:
     # A white line below the dots keeps them visible on the dark part of the map.
     ax.axvline(1.0, color="white", linewidth=2.2)
     ax.axvline(1.0, color=st.INK, linewidth=1.2, linestyle=":")
-    st.names_on_axis(ax, "y", [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
+    st.names_beside(ax, [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
     for row in range(1, n):
         ax.axhline(row - 0.5, color=st.GRID, linewidth=0.7)
     # Sizes in the unit of each effect; grey beyond the plausible range

@@ -50,8 +50,7 @@ class RegisteredFigure:
     @property
     def reads(self) -> tuple[str, ...]:
         """Names of the tables that it shows."""
-        parameters = inspect.signature(self.drawing).parameters.values()
-        return tuple(one.name for one in parameters if one.default is one.empty)
+        return tuple(inspect.signature(self.drawing).parameters)
 
 
 _registered: dict[str, RegisteredFigure] = {}
@@ -183,7 +182,7 @@ class FigureTables:
 
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
-    """Add pressure and a short label of the condition to `trials.csv`, for the panels of the overview."""
+    """Add pressure and a short label of the condition to `trials.csv`."""
     by_name = {trial.name: trial for trial in known}
     labels, pressures = [], []
     for name, condition in zip(trials["trial"], trials["condition"], strict=True):

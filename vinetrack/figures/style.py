@@ -11,8 +11,9 @@ import math
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -56,8 +57,15 @@ def look() -> Iterator[None]:
     """Context manager that applies the project's matplotlib settings and restores the former ones."""
     import matplotlib as mpl
 
-    with mpl.rc_context(fname=Path(__file__).with_name("figures.mplstyle")):
+    with mpl.rc_context(_settings()):
         yield
+
+
+@cache
+def _settings() -> Any:
+    import matplotlib as mpl
+
+    return mpl.rc_params_from_file(Path(__file__).with_name("figures.mplstyle"), use_default_template=False)
 
 
 def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
@@ -244,7 +252,7 @@ class Panel:
         length_in, depth_in = (abs(np.dot(way, self.box.size)) for way in (along, out))
         start, end = factor * np.array(self.x if below else self.y)
         low, high = sorted((start, end))
-        most = min(int(length_in * 72 / (30 if below else 20)), 9)  # as many numbers as on matplotlib's axes
+        most = int(length_in / (0.8 if below else 0.35))  # numbers may be so far apart, in (chosen)
         values = np.array(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
         values = values[(values >= low) & (values <= high)]
 
@@ -253,14 +261,11 @@ class Panel:
             share = (np.atleast_1d(values) - start) / (end - start)
             return start_in + np.outer(share * length_in, along) + outside_in * np.array(out)
 
-        def lines(ends: Sequence[np.ndarray], colour: str, width_pt: float, order: float) -> None:
-            drawn = LineCollection(list(np.stack(ends, axis=1)), colors=colour, linewidths=width_pt, zorder=order)
-            self.sheet.add_collection(drawn, autolim=False)
-
-        if grid:
-            lines((at(values, 0.0), at(values, -depth_in)), GRID, 0.7, 0.5)
-        lines((at(values, 0.0), at(values, 0.05)), INK, 0.8, 2.5)
-        lines((at(start, 0.0), at(end, 0.0)), INK, 0.8, 2.5)
+        zero = at(values, 0.0)
+        lines = list(zip(zero, at(values, -depth_in), strict=True)) if grid else []
+        marks = [*zip(zero, at(values, 0.05), strict=True), (at(start, 0.0)[0], at(end, 0.0)[0])]
+        style: dict[str, Any] = {"colors": [GRID] * len(lines) + [INK] * len(marks), "linewidths": 0.8, "zorder": 0.5}
+        self.sheet.add_collection(LineCollection([*lines, *marks], **style), autolim=False)
         if not numbered:
             return
         formatter = ScalarFormatter()
@@ -295,11 +300,11 @@ def corner_text(ax: Axes, x: float, y: float, words: str, **style: Any) -> None:
     ax.text(x, y, words, transform=ax.transAxes, **{"color": MUTED, **style})
 
 
-def names_on_axis(ax: Axes, axis: Literal["x", "y"], names: Sequence[str], **style: Any) -> None:
-    """Put names, one per unit, along an axis without marks or grid lines."""
-    ax.tick_params(axis=axis, length=0)
-    ax.grid(axis=axis, visible=False)
-    (ax.set_xticks if axis == "x" else ax.set_yticks)(range(len(names)), names, **style)
+def names_beside(ax: Axes, names: Sequence[str]) -> None:
+    """Put names, one per unit, beside the vertical axis, without marks or grid lines."""
+    ax.tick_params(axis="y", length=0)
+    ax.grid(axis="y", visible=False)
+    ax.set_yticks(range(len(names)), names)
 
 
 def band(
