@@ -16,7 +16,7 @@ from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.planning import prediction
 from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
-from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TAIL, TENSION, TIME, run
+from vinetrack.planning.prediction import EDGE, LEAST_TENSION, TAIL, TENSION, TIME, grown
 from vinetrack.planning.predictive_inputs import BAND, PRESSURE, YIELD, damping_prior
 
 FAST = {name: str(value) for name, value in published.FAST_VINE.items()}
@@ -47,7 +47,8 @@ def test_the_fast_vine_has_the_speeds_that_eq_2_gives_it():
     fast = trial(yield_pressure_kPa=3)
     B = damping_prior(fast.diameter_m, fast.thickness_m)
     assert pytest.approx(3.3, abs=0.05) == B
-    speeds = run(certain(fast, B), np.array([0.90, 0.95, 0.98, 0.99]) * fast.length_m, 1, 1).lead_velocity_m_s[0]
+    inputs, places = certain(fast, B), (0.90, 0.95, 0.98, 0.99)
+    speeds = [vt.predict_vine(inputs, samples=1, at_fraction=place)[EDGE].median for place in places]
     assert speeds == pytest.approx([42, 47, 52, 53.8], abs=0.5)
     assert speeds[3] == pytest.approx(53.8, abs=0.1)
 
@@ -100,9 +101,9 @@ def test_bands_are_those_of_the_one_thing_that_is_uncertain():
 def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time():
     inputs = vt.predictive_inputs(vt.planned_trial(FAST).trials[0])
     prediction = vt.predict_vine(inputs, samples=300)
-    runs = run(inputs, prediction.curve["lead_position_m"].to_numpy(), 300, 1)
+    moved, _ = grown(inputs.model, *inputs.drawn_trials(300, 1))
     there = prediction.curve.iloc[60]
-    positions = [float(np.interp(there["time_high_90_s"], times, runs.places_m)) for times in runs.time_s]
+    positions = [float(np.interp(there["time_high_90_s"], m.time_s, m.lead_position_m)) for m in moved]
     assert np.quantile(positions, 0.05, method="inverted_cdf") == pytest.approx(there["lead_position_m"], rel=0.01)
 
 

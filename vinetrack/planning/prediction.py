@@ -8,7 +8,7 @@ are those of the position at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -36,70 +36,6 @@ from vinetrack.planning.predictive_inputs import (
     hoop_stress_Pa,
     predictive_inputs,
 )
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Simulated draws, SI. Arrays have shape (n_draws,), or (n_draws, n_places) along `places_m`. At a place that a
-    draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge; `steady_tail_m_s` is that
-    of (P − P_y)A = B ẋⁿ, without weight or further effects, NaN for a model without damping. Forces are those of the
-    first draws only; `slack` is whether the tail is compressed or slack.
-    """
-
-    places_m: Floats
-    time_s: Floats
-    lead_velocity_m_s: Floats
-    end_s: Floats
-    end_lead_velocity_m_s: Floats
-    steady_tail_m_s: Floats
-    tension_N: Floats
-    least_tension_N: Floats
-    pressure_Pa: Floats
-    slack: Floats
-
-
-def run(inputs: PredictiveInputs, places_m: Floats, samples: int, seed: int) -> Runs:
-    """Draw predictive inputs and simulate every draw. Shapes: places_m (n_places,)."""
-    model, names = inputs.model, inputs.model.parameter_names
-    trials, rows = inputs.drawn_trials(samples, seed)
-    moved, end_s = grown(model, trials, rows)
-    tension_N, pressure_Pa, least_N, slack = [], [], [], []
-    # 300: draws whose forces are evaluated, a third of a millisecond each (chosen)
-    for trial, row, trajectory in zip(trials[:300], rows.tolist(), moved, strict=False):
-        position_m, lead_m_s = trajectory.lead_position_m, trajectory.lead_velocity_m_s
-        terms = evaluate(
-            replace(model, values=dict(zip(names, row, strict=True))), trial, trajectory.time_s, position_m, lead_m_s
-        )
-        drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
-        tension = np.where(np.abs(terms.tension_N) < 1e-9 * drive_N, 0.0, terms.tension_N)
-        tension_N.append(np.interp(places_m, position_m, tension, right=math.nan))
-        pressure_Pa.append(np.interp(places_m, position_m, terms.pressure_Pa, right=math.nan))
-        moving = (position_m <= places_m[-1]) & (lead_m_s > 0)
-        least_N.append(np.min(tension[moving]) if moving.any() else math.nan)
-        # 0.01: compression of the tail from which the model is said to be in doubt, as a fraction of the
-        # drive ½PA (chosen)
-        is_compressed = least_N[-1] < -0.01 * drive_N
-        slack.append(math.isfinite(trajectory.slack_from_s) if trial.tail_slack == "free" else is_compressed)
-    steady_m_s = np.full(samples, math.nan)
-    if DAMPING in names:
-        B, n = rows[:, names.index(DAMPING)], rows[:, names.index(EXPONENT)]
-        force_N = np.array([max(t.pressure_Pa - t.yield_pressure_Pa, 0.0) * t.area_m2 for t in trials])
-        with np.errstate(divide="ignore", over="ignore"):
-            steady_m_s = (force_N / B) ** (1 / n)
-    return Runs(
-        places_m=places_m,
-        time_s=np.array([np.interp(places_m, m.lead_position_m, m.time_s, right=math.inf) for m in moved]),
-        lead_velocity_m_s=np.array(
-            [np.interp(places_m, m.lead_position_m, m.lead_velocity_m_s, right=0.0) for m in moved]
-        ),
-        end_s=end_s,
-        end_lead_velocity_m_s=np.where(np.isfinite(end_s), [m.lead_velocity_m_s[-1] for m in moved], 0.0),
-        steady_tail_m_s=steady_m_s,
-        tension_N=np.array(tension_N),
-        least_tension_N=np.array(least_N),
-        pressure_Pa=np.array(pressure_Pa),
-        slack=np.array(slack),
-    )
 
 
 def grown(
@@ -135,7 +71,7 @@ def final_speeds(
 
 
 def drawn_final_speeds(
-    inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int, only: Iterable[str] | None = None
+    inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int, only: Collection[str] | None = None
 ) -> Floats:
     """Return the final speed in every draw, m/s, see `final_speeds`. Shape (n_draws,)."""
     trials, rows = inputs.drawn_trials(samples, seed, only)
@@ -180,9 +116,25 @@ class Contribution:
 
 
 @dataclass(frozen=True)
+class Neglected:
+    """An effect that the model leaves out, its typical size, and the median final speed, m/s, with and without it."""
+
+    effect: str
+    size: str
+    final_m_s: float
+    without_m_s: float
+
+    @property
+    def change(self) -> float:
+        """Relative change of the final speed."""
+        return self.final_m_s / self.without_m_s - 1 if self.without_m_s > 0 else math.nan
+
+
+@dataclass(frozen=True)
 class VinePrediction:
     """Prediction of one trial. `curve` has a row for each place along the growth, columns `CURVE_COLUMNS`. `shares` is
-    the uncertainty budget: the band of `final` with one uncertain input each, widest first.
+    the uncertainty budget: the band of `final` with one uncertain input each, widest first. `arrives` and `slack` are
+    the fractions of draws that reach the end, and whose tail is compressed or slack.
     """
 
     inputs: PredictiveInputs
@@ -212,7 +164,7 @@ class VinePrediction:
 
     @cached_property
     def neglected(self) -> tuple[Neglected, ...]:
-        """The final speed at the medians with each of the universal effects added, see `Neglected`."""
+        """The final speed at the medians with each of the universal effects added, see `_neglected`."""
         return _neglected(self.inputs, self.at_fraction)
 
     @property
@@ -263,11 +215,42 @@ def predict_vine(
     >>> vt.predict_vine(vt.predictive_inputs(trial), samples=40).arrives
     1.0
     """
-    length_m = inputs.trial.length_m
+    trial, model = inputs.trial, inputs.model
     # y/L of the curves, dense at the start
     along = np.union1d([0.0, 0.0005, 0.001, 0.002, 0.004, 0.007, *np.linspace(0.01, 0.99, 99)], [at_fraction])
-    runs = run(inputs, along * length_m, samples, seed)
-    place = int(np.searchsorted(along, at_fraction))
+    places_m, place = along * trial.length_m, int(np.searchsorted(along, at_fraction))
+    trials, rows = inputs.drawn_trials(samples, seed)
+    moved, end_s = grown(model, trials, rows)
+    # At a place that a draw never reaches the time is inf and the speed 0.
+    time_s = np.array([np.interp(places_m, m.lead_position_m, m.time_s, right=math.inf) for m in moved])
+    lead_m_s = np.array([np.interp(places_m, m.lead_position_m, m.lead_velocity_m_s, right=0.0) for m in moved])
+    # 300: draws whose forces are evaluated, a third of a millisecond each (chosen)
+    tension_N, pressure_Pa, least_N, slack = _forces(model, trials[:300], rows, moved, places_m)
+
+    r, stress_Pa = trial.travel_ratio, hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
+    quantities: list[Quantity] = []
+
+    def tell(name: str, where: float, values: Floats, unit: str) -> None:
+        low, median, high = band(values).tolist()
+        quantities.append(Quantity(name, where, low, median, high, unit))
+
+    if trial.payload_kg > 0:
+        if told_by_payload(trial) or not slack.any():
+            ejected_m_s = r * np.array([m.lead_velocity_m_s[-1] for m in moved])
+            tell(EJECTION, 1.0, np.where(np.isfinite(end_s), ejected_m_s, 0.0), "m/s")
+        tell("time to the end", 1.0, end_s, "s")
+    tell(EDGE, at_fraction, lead_m_s[:, place], "m/s")
+    tell(TAIL, at_fraction, r * lead_m_s[:, place], "m/s")
+    tell(TIME, at_fraction, time_s[:, place], "s")
+    if DAMPING in model.parameter_names:
+        tell("steady tail speed, Eq. (3)", math.nan, _steady_tail_m_s(model, trials, rows), "m/s")
+    tell(TENSION, at_fraction, tension_N[:, place], "N")
+    tell(LEAST_TENSION, math.nan, least_N, "N")
+    tell("hoop stress PD/2t", math.nan, np.array([stress_Pa]), "Pa")
+
+    time, speed, tension, pressure = (band(of)[[1, 0, 2]] for of in (time_s, lead_m_s, tension_N, pressure_Pa))
+    condition = np.full(along.size, trial.condition, dtype=object)
+    columns = (condition, along, places_m, *time, *speed, r * speed[0], *tension, pressure[0] / 1e3)
     shares = []
     for uncertainty in inputs.uncertainties:
         # 400: draws for the band of one uncertainty alone (derived)
@@ -277,13 +260,43 @@ def predict_vine(
     return VinePrediction(
         inputs=inputs,
         at_fraction=at_fraction,
-        quantities=tuple(_quantities(inputs, runs, along, place)),
-        curve=_curve(inputs, runs, along),
+        quantities=tuple(quantities),
+        curve=pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True))),
         shares=tuple(sorted(shares, key=lambda share: share.low - share.high)),
-        arrives=float(np.mean(np.isfinite(runs.end_s))),
-        slack=float(np.mean(runs.slack)),
+        arrives=float(np.mean(np.isfinite(end_s))),
+        slack=float(np.mean(slack)),
         samples=samples,
     )
+
+
+def _forces(
+    model: Model, trials: Sequence[Trial], rows: Floats, moved: Sequence[Trajectory], places_m: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Tension, N, and pressure, Pa, at the places, shape (n_trials, n_places); least tension, N, and whether the tail
+    is compressed or slack, shape (n_trials,).
+    """
+    of_trials = []
+    for trial, row, m in zip(trials, rows.tolist(), moved, strict=False):
+        valued = replace(model, values=dict(zip(model.parameter_names, row, strict=True)))
+        terms = evaluate(valued, trial, m.time_s, m.lead_position_m, m.lead_velocity_m_s)
+        drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
+        tension_N = np.where(np.abs(terms.tension_N) < 1e-9 * drive_N, 0.0, terms.tension_N)
+        moving = (m.lead_position_m <= places_m[-1]) & (m.lead_velocity_m_s > 0)
+        least_N = np.min(tension_N[moving]) if moving.any() else math.nan
+        # 0.01: compression of the tail from which the model is in doubt, as a fraction of the drive ½PA (chosen)
+        slack = math.isfinite(m.slack_from_s) if trial.tail_slack == "free" else least_N < -0.01 * drive_N
+        at_places = [np.interp(places_m, m.lead_position_m, y, right=math.nan) for y in (tension_N, terms.pressure_Pa)]
+        of_trials.append((*at_places, least_N, slack))
+    tension, pressure, least, is_slack = map(np.array, zip(*of_trials, strict=True))
+    return tension, pressure, least, is_slack
+
+
+def _steady_tail_m_s(model: Model, trials: Sequence[Trial], rows: Floats) -> Floats:
+    """Tail speed of (P − P_y)A = B ẋⁿ, without weight or further effects. Shape (n_trials,)."""
+    B, n = (rows[:, model.parameter_names.index(key)] for key in (DAMPING, EXPONENT))
+    force_N = np.array([max(t.pressure_Pa - t.yield_pressure_Pa, 0.0) * t.area_m2 for t in trials])
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.asarray((force_N / B) ** (1 / n))
 
 
 def band(values: Floats) -> Floats:
@@ -295,59 +308,10 @@ def band(values: Floats) -> Floats:
     return np.where(is_empty, np.nan, quantiles)
 
 
-def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int) -> Iterator[Quantity]:
-    trial, at = inputs.trial, float(along[place])
-    r = trial.travel_ratio
-    speed = runs.lead_velocity_m_s[:, place]
-
-    def quantity(name: str, where: float, values: Floats, unit: str) -> Quantity:
-        low, median, high = (float(number) for number in band(values))
-        return Quantity(name, where, low, median, high, unit)
-
-    if trial.payload_kg > 0:
-        if told_by_payload(trial) or not runs.slack.any():
-            yield quantity(EJECTION, 1.0, r * runs.end_lead_velocity_m_s, "m/s")
-        yield quantity("time to the end", 1.0, runs.end_s, "s")
-    yield quantity(EDGE, at, speed, "m/s")
-    yield quantity(TAIL, at, r * speed, "m/s")
-    yield quantity(TIME, at, runs.time_s[:, place], "s")
-    if not math.isnan(runs.steady_tail_m_s[0]):
-        yield quantity("steady tail speed, Eq. (3)", math.nan, runs.steady_tail_m_s, "m/s")
-    yield quantity(TENSION, at, runs.tension_N[:, place], "N")
-    yield quantity(LEAST_TENSION, math.nan, runs.least_tension_N, "N")
-    stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
-    yield Quantity("hoop stress PD/2t", math.nan, stress, stress, stress, "Pa")
-
-
-def _curve(inputs: PredictiveInputs, runs: Runs, along: Floats) -> pd.DataFrame:
-    time, speed, tension, pressure = (
-        band(values)[[1, 0, 2]] for values in (runs.time_s, runs.lead_velocity_m_s, runs.tension_N, runs.pressure_Pa)
-    )
-    condition = np.full(along.size, inputs.trial.condition, dtype=object)
-    tail_velocity, pressure_kPa = inputs.trial.travel_ratio * speed[0], pressure[0] / 1e3
-    columns = (condition, along, runs.places_m, *time, *speed, tail_velocity, *tension, pressure_kPa)
-    return pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True)))
-
-
 # ------------------------------------------------------------------------------
 # Checks of a planned vine: burst, no growth, a compressed or slack tail, and effects that the model leaves out.
 
 WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
-
-
-@dataclass(frozen=True)
-class Neglected:
-    """An effect that the model leaves out, its typical size, and the median final speed, m/s, with and without it."""
-
-    effect: str
-    size: str
-    final_m_s: float
-    without_m_s: float
-
-    @property
-    def change(self) -> float:
-        """Relative change of the final speed."""
-        return self.final_m_s / self.without_m_s - 1 if self.without_m_s > 0 else math.nan
 
 
 def _hazards(prediction: VinePrediction) -> Iterator[Remark]:

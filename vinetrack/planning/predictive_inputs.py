@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from vinetrack.core import published
 from vinetrack.core.problems import Problem, Remark, remark
@@ -27,7 +26,9 @@ from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, find
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, Number
-from vinetrack.inference.fit_summary import FitSummary
+
+if TYPE_CHECKING:
+    from vinetrack.inference.fit_summary import FitSummary
 
 # ------------------------------------------------------------------------------
 # Scaling priors for vines that have not been measured, each with a standard error.
@@ -47,19 +48,19 @@ PRINTED_SIZES = {R: (1e-3 * published.DIAMETER_MM[R], 1e-6 * published.THICKNESS
 
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
-    """Return the prior of B of a vine of this size, N·(s/m)ⁿ."""
+    """The prior of B of a vine of this size, N·(s/m)ⁿ."""
     largest = max(PRINTED_SIZES)
     diameter, thickness = PRINTED_SIZES[largest]
     return published.DAMPING_B[largest] * (thickness_m / thickness) * (diameter_m / diameter) ** 0.75
 
 
 def prior_ratio(trial: Trial, like: Trial) -> float:
-    """Return the ratio of the priors of B of two vines."""
+    """The ratio of the priors of B of two vines."""
     return damping_prior(trial.diameter_m, trial.thickness_m) / damping_prior(like.diameter_m, like.thickness_m)
 
 
 def damping_scatter() -> float:
-    """Return the standard deviation of ln B of the four printed values about the prior.
+    """The standard deviation of ln B of the four printed values about the prior.
 
     >>> round(damping_scatter(), 3)
     0.113
@@ -69,9 +70,8 @@ def damping_scatter() -> float:
 
 
 def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
-    """Return the standard error (scale of Student's t) of the predicted ln B of a vine with t/D as printed. It is the
-    prediction error of a line fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the
-    logarithm of the size; it grows beyond the smallest and the largest vine.
+    """The standard error (scale of Student's t) of the predicted ln B of a vine with t/D as printed: that of a line
+    fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the logarithm of the size.
     """
     sizes = [math.log(damping_prior(*size)) for size in PRINTED_SIZES.values()]
     middle = sum(sizes) / len(sizes)
@@ -87,27 +87,29 @@ def _split_leverage(diameter_m: float, thickness_m: float) -> float:
 
 
 def exponent_sigma() -> float:
-    """Return the standard error of the printed n, from the printed R² of the four fits with about ten pressures each.
-    The standard error of a slope n of N points is n √((1 − R²)/R²/(N − 2)); the four are combined with inverse-variance
-    weights.
+    """The standard error of the printed n, from the printed R² of the four fits of N = 8 to 11 pressures: that of a
+    slope is n √((1 − R²)/R²/(N − 2)); the four are combined with inverse-variance weights.
 
     >>> round(exponent_sigma(), 3)
     0.012
     """
-    dof = (8 + 11) / 2 - 2  # 8 to 11: the printed numbers of pressures of a scale
+    dof = (8 + 11) / 2 - 2
     variances = [published.EXPONENT**2 * (1 - R2) / R2 / dof for R2 in published.DAMPING_R2.values()]
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
 def burst_pressure_Pa(diameter_m: float, thickness_m: float, stress_Pa: float = BURST_STRESS_PA) -> float:
-    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; by default a guess from one vine."""
+    """The gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; by default a guess from one vine."""
     return 2 * thickness_m * stress_Pa / diameter_m
 
 
 def hoop_stress_Pa(pressure_Pa: float, diameter_m: float, thickness_m: float) -> float:
-    """Return the hoop stress PD/2t of the wall, Pa."""
+    """The hoop stress PD/2t of the wall, Pa."""
     return pressure_Pa * diameter_m / (2 * thickness_m)
 
+
+# ------------------------------------------------------------------------------
+# The distributions of all inputs of one trial, and draws from them.
 
 # Names of the two inputs that belong to the trial and not to the model
 PRESSURE, YIELD = "pressure_Pa", "yield_pressure_Pa"
@@ -116,19 +118,28 @@ BAND = (0.05, 0.5, 0.95)  # Convention: median and 90 % band of a prediction
 
 Draws = dict[str, Floats]  # Values, shape (n,), by name of a parameter (`effect.parameter`) or of a pressure
 
-Sampler = Callable[[Draws, np.random.Generator], Draws]
+
+def _varied(values: Floats, change: Floats, how: str) -> Floats:
+    """Values with a change `added` to them, to their `logarithm`, `relative` to them, or they are `replaced` by it."""
+    if how == "logarithm":
+        return np.asarray(values * np.exp(change))
+    if how == "relative":
+        return values * (1 + change)
+    return change if how == "replaced" else values + change
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """One uncertainty; `sample` returns the draws that vary with it, given all draws. `key` names its stream of random
-    numbers: uncertainties of the same key vary together, in different vines too.
+    """One uncertainty. `key` names its stream of random numbers: uncertainties of the same key vary together, in
+    different vines too. `of` are the inputs that vary with it, each as `_varied` says, by `changes(generator, n)`,
+    shape (n_inputs, n).
     """
 
     name: str
     why: Remark
     key: str
-    sample: Sampler = field(repr=False, compare=False)
+    of: Mapping[str, str]
+    changes: Callable[[np.random.Generator, int], Any] = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -146,7 +157,9 @@ class Input:
 
 @dataclass(frozen=True)
 class PredictiveInputs:
-    """The distributions from which one trial is predicted."""
+    """The distributions from which one trial is predicted. `spreads` are the relative between-trial standard deviations
+    of pressure and B.
+    """
 
     trial: Trial
     model: Model
@@ -161,20 +174,20 @@ class PredictiveInputs:
         values = dict(zip(self.model.parameter_names, self.model.parameters_of(self.trial).tolist(), strict=True))
         return {**values, PRESSURE: self.trial.pressure_Pa, YIELD: self.trial.yield_pressure_Pa}
 
-    def draw(self, count: int, seed: int, only: Iterable[str] | None = None) -> Draws:
+    def draw(self, count: int, seed: int, only: Collection[str] | None = None) -> Draws:
         """Draw every input `count` times within its physical bounds; the same seed gives the same draws."""
-        chosen = None if only is None else set(only)
         draws = {name: np.full(count, value) for name, value in self.medians.items()}
-        for uncertainty in self.uncertainties:
-            if chosen is None or uncertainty.name in chosen:
-                draws |= uncertainty.sample(draws, np.random.default_rng([seed, zlib.crc32(uncertainty.key.encode())]))
-        bounds = {f"{effect.name}.{p.name}": p.bounds for effect in self.model for p in effect.parameters}
-        bounds |= {YIELD: (0.0, math.inf), PRESSURE: (0.0, math.inf)}
-        return {name: np.clip(values, *bounds[name]) for name, values in draws.items()}
+        for one in self.uncertainties:
+            if only is None or one.name in only:
+                changes = one.changes(np.random.default_rng([seed, zlib.crc32(one.key.encode())]), count)
+                for (name, how), change in zip(one.of.items(), changes, strict=True):
+                    draws[name] = _varied(draws[name], change, how)
+        bounds = {name: parameter.bounds for name, _, parameter in _parameters(self.model)}
+        return {name: np.clip(values, *bounds.get(name, (0.0, math.inf))) for name, values in draws.items()}
 
-    def drawn_trials(self, count: int, seed: int, only: Iterable[str] | None = None) -> tuple[list[Trial], Floats]:
-        """The draws as the simulator takes them. Returns trials (one for each draw, with its pressures), model
-        parameters. Shape (count, n_parameters).
+    def drawn_trials(self, count: int, seed: int, only: Collection[str] | None = None) -> tuple[list[Trial], Floats]:
+        """The draws as the simulator takes them: trials (one for each draw, with its pressures), model parameters.
+        Shape (count, n_parameters).
         """
         draws = self.draw(count, seed, only)
         rows = np.column_stack([draws[name] for name in self.model.parameter_names])
@@ -182,9 +195,9 @@ class PredictiveInputs:
         return [replace(self.trial, pressure_Pa=P, yield_pressure_Pa=P_y) for P, P_y in pairs], rows
 
     def bands(self) -> list[Input]:
-        """Return every input with its 90 % band; fixed inputs have a band of zero width."""
+        """Every input with its 90 % band; fixed inputs have a band of zero width."""
         draws = self.draw(4000, 1)
-        named = {f"{effect.name}.{p.name}": (p.symbol, p.unit) for effect in self.model for p in effect.parameters}
+        named = {name: (parameter.symbol, parameter.unit) for name, _, parameter in _parameters(self.model)}
         named |= {YIELD: ("P_y", "Pa"), PRESSURE: ("P", "Pa")}
         first = [name for name in (DAMPING, EXPONENT, YIELD, PRESSURE) if name in draws]
         bands = []
@@ -194,16 +207,19 @@ class PredictiveInputs:
         return bands
 
 
+def _parameters(model: Model) -> list[tuple[str, Effect, Parameter]]:
+    return [
+        (f"{effect.name}.{parameter.name}", effect, parameter) for effect in model for parameter in effect.parameters
+    ]
+
+
 def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[str, dict[str, tuple[float, float]]]:
     """Parse an effect with its sizes: `NAME`, `NAME=value` or `NAME=low:high`, several parameters separated by commas.
-    Returns name (of the effect), sizes (ends of a range by `effect.parameter`, equal for a fixed value; empty where the
-    text gives none).
+    Returns name (of the effect), sizes (ends of a range by `effect.parameter`, equal for a fixed value).
     """
     name, _, sizes_text = text.partition("=")
     effect = find_effect(name.strip(), further)
-    if not sizes_text.strip():
-        return effect.name, {}
-    cells = [cell.strip() for cell in sizes_text.split(",")]
+    cells = [cell.strip() for cell in sizes_text.split(",")] if sizes_text.strip() else []
     if len(cells) > len(effect.parameters):
         known = ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters) or "none"
         raise EffectError(f"{effect.name} has {len(effect.parameters)} parameters, not {len(cells)}: {known}.")
@@ -234,20 +250,14 @@ class FitNumbers:
     source: str
     fit: Fit | FitSummary
 
-    def place(self, key: str, vine: str = "") -> int | None:
-        """Return the index of a parameter, shared or of this vine; None where there is none."""
-        numbers = enumerate(self.fit.numbers)
-        return next((k for k, number in numbers if number.key == key and number.vine in ("", vine)), None)
-
-    def yield_place(self, vine: str, stated_Pa: float) -> int | None:
-        """Return the index of the yield pressure of a fitted vine; of several, the one nearest to the stated value."""
-        places = [
-            k
-            for k, number in enumerate(self.fit.numbers)
-            if number.key == YIELD_PRESSURE and (number.vine == vine or number.vine.startswith(f"{vine}, "))
-        ]
-        # Nothing is nearer than the first to a value that is not stated.
-        return min(places, key=lambda k: np.nan_to_num(abs(self.fit.numbers[k].value - stated_Pa)), default=None)
+    def place(self, key: str, vine: str = "", near: float = math.nan) -> int | None:
+        """The index of a parameter, shared or of this vine; None where there is none. Of several yield pressures of a
+        vine, the one nearest to a stated value, else the first.
+        """
+        numbers = self.fit.numbers
+        of_vine = [one.vine in ("", vine) or one.vine.startswith(f"{vine}, ") for one in numbers]
+        places = [k for k, one in enumerate(numbers) if one.key == key and of_vine[k]]
+        return min(places, key=lambda k: np.nan_to_num(abs(numbers[k].value - near)), default=None)
 
     def sizes(self) -> dict[str, tuple[float, float]]:
         """Diameter and thickness, m, of every vine with a fitted B and a name that contains them."""
@@ -256,8 +266,8 @@ class FitNumbers:
         return {m[0]: (float(m[1]) / 1e3, float(m[2]) / 1e6) for m in named if m}
 
     def vine_for(self, trial: Trial) -> tuple[str, bool]:
-        """Return the vine from which a trial is predicted, and whether it has the same diameter and wall, at any
-        length, since B belongs to the tip; else the nearest in their logarithms, blank where no name contains a size.
+        """The vine from which a trial is predicted, and whether it has the same diameter and wall, at any length, since
+        B belongs to the tip; else the nearest in their logarithms, blank where no name contains a size.
         """
         size, sizes = (trial.diameter_m, trial.thickness_m), self.sizes()
         same = [vine for vine in sizes if _alike(sizes[vine], size)]
@@ -282,7 +292,7 @@ class FitNumbers:
 
 def fit_numbers(fit: Fit | FitSummary, source: str = "the fit") -> FitNumbers:
     """Read the parameters of a fit, in memory or from `fit.json`."""
-    if isinstance(fit, FitSummary) and fit.refused:
+    if not isinstance(fit, Fit) and fit.refused:
         raise FitError(f"{source} holds no fit to predict from: {fit.refused}")
     if not fit.numbers:
         raise FitError(f"{source} holds a fit without numbers: there is nothing to predict from.")
@@ -302,7 +312,8 @@ def _widening(number: Number) -> float:
     if number.method != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
         return 1.0
     half = (math.log(high / low) if log else high - low) / 2
-    return max(half / (float(ndtri(0.975)) * (sigma / number.value if log else sigma)), 1.0)
+    # 1.96: of a normal distribution, whose 95 % interval is this many standard deviations to either side
+    return max(half / (1.959963984540054 * (sigma / number.value if log else sigma)), 1.0)
 
 
 def _alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
@@ -367,20 +378,15 @@ class _Assembly:
     def vary(
         self, name: str, sigma: float, title: str, key: str, why: Remark, how: str = "added", dof: float = math.inf
     ) -> None:
-        """Let an input vary by sigma times a normal deviate, or one of Student's t, if that is any: `added` to it, to
-        its `logarithm`, or `relative` to it.
-        """
+        """Let an input vary by sigma times a normal deviate, or one of Student's t, if that is any."""
 
-        def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-            values, normal = draws[name], math.isinf(dof)
-            deviates = draw.standard_normal(values.size) if normal else draw.standard_t(dof, values.size)
-            changes = sigma * (deviates if normal else np.clip(deviates, -20.0, 20.0))
-            if how == "added":
-                return {name: values + changes}
-            return {name: values * (np.exp(changes) if how == "logarithm" else 1 + changes)}
+        def changes(draw: np.random.Generator, count: int) -> list[Floats]:
+            if math.isinf(dof):
+                return [sigma * draw.standard_normal(count)]
+            return [sigma * np.clip(draw.standard_t(dof, count), -20.0, 20.0)]
 
         if sigma != 0:
-            self.uncertainties.append(Uncertainty(title, why, key, sample))
+            self.uncertainties.append(Uncertainty(title, why, key, {name: how}, changes))
 
     def damping(self) -> None:
         """B: as stated, fitted or printed; else by the scaling prior, from the nearest vine of the fit if any."""
@@ -423,8 +429,8 @@ class _Assembly:
         """n: as stated, fitted or printed."""
         place = self.fit.place(EXPONENT) if self.fit else None
         if math.isfinite(self.stated.n):
-            self.set(EXPONENT, self.stated.n, "given")
             error = max(self.stated.n_error, 0.0)
+            self.set(EXPONENT, self.stated.n, "given")
             self.vary(EXPONENT, error, "error of n", "n given", remark("n_given", error=error))
         elif place is not None:
             self.set_fitted(EXPONENT, place)
@@ -437,7 +443,7 @@ class _Assembly:
         """P_y: as fitted for this vine, unless the sheet contradicts it; as stated; as printed, for one vine or all."""
         trial, fit = self.trial, self.fit
         stated, sigma = trial.yield_pressure_Pa, max(np.nan_to_num(trial.yield_pressure_sigma_Pa), 0.0)
-        place = fit.yield_place(self.vine, stated) if fit and self.is_same else None
+        place = fit.place(YIELD_PRESSURE, self.vine, stated) if fit and self.is_same else None
         if fit is not None and place is not None and math.isfinite(stated):
             # A stated yield pressure is believed where it contradicts the fitted one by more than 3 standard errors.
             tolerance = 3 * math.hypot(sigma, math.sqrt(fit.covariance[place, place]))
@@ -456,64 +462,53 @@ class _Assembly:
             self.vary(YIELD, rounding_Pa, "printed P_y", "P_y printed", why)
         else:
             self.set(YIELD, 1000 * printed_kPa, "P_y_guessed")
-            sigma = math.log(3.0) / float(ndtri(0.95))  # nine of ten vines within a factor of 3
+            sigma = math.log(3.0) / 1.6448536269514722  # nine of ten vines within a factor of 3
             self.vary(YIELD, sigma, "guess of P_y", "P_y guess", remark("P_y_guess", kPa=printed_kPa), "logarithm")
 
     def other_parameters(self, model: Model) -> None:
         """Parameters of all other effects: as stated, as fitted, or at their typical size."""
-        for effect, parameter in [(one, p) for one in model for p in one.parameters]:
-            name = f"{effect.name}.{parameter.name}"
+        for name, effect, parameter in _parameters(model):
             if name in self.values:
                 continue
             place = self.fit.place(name, self.vine) if self.fit else None
             if name in self.stated.sizes:
-                self._stated_size(effect, parameter, name, *self.stated.sizes[name])
+                self._stated_size(name, effect, parameter, *self.stated.sizes[name])
             elif place is not None:
                 self.set_fitted(name, place)
             else:
                 self.set(name, parameter.default, "constant" if parameter.held else "typical_size")
 
-    def _stated_size(self, effect: Effect, parameter: Parameter, name: str, low: float, high: float) -> None:
+    def _stated_size(self, name: str, effect: Effect, parameter: Parameter, low: float, high: float) -> None:
         self.set(name, (low + high) / 2, "given")
         facts = {"symbol": parameter.symbol, "effect": effect.name}
         least, most = parameter.plausible or parameter.bounds
         if low < least or high > most:
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             self.notes.append(remark("implausible", **facts, low=least, high=most, unit=unit))
-
-        def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-            return {name: draw.uniform(low, high, draws[name].size)}
-
         if high > low:
-            why = remark("uniform", **facts, low=low, high=high)
-            self.uncertainties.append(Uncertainty(f"{parameter.symbol} ({effect.name})", why, name, sample))
+            title, why = f"{parameter.symbol} ({effect.name})", remark("uniform", **facts, low=low, high=high)
+            how = {name: "replaced"}
+            self.uncertainties.append(Uncertainty(title, why, name, how, lambda draw, n: [draw.uniform(low, high, n)]))
 
     def joint_draw_of_fit(self) -> None:
         """Draw all inputs that the fit provides jointly, with their covariance."""
-        fit = self.fit
-        if fit is None or not self.from_fit:
+        if self.fit is None or not self.from_fit:
             return
-        names, places = list(self.from_fit), list(self.from_fit.values())
-        covariance, numbers = fit.covariance[np.ix_(places, places)], [fit.fit.numbers[place] for place in places]
-
-        def sample(draws: Draws, draw: np.random.Generator) -> Draws:
-            size = next(iter(draws.values())).size
-            changes = draw.multivariate_normal(np.zeros(len(places)), covariance, size, method="svd").T
-            return {
-                name: draws[name] * np.exp(change) if _is_log(number) else draws[name] + change
-                for name, number, change in zip(names, numbers, changes, strict=True)
-            }
-
+        source, fit, places = self.fit.source, self.fit.fit, list(self.from_fit.values())
+        mean, covariance = np.zeros(len(places)), self.fit.covariance[np.ix_(places, places)]
+        how = {name: "logarithm" if _is_log(fit.numbers[place]) else "added" for name, place in self.from_fit.items()}
         symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
-        shown = ", ".join(symbols.get(name, name) for name in names)
-        why = remark("with_covariance", names=shown, source=fit.source, count=len(fit.fit.trials))
-        self.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", sample))
-        variances = np.diag(fit.fit.covariance)
-        if not np.isfinite(variances).all():
-            open_ones = [
-                n.symbol for n, known in zip(fit.fit.numbers, np.isfinite(variances), strict=True) if not known
-            ]
-            self.notes.append(remark("not_determined", source=fit.source, names=", ".join(open_ones)))
+        shown = ", ".join(symbols.get(name, name) for name in self.from_fit)
+        why = remark("with_covariance", names=shown, source=source, count=len(fit.trials))
+
+        def changes(draw: np.random.Generator, count: int) -> Floats:
+            return draw.multivariate_normal(mean, covariance, count, method="svd").T
+
+        self.uncertainties.insert(0, Uncertainty("fitted numbers", why, "fit", how, changes))
+        is_known = np.isfinite(np.diag(fit.covariance))
+        if not is_known.all():
+            of_open = [number.symbol for number, known in zip(fit.numbers, is_known, strict=True) if not known]
+            self.notes.append(remark("not_determined", source=source, names=", ".join(of_open)))
 
     def between_trials(self) -> tuple[float, float]:
         """Relative between-trial standard deviations of pressure and B; both become uncertainties."""
@@ -600,8 +595,8 @@ def predictive_inputs(
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
-    """Return a warning if the speeds contradict the pressures as stated but agree with them in another unit. The other
-    unit is psi, kPa where psi are stated, or absolute instead of gauge pressure.
+    """A warning if the speeds contradict the pressures as stated but agree with them in another unit: psi, kPa where
+    psi are stated, or absolute instead of gauge pressure.
     """
     # Factors between implied and prior damping from which, and within which, another unit explains the speeds (chosen)
     far_off, near = 4.0, 2.5
@@ -639,9 +634,9 @@ def _middle_ratio(pairs: Iterable[tuple[Trial, float]]) -> float:
     """
     ratios = []
     for trial, speed in pairs:
-        if speed > 0 and math.isfinite(speed):
-            drive_N = (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
-            damping = drive_N / (trial.travel_ratio * speed) ** published.EXPONENT if drive_N > 0 else 0.0
+        if 0 < speed < math.inf:
+            drive_N = max(0.0, (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2)
+            damping = drive_N / (trial.travel_ratio * speed) ** published.EXPONENT
             ratios.append(damping / damping_prior(trial.diameter_m, trial.thickness_m))
     known = [ratio for ratio in ratios if math.isfinite(ratio)]
     return float(np.median(known)) if known else math.nan
