@@ -38,7 +38,7 @@ from vinetrack.planning.discriminating_design import (
     OTHER_RIG,
     SAME_RIG,
     Condition,
-    RefitTerms,
+    Hypothesis,
     conditions_by_effort,
     exchanged,
     extend,
@@ -145,7 +145,7 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
     return remark("deciding_measurements", **known, faults_only=bool(measured))
 
 
-def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[RefitTerms]:
+def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[Hypothesis]:
     """The quadratic forms of −2 ln L of all hypotheses with the conditions that can be filmed; none without any."""
     conditions = feasible_conditions([trial_data.trial for trial_data in tied[0].predictor.data], limits)
     if not conditions:
@@ -162,7 +162,7 @@ def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) 
         raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
 
 
-def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> tuple[list[int], Floats]:
+def _best_option(terms: list[Hypothesis], limits: Limits, seed: int) -> tuple[list[int], Floats]:
     """The best set of trials of the least effort that is sufficient, else of all: replicates of one condition,
     exchanged one at a time. Returns design (indices of conditions, one a trial), rises (see `simulated_rises`).
     """
@@ -198,7 +198,7 @@ def _best_option(terms: list[RefitTerms], limits: Limits, seed: int) -> tuple[li
     return max(options, key=lambda option: float(worth(_separations(option[1])[None])[0]))
 
 
-def _recommendation(terms: Sequence[RefitTerms], design: list[int], rises: Floats, seed: int) -> NextExperiment:
+def _recommendation(terms: Sequence[Hypothesis], design: list[int], rises: Floats, seed: int) -> NextExperiment:
     least_separation = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
     fits, names = [one.fit for one in terms], [one.name for one in terms]
     between = _separations(np.concatenate([rises, simulated_rises(terms, design, [1], seed)]))

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -43,10 +42,8 @@ from vinetrack.inference.marginal_likelihood import (
 from vinetrack.inference.optimiser import FixedTerms, make_problem, solve
 from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.sensitivity import (
-    DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
     ORIGIN,
-    PRESSURE,
     RELEASE,
     Job,
     Predictor,
@@ -80,31 +77,29 @@ class Condition:
 
 
 def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
-    """Return every candidate trial; empty where the limits exclude all."""
-    vines = [(trials[k], k) for k in _typical_trials(trials)]
-    if not vines:
-        return []
+    """Every candidate trial; empty where the limits exclude all."""
     used = [trial for trial in trials if trial.travel_ratio != 1]
-    rigs = [
-        (rig, like, effort)
-        for vine, like in vines
-        if _allowed(vine, limits)
-        for effort, rig in _rigs(vine, used, limits)
-    ]
-    for vine, like in _new_vines(vines, limits) if limits.new_vines else []:
-        of_vine = _rigs(vine, used, limits)
-        least = min((effort for effort, _ in of_vine), default=SAME_RIG)
-        rigs += [(rig, like, NEW_VINE) for effort, rig in of_vine if effort == least]
-    loaded = [
-        (replace(rig, pressure_Pa=pressure, pressure_sigma_Pa=sigma, payload_kg=payload), like, effort)
-        for rig, like, effort in rigs
-        for payload in _payloads(used, limits)
-        for pressure, sigma in _pressures(rig, payload, used, limits)
-    ]
-    return [
-        Condition(replace(trial, name=f"next_{number}"), like, effort, _changed(trial, trials[like]))
-        for number, (trial, like, effort) in enumerate(loaded, 1)
-    ]
+    if not used:
+        return []
+    typical = _typical_trials(trials)
+    vines = [(trials[k], k, SAME_RIG) for k in typical if _allowed(trials[k], limits)]
+    if limits.new_vines:
+        vines += [(vine, like, NEW_VINE) for vine, like in _new_vines([(trials[k], k) for k in typical], limits)]
+    conditions: list[Condition] = []
+    for vine, like, effort_of_vine in vines:
+        rigs = _rigs(vine, used, limits)
+        least = min((effort for effort, _ in rigs), default=SAME_RIG)
+        for effort, rig in rigs:
+            if effort_of_vine == NEW_VINE and effort > least:
+                continue
+            for payload in _payloads(used, limits):
+                for pressure, sigma in _pressures(rig, payload, used, limits):
+                    settings: dict[str, Any] = {"pressure_Pa": pressure, "pressure_sigma_Pa": sigma}
+                    name = f"next_{len(conditions) + 1}"
+                    trial = replace(rig, name=name, payload_kg=payload, **settings)
+                    changed = _changed(trial, trials[like])
+                    conditions.append(Condition(trial, like, max(effort, effort_of_vine), changed))
+    return conditions
 
 
 def conditions_by_effort(
@@ -124,10 +119,7 @@ def conditions_by_effort(
 
 
 def exchanged(
-    design: Sequence[int],
-    best: float,
-    allowed: NDArray[np.intp],
-    worth_with: Callable[[list[int]], Floats],
+    design: Sequence[int], best: float, allowed: NDArray[np.intp], worth_with: Callable[[list[int]], Floats]
 ) -> tuple[list[int], float]:
     """Exchange the trials of a design one at a time until none gains (Fedorov 1972, Theory of Optimal Experiments).
     `best` is its worth; `worth_with`, shape (n_allowed,), gives that of other trials with one of each `allowed` added.
@@ -144,19 +136,21 @@ def exchanged(
     return design, best
 
 
-def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
-    return tuple(column for column, name in RIG.items() if not _alike(rig, before, [name]))
-
-
 def _typical_trials(trials: Sequence[Trial]) -> list[int]:
     """Index of a typical trial of each everting vine: the first with its commonest rig and yield pressure."""
-    shown = ("vine", "yield_pressure_Pa", "bends", *RIG.values())
-    texts = [repr([getattr(trial, name) for name in shown]) for trial in trials]
-    places = []
-    for vine in dict.fromkeys(trial.vine for trial in trials if trial.travel_ratio != 1):
-        of_vine = Counter(text for text, trial in zip(texts, trials, strict=True) if trial.vine == vine)
-        places.append(texts.index(of_vine.most_common(1)[0][0]))
-    return places
+    shown = ("yield_pressure_Pa", "bends", *RIG.values())
+    rigs_of: dict[str, dict[str, list[int]]] = {}
+    for k, trial in enumerate(trials):
+        if trial.travel_ratio != 1:
+            rig = repr([getattr(trial, name) for name in shown])
+            rigs_of.setdefault(trial.vine, {}).setdefault(rig, []).append(k)
+    return [max(places.values(), key=len)[0] for places in rigs_of.values()]
+
+
+def _of(trial: Trial, column: str) -> float:
+    """The value of a column, SI."""
+    value: float = getattr(trial, COLUMNS[column].field)
+    return value
 
 
 def _stated(limits: Limits, column: str) -> list[float] | None:
@@ -165,17 +159,29 @@ def _stated(limits: Limits, column: str) -> list[float] | None:
     return None if values is None else [COLUMNS[column].to_si(value) for value in values]
 
 
-def _allowed(vine: Trial, limits: Limits) -> bool:
-    """Whether the user's lists of sizes, where given, contain this vine."""
-    for column in ("diameter_mm", "thickness_um", "length_mm"):
-        size, values = getattr(vine, COLUMNS[column].field), _stated(limits, column)
-        if values is not None and math.isfinite(size) and not _is_among(size, values):
-            return False
-    return True
-
-
 def _is_among(value: float, values: Iterable[float]) -> bool:
     return any(math.isclose(value, listed, rel_tol=1e-4, abs_tol=1e-12) for listed in values)
+
+
+def _alike(trial: Trial, other: Trial, columns: Iterable[str] = ("diameter_mm", "thickness_um", "length_mm")) -> bool:
+    pairs = [(_of(trial, column), _of(other, column)) for column in columns]
+    return all(_is_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
+
+
+def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
+    return tuple(column for column in RIG if not _alike(rig, before, [column]))
+
+
+def _allowed(vine: Trial, limits: Limits) -> bool:
+    """Whether the user's lists of sizes, where given, contain this vine."""
+    columns = ("diameter_mm", "thickness_um", "length_mm")
+    sizes = [(_of(vine, column), _stated(limits, column)) for column in columns]
+    return all(values is None or math.isnan(size) or _is_among(size, values) for size, values in sizes)
+
+
+def _rounded(value: float) -> float:
+    """The value to two significant digits, as a person would order it."""
+    return float(f"{value:.2g}")
 
 
 def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
@@ -187,7 +193,7 @@ def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int,
         rig = replace(vine, **changed)
         changes = len(_changed(rig, vine))
         if changes == 0 or not rig.inlet_m > vine.diameter_m:
-            at_hand = any(_alike(rig, trial, tuple(RIG.values())) for trial in used)
+            at_hand = any(_alike(rig, trial, RIG) for trial in used)
             rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
     fewest = min((changes for changes, _, _ in rigs), default=0)
     return [(effort, rig) for changes, effort, rig in rigs if changes <= max(1, fewest)]
@@ -195,14 +201,16 @@ def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int,
 
 def _choices(vine: Trial, used: Sequence[Trial], limits: Limits, column: str, factors: Sequence[float]) -> list[float]:
     """Values of one part of the rig: the user's, else those used and multiples of the present one; NaN stays."""
-    field, stated = COLUMNS[column].field, _stated(limits, column)
-    now = getattr(vine, field)
-    if not math.isfinite(now):
+    now, stated = _of(vine, column), _stated(limits, column)
+    if math.isnan(now):
         return [now]
     if stated is not None:
         return stated
-    before = dict.fromkeys(getattr(trial, field) for trial in used)
-    values = [now, *filter(math.isfinite, before), *(_rounded(now * factor) for factor in factors)]
+    values = [
+        now,
+        *filter(math.isfinite, (_of(trial, column) for trial in used)),
+        *(_rounded(now * f) for f in factors),
+    ]
     return [value for i, value in enumerate(values) if not _is_among(value, values[:i])]
 
 
@@ -252,9 +260,9 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
             continue
         distances = [math.hypot(math.log(v.diameter_m / diameter), math.log(v.thickness_m / wall)) for v in vines]
         near, like = models[int(np.argmin(distances))]
-        unfilmed = replace(near, video=None, track=None, pressure_trace=None)
         for length in _stated(limits, "length_mm") or [near.length_m]:
-            sized = replace(unfilmed, diameter_m=diameter, thickness_m=wall, length_m=length)
+            size: dict[str, Any] = {"diameter_m": diameter, "thickness_m": wall, "length_m": length}
+            sized = replace(near, video=None, track=None, pressure_trace=None, **size)
             if not any(_alike(sized, vine) for vine in vines):
                 new_vines.append((with_names([sized])[0], like))
     most = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
@@ -272,20 +280,10 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
 def _sizes(vines: Sequence[Trial], limits: Limits, column: str, factors: Sequence[float]) -> list[float]:
     """Candidate sizes: the user's, else those used and multiples of the smallest and largest."""
     stated = _stated(limits, column)
-    used = {size for vine in vines if math.isfinite(size := getattr(vine, COLUMNS[column].field))}
+    used = {size for vine in vines if math.isfinite(size := _of(vine, column))}
     if stated is not None or not used:
         return stated or []
     return sorted(used | {_rounded(f * (min(used) if f < 1 else max(used))) for f in factors})
-
-
-def _rounded(value: float) -> float:
-    """The value to two significant digits, as a person would order it."""
-    return float(f"{value:.2g}")
-
-
-def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "thickness_m", "length_m")) -> bool:
-    pairs = [(getattr(trial, name), getattr(other, name)) for name in names]
-    return all(_is_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
 # ------------------------------------------------------------------------------
@@ -300,7 +298,7 @@ class Hypothesis:
     """One of the tied fits, extended to further conditions. `layout` maps the free parameters to the trials of the
     conditions: those of the fit first, then those of new vines. All are scaled as in the fit; `theta`, shape (n_free,),
     are their best values. The experiment films `rest_frames` before release, `frames_behind_end` of the growth, and
-    `longest_s` of motion.
+    `longest_s` of motion. For `so_far` and `each` see `refit_terms`.
     """
 
     name: str
@@ -312,6 +310,8 @@ class Hypothesis:
     rest_frames: int
     frames_behind_end: int
     longest_s: float
+    so_far: Floats
+    each: Floats
 
     @property
     def n_old(self) -> int:
@@ -397,6 +397,8 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
         rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
         frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
         longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
+        so_far=np.empty(0),
+        each=np.empty(0),
     )
 
 
@@ -493,8 +495,8 @@ def film_trials(
     trial_effects = np.zeros((len(places), N_TRIAL_EFFECTS))
     trial_effects[:, RELEASE] = [(truth.rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
     trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(places))
-    trial_effects[:, PRESSURE] = np.where(predictor.has_pressure_deviation, deviations[:, 0], 0.0)
-    trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.has_damping_deviation, deviations[:, 1], 0.0)
+    may_deviate = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
+    trial_effects[:, DEVIATION_COLUMNS] = np.where(may_deviate, deviations, 0.0)
     moved = predictor.run(predictor.jobs(theta, trial_effects))
     filmed: list[tuple[int, FitTrial]] = []
     for place, blank, trajectory, effects in zip(places, predictor.data, moved, trial_effects, strict=True):
@@ -519,20 +521,12 @@ def film_trials(
 # moves as it says: minimised over the first, the diagonal of the others is what the refit does not explain.
 
 
-@dataclass(frozen=True)
-class RefitTerms(Hypothesis):
-    """−2 ln L of a refitted hypothesis at several assumed pairs of between-trial standard deviations (levels), as
-    quadratic forms in its free parameters and in the motion by each hypothesis. `so_far`, shape (n_levels, n, n), is
-    that of the trials so far near the best values, with its rise from level to level on the diagonal of the motions;
-    `each`, (n_levels, n_conditions, n, n), that of one trial of each condition.
+def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[Hypothesis]:
+    """The hypotheses with −2 ln L of each when refitted, at several assumed pairs of between-trial standard deviations
+    (levels), as quadratic forms in its free parameters and in the motion by each hypothesis. `so_far`, shape (n_levels,
+    n, n), is that of the trials so far near the best values, with its rise from level to level on the diagonal of the
+    motions; `each`, (n_levels, n_conditions, n, n), that of one trial of each condition.
     """
-
-    so_far: Floats
-    each: Floats
-
-
-def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[RefitTerms]:
-    """Return the quadratic forms of each hypothesis, with one trial of each condition, at its best values so far."""
     times, weights = zip(*(_times(hypotheses[0], k, *course) for k, course in enumerate(courses)), strict=True)
     trial_effects = np.zeros((len(courses), N_TRIAL_EFFECTS))
     predictors = [hypothesis.predictor(range(len(courses)), times) for hypothesis in hypotheses]
@@ -562,13 +556,13 @@ def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float,
             each.append(at_unknowns(eliminated(products, precision)[0], index, total))
             scatter_rise = has_deviations @ (2 * np.log(factor) + 1 / factor**2 - 1)
             each[-1][:, true, true] += scatter_rise[:, None]
-        terms.append(RefitTerms(**vars(hypothesis), so_far=so_far, each=np.stack(each)))
+        terms.append(replace(hypothesis, so_far=so_far, each=np.stack(each)))
     return terms
 
 
 def _so_far(hypothesis: Hypothesis, n_true: int) -> tuple[Floats, Floats, Floats]:
     """Pairs of between-trial standard deviations that a refit may estimate, the fitted ones first, their factors on
-    those, shape (n_levels, 2) each, and the quadratic form of the trials so far at each, see `RefitTerms`.
+    those, shape (n_levels, 2) each, and the quadratic form of the trials so far at each, see `refit_terms`.
     """
     solution, old, size = hypothesis.fit.solution, hypothesis.n_old, hypothesis.theta.size
     spread = np.array(solution.state.spread)
@@ -604,7 +598,7 @@ def _times(hypothesis: Hypothesis, place: int, near_end_s: float, ends_s: float)
     return np.concatenate([[-frame_s], moving, [last_s]]), weights
 
 
-def separations(terms: Sequence[RefitTerms], designs: Sequence[Sequence[int]] | NDArray[np.int_]) -> Floats:
+def separations(terms: Sequence[Hypothesis], designs: Sequence[Sequence[int]] | NDArray[np.int_]) -> Floats:
     """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal. Shapes:
     designs (n_designs, n_trials) → (n_designs, n, n).
     """
@@ -704,7 +698,7 @@ class PartlyLinear(Predictor):
 
 
 def simulated_rises(
-    hypotheses: Sequence[RefitTerms], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
+    hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
 ) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
     values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
@@ -732,7 +726,7 @@ def simulated_rises(
     return rises
 
 
-def _drawn_parameters(truth: RefitTerms, rng: np.random.Generator) -> Floats:
+def _drawn_parameters(truth: Hypothesis, rng: np.random.Generator) -> Floats:
     """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
     Returns free parameters, scaled, within their bounds. Shape (n_free,).
     """
@@ -758,18 +752,16 @@ def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], thoro
     before, wide, rows = fit.predictor.layout, hypothesis.layout, [place for place, _ in new]
     used = np.union1d(np.arange(hypothesis.n_old), wide.index[rows][wide.index[rows] >= 0])
     index = np.where(wide.index[rows] < 0, -1, np.searchsorted(used, wide.index[rows]))
-    layout = ParameterMap(
-        wide.model,
-        tuple(wide.free[k] for k in used),
-        wide.keys,
-        np.concatenate([before.index, index]),
-        np.concatenate([before.base, wide.base[rows]]),
+    layout = replace(
+        wide,
+        free=tuple(wide.free[k] for k in used),
+        index=np.concatenate([before.index, index]),
+        base=np.concatenate([before.base, wide.base[rows]]),
     )
-    data = [trial_data for _, trial_data in new]
+    theta, data = hypothesis.theta[used], [trial_data for _, trial_data in new]
     quick = PartlyLinear(layout, fit, data)
     try:
         # New releases are aligned, and the noise of the new trials is that of the old.
-        theta = np.concatenate([old.state.theta, layout.start[hypothesis.n_old :]])
         aligned, _ = align(data, quick.new, theta, initial_trial_effects(data))
         state = replace(
             old.state,
