@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -146,7 +147,7 @@ def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
 
 
 def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> list[Hypothesis]:
-    """The quadratic forms of −2 ln L of all hypotheses with the conditions that can be filmed; none without any."""
+    """All hypotheses, extended to the conditions that can be filmed; none without any."""
     conditions = feasible_conditions([trial_data.trial for trial_data in tied[0].predictor.data], limits)
     if not conditions:
         return []
@@ -154,10 +155,9 @@ def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) 
     usable = [(condition, course) for condition, course in zip(conditions, courses, strict=True) if course is not None]
     if not usable:
         return []
-    chosen = [condition for condition, _ in usable]
-    hypotheses = [extend(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
+    chosen, chosen_courses = zip(*usable, strict=True)
     try:
-        return refit_terms(hypotheses, [course for _, course in usable])
+        return refit_terms([extend(fit, name, chosen) for fit, name in zip(tied, names, strict=True)], chosen_courses)
     except SimulationError as error:
         raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
 
@@ -168,26 +168,21 @@ def _best_option(terms: list[Hypothesis], limits: Limits, seed: int) -> tuple[li
     """
     conditions = terms[0].conditions
 
-    def worth_of_replicates(places: NDArray[np.intp]) -> Floats:
-        return worth(separations(terms, np.repeat(places[:, None], limits.trials, axis=1)))
+    def worth_of(others: Sequence[int], places: NDArray[np.intp], replicates: int = 1) -> Floats:
+        return worth(separations(terms, [[*others, *[k] * replicates] for k in places]))
 
     def best_vines(places: NDArray[np.intp]) -> list[str]:
-        best_first = places[np.argsort(-worth_of_replicates(places))]
+        best_first = places[np.argsort(-worth_of([], places, limits.trials))]
         # 2: new vines that are tried, at most (chosen)
         return list(dict.fromkeys(conditions[k].trial.vine for k in best_first))[: 2 if len(terms) == 2 else 1]
 
     options: list[tuple[list[int], Floats]] = []
     before = -math.inf
     for _, allowed in conditions_by_effort(conditions, best_vines):
-
-        def worth_with(others: list[int], allowed: NDArray[np.intp] = allowed) -> Floats:
-            return worth(separations(terms, [[*others, k] for k in allowed]))
-
-        values = worth_of_replicates(allowed)
+        values = worth_of([], allowed, limits.trials)
         start = [int(allowed[int(np.argmax(values))])] * limits.trials
-        design, predicted = exchanged(start, float(np.max(values)), allowed, worth_with)
-        # 1.01: factor by which the worth of a design must exceed that with less effort for it to be
-        # considered (chosen)
+        design, predicted = exchanged(start, float(np.max(values)), allowed, partial(worth_of, places=allowed))
+        # 1.01: factor by which the worth of a design must exceed that with less effort to be considered (chosen)
         if predicted > 1.01 * before:
             before = predicted
             options.append((sorted(design), simulated_rises(terms, sorted(design), [0], seed)))
@@ -226,18 +221,16 @@ def _recommendation(terms: Sequence[Hypothesis], design: list[int], rises: Float
     to_measure = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
     measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in to_measure])
     trials = trial_entries(terms[0].conditions, design)
-    told: dict[str, Any] = {
-        "if_true": {title[a, b]: {names[a]: float(between[a, b]), names[b]: float(between[b, a])} for a, b in title},
-        "simulated": {title[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()},
-    }
+    if_true = {title[a, b]: {names[a]: float(between[a, b]), names[b]: float(between[b, a])} for a, b in title}
+    by_title = {title[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()}
+    told = {"trials": trials, "least_sigma": least_separation, "if_true": if_true, "simulated": by_title}
     more = {"unresolved": [title[pair] for pair in unresolved], "measurement": measurement}
-    code = "trials_to_make" if worth_it else "no_trials_separate"
     return NextExperiment(
-        advice=remark(code, trials=trials, least_sigma=least_separation, **told, **more),
+        advice=remark("trials_to_make" if worth_it else "no_trials_separate", **told, **more),
         trials=trials if worth_it else (),
         separation_sigma={title[pair]: sigma for pair, sigma in expected.items()},
-        if_true_sigma=told["if_true"],
-        simulated_sigma=told["simulated"],
+        if_true_sigma=if_true,
+        simulated_sigma=by_title,
         measurement=measurement,
     )
 

@@ -78,30 +78,23 @@ def _predictor_of(fit: Fit, data: Sequence[FitTrial]) -> Predictor:
 
 def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Fit) -> tuple[Floats, Floats]:
     """Sizes of an effect, and the ratios of its expected scores there to those of linear theory. Where the score at
-    seven units, above any threshold, agrees with linear theory, no other size is computed. Returns sizes, ratios. Shape
-    (n_sizes,).
+    seven units, above any threshold, agrees with linear theory, no other size is computed. Shape (n_sizes,) each.
     """
-
-    def ratio_at(multiple: float) -> float:
-        return score_ratio(tests, shape_index, multiple * unit, start)
-
-    # Ratio of an expected score to that of linear theory from which neither is used, as below 0 (chosen)
-    max_score_ratio = 2.0
-    large = ratio_at(7.0)
+    largest = 2.0  # Ratio of an expected score to that of linear theory from which neither is used (chosen)
+    multiples, ratios = [7.0], [score_ratio(tests, shape_index, 7.0 * unit, start)]
     # 0.02: relative deviation of an expected score from linear theory that is neglected (chosen)
-    if 0 < abs(large - 1) < 0.02:
-        return np.array([7 * unit]), np.array([large])
-    multiples, ratios = [4.0, 7.0], [ratio_at(4.0), large]
-    if not all(0 < ratio < max_score_ratio for ratio in ratios):
-        return unit * np.array(multiples), np.ones(2)
-    # 7.0: expected score from which no larger size is tried (chosen)
-    # 56.0: multiple of the size of one standard error beyond which no size is tried (chosen)
-    while ratios[-1] * multiples[-1] < 7.0 and multiples[-1] < 56.0:
-        ratio = ratio_at(2 * multiples[-1])
-        if ratio == 1 or not 0 < ratio < max_score_ratio:
-            break
-        multiples.append(2 * multiples[-1])
-        ratios.append(ratio)
+    if not 0 < abs(ratios[0] - 1) < 0.02:
+        multiples, ratios = [4.0, 7.0], [score_ratio(tests, shape_index, 4.0 * unit, start), *ratios]
+        if not all(0 < ratio < largest for ratio in ratios):
+            return unit * np.array(multiples), np.ones(2)
+        # 7.0: expected score from which no larger size is tried (chosen)
+        # 56.0: multiple of the size of one standard error beyond which no size is tried (chosen)
+        while ratios[-1] * multiples[-1] < 7.0 and multiples[-1] < 56.0:
+            ratio = score_ratio(tests, shape_index, 2 * multiples[-1] * unit, start)
+            if ratio == 1 or not 0 < ratio < largest:
+                break
+            multiples.append(2 * multiples[-1])
+            ratios.append(ratio)
     return unit * np.array(multiples), np.array(ratios)
 
 
@@ -166,21 +159,19 @@ def fitted_without(start: Fit, shape: CandidateShape, size: float) -> Fit:
 
 def _used_points(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.bool_]:
     """Points that a fit uses: before the last part of the growth, and not next to its end."""
+    length_m = np.nan_to_num(trial_data.trial.length_m, nan=math.inf)
     behind_s = trajectory.end_time_s + (FRAMES_BEHIND_END + 1) * trial_data.frame_s
-    ended = trajectory.status == "ended"
-    grown = trajectory.lead_position_m < END_FRACTION * trial_data.trial.length_m
-    return np.asarray(grown | (ended & (trajectory.time_s > behind_s)) | ~np.isfinite(trial_data.trial.length_m))
+    behind = (trajectory.status == "ended") & (trajectory.time_s > behind_s)
+    return np.asarray((trajectory.lead_position_m < END_FRACTION * length_m) | behind)
 
 
 def _with_positions(trial_data: FitTrial, position_m: Floats, keep: NDArray[np.bool_]) -> FitTrial:
     """A trial with other positions, at the points that a fit uses; stretches without gaps begin anew behind a gap."""
     stretch = np.cumsum(trial_data.first | np.concatenate([[False], ~keep[:-1]]))[keep]
-    known = {name: getattr(trial_data, name) for name in ("stated_m", "slow_m", "relative_sd")}
-    of_points: dict[str, Any] = {name: None if values is None else values[keep] for name, values in known.items()}
     first = np.concatenate([[True], np.diff(stretch) > 0])
-    return replace(
-        trial_data, time_s=trial_data.time_s[keep], lead_position_m=position_m[keep], first=first, **of_points
-    )
+    known = {name: getattr(trial_data, name) for name in ("time_s", "stated_m", "slow_m", "relative_sd")}
+    of_points: dict[str, Any] = {name: None if values is None else values[keep] for name, values in known.items()}
+    return replace(trial_data, lead_position_m=position_m[keep], first=first, **of_points)
 
 
 def sizes_at_systematic_error(tests: MisfitTests) -> Floats:

@@ -16,7 +16,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -310,8 +310,8 @@ class Hypothesis:
     rest_frames: int
     frames_behind_end: int
     longest_s: float
-    so_far: Floats
-    each: Floats
+    so_far: Floats = field(default_factory=lambda: np.empty(0))
+    each: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def n_old(self) -> int:
@@ -334,21 +334,11 @@ class Hypothesis:
         """
         items = []
         for place, time_s in zip(places, times_s, strict=True):
-            condition = self.conditions[place]
-            like = self.fit.predictor.data[condition.like]
-            constant = (np.array([-1e3, 1e3]), np.full(2, condition.trial.pressure_Pa))
-            items.append(
-                FitTrial(
-                    trial=condition.trial,
-                    time_s=time_s,
-                    lead_position_m=time_s,
-                    first=np.arange(time_s.size) == 0,
-                    n_rest=int(np.count_nonzero(time_s <= 0)),
-                    noise_m=like.noise_m,
-                    correlation=like.correlation,
-                    trace=None if like.trace is None else constant,
-                )
-            )
+            trial, like = self.conditions[place].trial, self.fit.predictor.data[self.conditions[place].like]
+            constant = (np.array([-1e3, 1e3]), np.full(2, trial.pressure_Pa))
+            first, n_rest = np.arange(time_s.size) == 0, int(np.count_nonzero(time_s <= 0))
+            trace = None if like.trace is None else constant
+            items.append(FitTrial(trial, time_s, time_s, first, n_rest, like.noise_m, like.correlation, trace))
         rows = list(places)
         layout = replace(self.layout, index=self.layout.index[rows], base=self.layout.base[rows])
         return _stepped_as(self.fit, layout, items)
@@ -397,8 +387,6 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
         rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
         frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
         longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
-        so_far=np.empty(0),
-        each=np.empty(0),
     )
 
 
@@ -423,11 +411,12 @@ def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float]
     """
     last = hypotheses[-1]
     every, longest_s, fit = range(len(last.conditions)), last.longest_s, last.fit
-    trial_effects = np.zeros((len(every), N_TRIAL_EFFECTS))
-    times = [np.linspace(0.0, longest_s, 400)] * len(every)
-    predictors = [hypothesis.predictor(every, times) for hypothesis in hypotheses]
-    jobs_of = [p.jobs(hypothesis.theta, trial_effects) for p, hypothesis in zip(predictors, hypotheses, strict=True)]
-    runs = [_simulated(predictor, jobs) for predictor, jobs in zip(predictors, jobs_of, strict=True)]
+    trial_effects, times = np.zeros((len(every), N_TRIAL_EFFECTS)), [np.linspace(0.0, longest_s, 400)] * len(every)
+    runs = []
+    for hypothesis in hypotheses:
+        predictor = hypothesis.predictor(every, times)
+        jobs = predictor.jobs(hypothesis.theta, trial_effects)
+        runs.append(_simulated(predictor, jobs))
     # The largest ratio of tail speed to steady speed among the trials so far
     made = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
     seen = [
@@ -437,24 +426,21 @@ def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float]
     ]
     # 1.05: the ratio above which the model predicts compression in the tail (chosen)
     largest_ratio = max(1.05, *filter(math.isfinite, seen))
-    growth: list[tuple[float, float] | None] = []
+    growth: list[tuple[float, float] | None] = [None] * len(every)
     for i, condition in enumerate(last.conditions):
-        trajectories = [run[i] for run in runs]
-        moving = [trajectory for trajectory in trajectories if trajectory is not None]
+        trial, moving = condition.trial, [course for run in runs if (course := run[i]) is not None]
         if len(moving) < len(runs):
-            growth.append(None)
             continue
-        length_m = condition.trial.length_m
-        near_m = np.nan_to_num(END_FRACTION * length_m, nan=math.inf)
+        near_m = np.nan_to_num(END_FRACTION * trial.length_m, nan=math.inf)
         near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in moving)
         grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
-        ratio = _speed_ratio(fit, condition.trial, jobs_of[-1][i], moving[-1].tail_velocity_m_s)
-        # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
-        grows_enough = grown_m > 0.3 * (length_m if math.isfinite(length_m) else 0.0)
-        is_compressed = condition.trial.tail_slack != "free" and ratio > largest_ratio
         ends_s = max(m.end_time_s if m.status == "ended" else math.inf for m in moving)
-        is_worth_it = grows_enough and not is_compressed and near_s > 8 * last.frame_s(i)
-        growth.append((near_s, ends_s) if is_worth_it else None)
+        ratio = _speed_ratio(fit, trial, jobs[i], moving[-1].tail_velocity_m_s)
+        # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
+        grows_enough = grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * last.frame_s(i)
+        is_compressed = trial.tail_slack != "free" and ratio > largest_ratio
+        if grows_enough and not is_compressed:
+            growth[i] = near_s, ends_s
     return growth
 
 
@@ -495,8 +481,7 @@ def film_trials(
     trial_effects = np.zeros((len(places), N_TRIAL_EFFECTS))
     trial_effects[:, RELEASE] = [(truth.rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
     trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(places))
-    may_deviate = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
-    trial_effects[:, DEVIATION_COLUMNS] = np.where(may_deviate, deviations, 0.0)
+    trial_effects[:, DEVIATION_COLUMNS] = np.where(_may_deviate(predictor), deviations, 0.0)
     moved = predictor.run(predictor.jobs(theta, trial_effects))
     filmed: list[tuple[int, FitTrial]] = []
     for place, blank, trajectory, effects in zip(places, predictor.data, moved, trial_effects, strict=True):
@@ -511,6 +496,11 @@ def film_trials(
             track = plain_track(blank.time_s[:stop], position_m, pressure_Pa=pressure_Pa)
             filmed.append((place, prepare_trial(blank.trial, track)))
     return filmed
+
+
+def _may_deviate(predictor: Predictor) -> NDArray[np.bool_]:
+    """Whether pressure and B of each trial may deviate, shape (n_trials, 2)."""
+    return np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
 
 
 # ------------------------------------------------------------------------------
@@ -528,13 +518,12 @@ def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float,
     motions; `each`, (n_levels, n_conditions, n, n), that of one trial of each condition.
     """
     times, weights = zip(*(_times(hypotheses[0], k, *course) for k, course in enumerate(courses)), strict=True)
-    trial_effects = np.zeros((len(courses), N_TRIAL_EFFECTS))
+    trial_effects, root_weights = np.zeros((len(courses), N_TRIAL_EFFECTS)), np.sqrt(np.stack(weights))[:, :, None]
     predictors = [hypothesis.predictor(range(len(courses)), times) for hypothesis in hypotheses]
     columns = [
         np.stack(p.linearise(hypothesis.theta, trial_effects))
         for p, hypothesis in zip(predictors, hypotheses, strict=True)
     ]
-    root_weights = np.sqrt(np.stack(weights))[:, :, None]
     # The last column is placeholder − motion; the placeholder cancels in the difference of two hypotheses.
     motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
     terms = []
@@ -545,16 +534,14 @@ def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float,
         both = scale * root_weights * np.concatenate([sensitivities[:, :, :-1], differences], axis=2)
         products = np.swapaxes(both, 1, 2) @ both
         spreads, factors, so_far = _so_far(hypothesis, len(hypotheses))
-        size, total = hypothesis.theta.size, so_far.shape[1]
-        true = np.arange(size, total)
+        true, total = np.arange(hypothesis.theta.size, so_far.shape[1]), so_far.shape[1]
         index = np.concatenate([hypothesis.layout.index, np.tile(true, (len(courses), 1))], axis=1)
-        has_deviations = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
         each = []
         for spread, factor in zip(spreads, factors, strict=True):
             precision = np.full((len(courses), N_TRIAL_EFFECTS), 1e-9)
             precision[:, DEVIATION_COLUMNS] = 1 / spread**2
             each.append(at_unknowns(eliminated(products, precision)[0], index, total))
-            scatter_rise = has_deviations @ (2 * np.log(factor) + 1 / factor**2 - 1)
+            scatter_rise = _may_deviate(predictor) @ (2 * np.log(factor) + 1 / factor**2 - 1)
             each[-1][:, true, true] += scatter_rise[:, None]
         terms.append(replace(hypothesis, so_far=so_far, each=np.stack(each)))
     return terms
@@ -711,11 +698,10 @@ def simulated_rises(
     rises = np.full((len(draws), n, n), math.nan)
     before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in hypotheses])
     for k, a in np.ndindex(len(draws), n):
-        rng = np.random.default_rng([seed, int(thorough), draws[k], a])
-        truth = hypotheses[a]
-        theta = _drawn_parameters(truth, rng) if thorough else truth.theta
-        in_turn = alternating[(np.arange(len(design)) + draws[k]) % 4]
-        deviations = rng.standard_normal((len(design), 2)) if thorough else in_turn
+        rng, truth = np.random.default_rng([seed, int(thorough), draws[k], a]), hypotheses[a]
+        theta, deviations = truth.theta, alternating[(np.arange(len(design)) + draws[k]) % 4]
+        if thorough:
+            theta, deviations = _drawn_parameters(truth, rng), rng.standard_normal((len(design), 2))
         try:
             new = film_trials(truth, design, theta, deviations * truth.fit.solution.state.spread, rng)
         except SimulationError:
