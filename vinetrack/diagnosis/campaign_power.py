@@ -74,19 +74,16 @@ def make(
     ]
     theta = np.array([model.parameters_of(trial) for trial in trials])
     theta[:, model.parameter_names.index(DAMPING)] *= np.exp(spreads[1] * draw.standard_normal(count))
-    until_longest = [np.array([0.0, 2 * camera.longest_s]) for camera in cameras]
-    ends = simulate_many(model, true_trials, until_longest, parameters=theta, host=host)
-    release_frames = rest_frames - draw.uniform(size=count)
-    times, since_release = [], []
-    for end, camera, release in zip(ends, cameras, release_frames.tolist(), strict=True):
-        stop_s = min(end.end_time_s if end.status == "ended" else 2 * camera.longest_s, camera.stops_s)
-        times.append(np.arange(rest_frames + int(stop_s * camera.capture_fps)) / camera.capture_fps)
-        since_release.append(times[-1] - release / camera.capture_fps)
+    release_s = (rest_frames - draw.uniform(size=count)) / [camera.capture_fps for camera in cameras]
+    times = [np.arange(rest_frames + int(2 * c.longest_s * c.capture_fps)) / c.capture_fps for c in cameras]
+    since_release = [time_s - first_s for time_s, first_s in zip(times, release_s.tolist(), strict=True)]
     moved = simulate_many(model, true_trials, since_release, parameters=theta, host=host)
     pairs = []
-    for trial, time_s, trajectory, camera in zip(trials, times, moved, cameras, strict=True):
+    for trial, whole_s, trajectory, camera in zip(trials, times, moved, cameras, strict=True):
+        ends_s = trajectory.end_time_s if trajectory.status == "ended" else 2 * camera.longest_s
+        time_s = whole_s[: rest_frames + int(min(ends_s, camera.stops_s) * camera.capture_fps)]
         noise_m = ar1_noise(time_s.size, camera.noise_m, camera.noise_correlation, draw)
-        position_m = trajectory.observed_position_m + noise_m + draw.uniform(-0.05, 0.05)
+        position_m = trajectory.observed_position_m[: time_s.size] + noise_m + draw.uniform(-0.05, 0.05)
         pressure_Pa = np.full(time_s.size, trial.pressure_Pa) if camera.has_trace else None
         track = plain_track(time_s, position_m, pressure_Pa=pressure_Pa)
         pairs.append((trial, replace(track, lead_position_systematic_m=np.full(time_s.size, camera.slow_error_m))))
