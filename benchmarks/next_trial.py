@@ -8,7 +8,6 @@ with the truth, releases, origins, noise and scatter of their own, B of new vine
 fitted again. A row a kind of tie:
 
 predicted    √(Δ−2 ln L) that was promised if the truth is true, median over campaigns
-simulated   what the check by simulation gave in the direction that separates less, against its promise, median ratio
 realised    what the trials gave, against what was promised, median and range of the ratio
 kept        campaigns in which trials were asked for, and those in which 0.8 of the promise or more came true
 CPU         of `next_experiment`, s, median
@@ -139,7 +138,6 @@ def measure(tie: Tie, seed: int) -> dict[str, float] | None:
     promised = found.if_true_sigma[pair][tie.effect]
     return {
         "predicted": promised,
-        "simulated": found.simulated_sigma[pair][0] / found.separation_sigma[pair],
         "realised": math.sqrt(max(gained[0] - gained[1], 0.0)) / promised,
         "cpu": spent,
     }
@@ -157,21 +155,20 @@ def main() -> None:
         seeds = range(arguments.first_seed, arguments.first_seed + arguments.campaigns)
         every = [measure(tie, seed) for seed in track(seeds, description=tie.effect)]
         rows.append(_row(tie, [one for one in every if one is not None], len(every)))
-    head = ("true", "taken for", "predicted σ", "simulated", "realised", "range", "kept", "CPU s")
+    head = ("true", "taken for", "predicted σ", "realised", "range", "kept", "CPU s")
     print("\n".join(table(rows, head)))
 
 
 def _row(tie: Tie, seen: Sequence[Mapping[str, float]], campaigns: int) -> tuple[str, ...]:
     name = f"{tie.effect} ({tie.note})" if tie.note else tie.effect
     if not seen:
-        return name, tie.other, "–", "–", "–", "–", f"0 of 0, {campaigns} campaigns", "–"
+        return name, tie.other, "–", "–", "–", f"0 of 0, {campaigns} campaigns", "–"
     columns = {key: np.array([one[key] for one in seen]) for key in seen[0]}
     ratio = columns["realised"]
     return (
         name,
         tie.other,
         f"{np.median(columns['predicted']):.1f}",
-        f"{np.median(columns['simulated']):.2f}",
         f"{np.median(ratio):.2f}",
         f"{ratio.min():.2f}–{ratio.max():.2f}",
         f"{np.count_nonzero(ratio >= 0.8)} of {len(seen)}",

@@ -272,9 +272,7 @@ def test_another_connector_separates_drag_from_inlet_loss_as_predicted_and_witho
     assert sum(trial["replicates"] for trial in advised.trials) == 4
     assert advised.separation_sigma["air_drag | inlet_loss"] > 8
     assert advised.advice.code == "trials_to_make"
-    (sigma,), ((mean, _),) = advised.separation_sigma.values(), advised.simulated_sigma.values()
-    assert sigma == pytest.approx(mean, rel=0.2)
-    # And as it is with the trials once made.
+    # As it is with the trials once made.
     new = grown(as_trials(advised, pairs[0][0]), 4101)
     predicted = advised.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)

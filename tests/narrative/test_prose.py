@@ -74,7 +74,7 @@ def plan() -> str:
                "new_vine": False, "changed": ["inlet_mm"]}]  # fmt: skip
     pair = "air_drag | inlet_loss"
     facts = {"trials": trials, "if_true": {pair: {"air_drag": 10.0, "inlet_loss": 4.3}}, "least_sigma": 3.0}
-    facts |= {"simulated": {pair: (4.0, 0.5)}, "unresolved": [], "measurement": remark("")}
+    facts |= {"unresolved": [], "measurement": remark("")}
     made = [remark(code, **facts) for code in ("trials_to_make", "no_trials_separate")]
     first = remark("measure_first", faults=["length_scale", "time_base"], measurement=remark(""))
     further = [line for one in (none, enough, never) for line in further_lines(one)]

@@ -56,9 +56,8 @@ from vinetrack.planning.predictive_inputs import prior_ratio
 # The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
 #
 # Every condition within the limits is rated by linear theory, and the best set of trials found by exchange. Its
-# separation is predicted by refitting simulated trials; as a check, the trials are simulated again with the true
-# parameters and all noise drawn anew. Where no trials help, or only measurements are in question, the advice is what to
-# measure instead.
+# separation is predicted by refitting simulated trials. Where no trials help, or only measurements are in question, the
+# advice is what to measure instead.
 
 NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
 
@@ -74,7 +73,6 @@ class NextExperiment:
     trials: tuple[Mapping[str, Any], ...] = ()
     separation_sigma: Mapping[str, float] = field(default_factory=dict)
     if_true_sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    simulated_sigma: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     measurement: Remark = field(default_factory=Remark)
 
     def to_json(self) -> dict[str, Any]:
@@ -84,7 +82,6 @@ class NextExperiment:
             "trials": self.trials,
             "separation_sigma": self.separation_sigma,
             "if_true_sigma": self.if_true_sigma,
-            "simulated_sigma": {pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()},
             "calibration": str(self.measurement) or None,
         }
 
@@ -199,38 +196,21 @@ def _recommendation(terms: Sequence[Hypothesis], design: list[int], rises: Float
     between = _separations(np.concatenate([rises, simulated_rises(terms, design, [1], seed)]))
     expected = _by_pair(between)
     title = {(a, b): f"{names[a]} | {names[b]}" for a, b in expected}
-    worth_it = max(expected.values()) >= least_separation
-    simulated: dict[tuple[int, int], tuple[float, float]] = {}
-    if worth_it:
-        # Draws of the check by number of hypotheses, otherwise one; one less beyond 20 standard deviations (chosen)
-        draws = max({2: 3, 3: 2}.get(len(names), 1) - (min(expected.values()) > 20.0), 1)
-        sigma = np.sqrt(np.maximum(simulated_rises(terms, design, range(draws), seed, thorough=True), 0.0))
-        for a, b in expected:
-            # Mean and standard deviation over the draws, in the direction that separates less
-            known = [drawn[np.isfinite(drawn)] for drawn in (sigma[:, a, b], sigma[:, b, a])]
-            least = min((drawn for drawn in known if drawn.size), key=np.mean, default=None)
-            if least is not None:
-                sd = float(np.std(least, ddof=1)) if least.size > 1 else math.nan
-                simulated[a, b] = float(np.mean(least)), sd
-    unresolved = [
-        pair for pair, sigma in expected.items() if min(sigma, simulated.get(pair, (sigma,))[0]) < least_separation
-    ]
-    worth_it = worth_it and len(unresolved) < len(expected)
+    unresolved = [pair for pair, sigma in expected.items() if sigma < least_separation]
+    worth_it = len(unresolved) < len(expected)
     # Where all pairs are resolved: those that a measurement would decide as well, with an effect of it in only one.
     kinds = [{effect.kind for effect in fit.model} for fit in fits]
     to_measure = unresolved or [(a, b) for a, b in expected if "measurement" in kinds[a] ^ kinds[b]]
     measurement = _deciding_measurements([(fits[a], fits[b]) for a, b in to_measure])
     trials = trial_entries(terms[0].conditions, design)
     if_true = {title[a, b]: {names[a]: float(between[a, b]), names[b]: float(between[b, a])} for a, b in title}
-    by_title = {title[pair]: mean_and_sd for pair, mean_and_sd in simulated.items()}
-    told = {"trials": trials, "least_sigma": least_separation, "if_true": if_true, "simulated": by_title}
+    told = {"trials": trials, "least_sigma": least_separation, "if_true": if_true}
     more = {"unresolved": [title[pair] for pair in unresolved], "measurement": measurement}
     return NextExperiment(
         advice=remark("trials_to_make" if worth_it else "no_trials_separate", **told, **more),
         trials=trials if worth_it else (),
         separation_sigma={title[pair]: sigma for pair, sigma in expected.items()},
         if_true_sigma=if_true,
-        simulated_sigma=by_title,
         measurement=measurement,
     )
 

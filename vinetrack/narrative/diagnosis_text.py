@@ -276,28 +276,21 @@ def _trial_in_words(trial: Mapping[str, Any]) -> str:
     return f"{words}, {' and '.join(changed)}" if changed else words
 
 
-def separation_text(
-    if_true: Mapping[str, Mapping[str, float]], simulated: Mapping[str, tuple[float, float]] | None = None
-) -> str:
+def separation_text(if_true: Mapping[str, Mapping[str, float]]) -> str:
     """Return the expected significance with which the trials separate each pair of hypotheses."""
     parts = []
     for pair, by_truth in if_true.items():
         least, most = sorted(by_truth, key=by_truth.__getitem__)
         # 1.5: ratio from which the larger of two expected significances is stated beside the smaller (chosen)
         is_much_larger = by_truth[most] > 1.5 * max(by_truth[least], 1.0)
-        notes = [f"{by_truth[most]:.2g} σ if {most} is true"] if is_much_larger else []
-        mean, sd = (simulated or {}).get(pair, (math.nan, math.nan))
-        if math.isfinite(mean):
-            notes.append(f"simulated: {mean:.2g}" + (f" ± {max(sd, 0.1):.1g} σ" if math.isfinite(sd) else " σ"))
-        remark = f" ({'; '.join(notes)})" if notes else ""
-        parts.append(f"{pair.replace(' | ', ' from ')} by {by_truth[least]:.2g} σ{remark}")
+        note = f" ({by_truth[most]:.2g} σ if {most} is true)" if is_much_larger else ""
+        parts.append(f"{pair.replace(' | ', ' from ')} by {by_truth[least]:.2g} σ{note}")
     return ", ".join(parts)
 
 
 def advice_text(
     trials: Sequence[Mapping[str, Any]],
     if_true: Mapping[str, Mapping[str, float]],
-    simulated: Mapping[str, tuple[float, float]],
     unresolved: Sequence[str],
     measurement: Remark,
     least_sigma: float,
@@ -305,7 +298,7 @@ def advice_text(
     worth_it: bool = True,
 ) -> str:
     """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead."""
-    promise, advice = separation_text(if_true, simulated), str(measurement)
+    promise, advice = separation_text(if_true), str(measurement)
     if not worth_it:
         return (
             f"No trials within `limits` separate the tied hypotheses by {least_sigma:g} σ; the best would separate"

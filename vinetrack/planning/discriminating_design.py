@@ -50,7 +50,7 @@ from vinetrack.inference.sensitivity import (
     align,
     initial_trial_effects,
 )
-from vinetrack.planning.predictive_inputs import damping_scatter, hoop_stress_Pa, prior_ratio
+from vinetrack.planning.predictive_inputs import hoop_stress_Pa, prior_ratio
 from vinetrack.tracks.position_noise import ar1_noise
 
 # ------------------------------------------------------------------------------
@@ -469,11 +469,10 @@ def _speed_ratio(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) ->
 
 
 def film_trials(
-    truth: Hypothesis, places: Sequence[int], theta: Floats, deviations: Floats, rng: np.random.Generator
+    truth: Hypothesis, places: Sequence[int], deviations: Floats, rng: np.random.Generator
 ) -> list[tuple[int, FitTrial]]:
     """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise, and
-    select usable points as for a fit; without those that have too few. Shapes: theta (n_free,); deviations (n_places,
-    2).
+    select usable points as for a fit; without those that have too few. Shapes: deviations (n_places, 2).
     """
     rho, frames_s = truth.fit.solution.state.rho, [truth.frame_s(place) for place in places]
     times = [s * np.arange(truth.rest_frames + math.ceil(truth.longest_s / s), dtype=float) for s in frames_s]
@@ -482,7 +481,7 @@ def film_trials(
     trial_effects[:, RELEASE] = [(truth.rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
     trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(places))
     trial_effects[:, DEVIATION_COLUMNS] = np.where(_may_deviate(predictor), deviations, 0.0)
-    moved = predictor.run(predictor.jobs(theta, trial_effects))
+    moved = predictor.run(predictor.jobs(truth.theta, trial_effects))
     filmed: list[tuple[int, FitTrial]] = []
     for place, blank, trajectory, effects in zip(places, predictor.data, moved, trial_effects, strict=True):
         stop = blank.time_s.size
@@ -636,13 +635,10 @@ def worth(between: Floats) -> Floats:
 # Separation by further trials, found by simulating them and refitting the hypotheses to old and new trials.
 #
 # Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
-# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials;
-# between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can explain
-# part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
-#
-# There are two levels of detail. The quick one sets the truth to the best values and treats the old trials as linear in
-# the parameters, which is fast enough to compare designs. The thorough one draws the truth from its distribution given
-# the old trials and simulates every trajectory anew, as a check.
+# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials, the
+# old ones as linear in the parameters; between-trial standard deviations and noise are estimated anew as in a
+# diagnosis, so a wrong hypothesis can explain part of its misfit as scatter. The squared separation is the increase in
+# the difference of −2 ln L.
 
 
 class PartlyLinear(Predictor):
@@ -684,13 +680,10 @@ class PartlyLinear(Predictor):
         return [of_fit[:, -1] - of_fit[:, :-1] @ step for of_fit, step in zip(columns, steps, strict=True)]
 
 
-def simulated_rises(
-    hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool = False
-) -> Floats:
+def simulated_rises(hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair; NaN where a refit fails. The truth is at its best
     values and the deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the
-    average. If `thorough`, both are random and every trajectory is simulated: only where the pressure was recorded do
-    the old trials stay linear, for to simulate those takes a hundred times as long. Shape (n_draws, n, n).
+    average. Shape (n_draws, n, n).
     """
     n = len(hypotheses)
     # Deviations of pressure and B in standard deviations, balanced over replicates (derived)
@@ -698,39 +691,19 @@ def simulated_rises(
     rises = np.full((len(draws), n, n), math.nan)
     before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in hypotheses])
     for k, a in np.ndindex(len(draws), n):
-        rng, truth = np.random.default_rng([seed, int(thorough), draws[k], a]), hypotheses[a]
-        theta, deviations = truth.theta, alternating[(np.arange(len(design)) + draws[k]) % 4]
-        if thorough:
-            theta, deviations = _drawn_parameters(truth, rng), rng.standard_normal((len(design), 2))
+        rng, truth = np.random.default_rng([seed, 0, draws[k], a]), hypotheses[a]
+        deviations = alternating[(np.arange(len(design)) + draws[k]) % 4] * truth.fit.solution.state.spread
         try:
-            new = film_trials(truth, design, theta, deviations * truth.fit.solution.state.spread, rng)
+            new = film_trials(truth, design, deviations, rng)
         except SimulationError:
             continue
         if new:
-            after = np.array([_refitted(hypothesis, new, thorough) for hypothesis in hypotheses])
+            after = np.array([_refitted(hypothesis, new) for hypothesis in hypotheses])
             rises[k, a] = after - before - (after[a] - before[a])
     return rises
 
 
-def _drawn_parameters(truth: Hypothesis, rng: np.random.Generator) -> Floats:
-    """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
-    Returns free parameters, scaled, within their bounds. Shape (n_free,).
-    """
-    furthest_draw = 2.0  # Standard deviations at which draws are clipped: the linearised fit holds no further (chosen)
-    old = truth.n_old
-    values, vectors = np.linalg.eigh(truth.so_far[0, :old, :old])
-    is_determined = values > 1e-9 * values[-1]
-    sd = np.where(is_determined, 1 / np.sqrt(np.where(is_determined, values, 1.0)), 0.0)
-    normal = np.clip(rng.standard_normal(old), -furthest_draw, furthest_draw)
-    added = truth.layout.free[old:]
-    stated_sd = [new.prior_sd / new.scale if math.isfinite(new.prior_sd) else 0.0 for new in added]
-    sd_of_new = [damping_scatter() if new.key == DAMPING else sd for new, sd in zip(added, stated_sd, strict=True)]
-    change = np.concatenate([vectors @ (sd * normal), rng.standard_normal(len(added)) * np.array(sd_of_new)])
-    below, above = truth.room
-    return np.asarray(truth.theta + np.clip(change, -below, above))
-
-
-def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], thorough: bool) -> float:
+def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]]) -> float:
     """−2 ln L of a hypothesis fitted to old trials and to new ones of these conditions; NaN where the fit fails."""
     most = 20  # Iterations of a refit, at most (chosen)
     fit, old = hypothesis.fit, hypothesis.fit.solution
@@ -745,27 +718,24 @@ def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]], thoro
         base=np.concatenate([before.base, wide.base[rows]]),
     )
     theta, data = hypothesis.theta[used], [trial_data for _, trial_data in new]
-    quick = PartlyLinear(layout, fit, data)
+    predictor = PartlyLinear(layout, fit, data)
     try:
         # New releases are aligned, and the noise of the new trials is that of the old.
-        aligned, _ = align(data, quick.new, theta, initial_trial_effects(data))
+        aligned, _ = align(data, predictor.new, theta, initial_trial_effects(data))
         state = replace(
             old.state,
             theta=theta,
             trial_effects=np.concatenate([old.state.trial_effects, aligned]),
             variance=np.concatenate([old.state.variance, np.full(len(data), hypothesis.variance)]),
         )
-        problem = make_problem(quick, state.trial_effects)
-        problem.release_origin_mean[: quick.n_old] = old.problem.release_origin_mean
+        problem = make_problem(predictor, state.trial_effects)
+        problem.release_origin_mean[: predictor.n_old] = old.problem.release_origin_mean
         # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
         fixed = FixedTerms(state.spread, (state.rho, state.variance))
-        solution = solve(quick, problem, state, fixed, warm=True, most_iterations=most)
-        whole: Predictor = quick
-        if thorough and all(trial_data.trace is None for trial_data in fit.predictor.data):
-            whole = _stepped_as(fit, layout, quick.data)
-            whole.steps = quick.new.steps.copy()
-        solution = solve(whole, problem, solution.state, warm=True, most_iterations=most)
-        smooth = smooth_errors(whole, solution)  # which absorb part of what is wrong in a hypothesis, as in every fit
+        solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
+        solution = solve(predictor, problem, solution.state, warm=True, most_iterations=most)
+        # These absorb part of what is wrong in a hypothesis, as in every fit.
+        smooth = smooth_errors(predictor, solution)
     except SimulationError:
         return math.nan
     return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))

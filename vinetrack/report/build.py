@@ -284,12 +284,10 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
     rows = [
         [number(trial.get(key)) if key != "replicates" else str(trial.get(key)) for key in shown] for trial in trials
     ]
-    simulated = content.get("simulated_sigma") or {}
-    separations = []
-    for pair, sigma in (content.get("separation_sigma") or {}).items():
-        found = simulated.get(pair) or {}
-        spread = f"{number(found['mean'], 2)} ± {number(found.get('sd'), 1)}" if is_finite(found.get("mean")) else "–"
-        separations.append((" from ".join(map(spaced_name, pair.split(" | "))), number(sigma, 2), spread))
+    separations = [
+        (" from ".join(map(spaced_name, pair.split(" | "))), number(sigma, 2))
+        for pair, sigma in (content.get("separation_sigma") or {}).items()
+    ]
     return {
         "text": str(content.get("text") or ""),
         "trials": ReportTable("", head, rows if head else (), frozenset(range(len(head)))),
