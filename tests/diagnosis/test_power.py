@@ -171,41 +171,6 @@ def test_no_trials_are_added_where_none_are_needed_and_a_target_out_of_reach_is_
     assert never.unlimited < 0.9
 
 
-CONNECTOR_LIMITS = Limits(
-    pressure_kPa=(14.0, 40.0), payload_g=(0.0, 0.0), inlet_mm=(5.5, 8.0), chamber_l=(3.7,), trials=4
-)
-NAMES = ("inlet_loss", "linear_damping", "leak")
-
-
-def sizes_with(design: campaign_power.CampaignDesign, settings: list[tuple[float, float]]) -> np.ndarray:
-    like = design.trials[0]
-    added = [replace(like, name=f"a{k}", pressure_Pa=1e3 * P, inlet_m=mm / 1e3) for k, (P, mm) in enumerate(settings)]
-    tests, _ = planned_tests(with_trials(design, added))
-    return np.array([linear_power.effect_power(tests, name).size_at(0.9) for name in NAMES])
-
-
-@pytest.mark.slow
-def test_what_is_recommended_reveals_more_than_repeats_do_and_as_much_as_promised():
-    """After three trials of one vine at each of two pressures, through a connector that is always the same."""
-    design = planned(3, (0.005, 0.02), (14, 24), NAMES, chamber_l="3.7", inlet_mm="8")
-    found = advice.exploratory_trials(design, power_with(design, nonlinear=True), CONNECTOR_LIMITS)
-    settings = [(t["pressure_kPa"], t["inlet_mm"]) for t in found.trials for _ in range(t["replicates"])]
-    assert len(settings) == 4
-    recommended = np.array([found.then[name].size_at(0.9) for name in NAMES])
-    assert recommended.tolist() == pytest.approx(sizes_with(design, settings).tolist(), rel=0.03)
-    repeated = sizes_with(design, [(14.0, 8.0), (14.0, 8.0), (24.0, 8.0), (24.0, 8.0)])
-    # The loss of a connector shows once another connector is used, and what it is taken for with it; a leak is found
-    # by either design at a thousandth of its largest plausible size.
-    assert np.all(recommended[:2] < 0.1 * repeated[:2])
-    assert recommended[2] < 1e-3 * found.now["leak"].largest
-
-
-def test_information_apart_from_the_most_similar_rival():
-    alone, apart = advice._alone_and_distinct(np.array([[[4.0, 2.0, 1.0], [2.0, 5.0, 0.0], [1.0, 0.0, 0.5]]]))
-    assert alone.tolist() == [[4.0, 5.0, 0.5]]
-    assert apart[0] == pytest.approx([4 - 1 / 0.5, 5 - 4 / 4, 0.5 - 1 / 4])
-
-
 FITTED = ["air_drag", "inlet_loss", "reservoir_depletion", "tail_friction", "length_scale", "time_base"]
 HOST = vt.make_model([*BASE_EFFECTS, *FITTED])  # one compiled model serves all that are fitted here
 

@@ -201,16 +201,6 @@ def test_simulated_campaigns_are_counted_beside_the_prediction(folder, monkeypat
     assert (leak.count, leak.value, leak.named) == (2, pytest.approx(0.01), (("leak", 2),))
 
 
-@pytest.mark.slow
-def test_the_trials_that_would_reveal_most_are_recommended(tmp_path):
-    power = power_of_target(
-        PowerRequest(planned(tmp_path, "limits: {pressure_kPa: 14:40, trials: 2}\n"), recommend=True)
-    )
-    assert power.recommended is not None
-    assert sum(trial["replicates"] for trial in power.to_json()["recommended_trials"]) == 2
-    assert any(power.recommended.then[name].size_at(0.9) < power[name].size_at(0.9) for name in ("leak", "air_drag"))
-
-
 ROOT = Path(__file__).parents[2]
 CHOSEN = (
     *(f"R{scale}_{kPa}kPa_1" for scale, kPa in ((1, "15p1"), (1, "19p4"), (1, "23p7"), (2, "12p7"), (2, "19p1"))),

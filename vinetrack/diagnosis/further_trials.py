@@ -16,15 +16,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
-from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shapes
+from vinetrack.diagnosis.linear_power import effect_power, typical_shapes
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials, InformativeTrials, Power
+from vinetrack.diagnosis.power import EffectPower, FurtherTrials
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
@@ -235,42 +234,36 @@ def _entry(condition: Condition, *more: str) -> dict[str, Any]:
 # ------------------------------------------------------------------------------
 # Information of candidate designs about the sizes of effects, by linear theory.
 #
-# With trial effects eliminated, the cross products of free parameters, shared systematic errors and the shapes of the
-# effects add up over trials. Of a design with n_c trials of condition c, and the trials so far,
+# With trial effects eliminated, the cross products of free parameters, shared systematic errors and the shape of the
+# effect add up over trials. Of a design with n_c trials of condition c, and the trials so far,
 #
 #     M = M_prior + M_so_far + Σ_c n_c M_c,   I = M_aa − M_aν M_νν⁻¹ M_νa
 #
-# is the information about the sizes a with all other unknowns ν free: its diagonal is about each effect alone, and
-# I_ee − I_ef² / I_ff about effect e with effect f free as well. One trial of every condition is therefore simulated
-# once, and designs are evaluated by linear algebra.
+# is the information about the size a with all other unknowns ν free. One trial of every condition is therefore
+# simulated once, and designs are evaluated by linear algebra.
 
 REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
 UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
 
-Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products
-
 
 class DesignInformation:
-    """Information of designs about the sizes of some effects with everything else free. `conditions` are those that can
-    be filmed; `each`, shape (n_conditions, n, n), is what `REPLICATES` trials of each add, the effects last.
+    """Information of designs about the size of an effect with everything else free. `conditions` are those that can be
+    filmed; `each`, shape (n_conditions, n, n), is what `REPLICATES` trials of each add, the effect last.
     """
 
-    def __init__(self, design: CampaignDesign, every: Sequence[Condition], effects: Sequence[str]) -> None:
-        tests = tests_with_conditions(design, every, tuple(effects))
+    def __init__(self, design: CampaignDesign, every: Sequence[Condition], effect: str) -> None:
+        tests = tests_with_conditions(design, every, (effect,))
         fit, products, problem = tests.fit, tests.products, tests.products.problem
-        shape_of = {name: shapes[-1] for name in effects if (shapes := typical_shapes(tests, name))}
-        self.effects = list(shape_of)
-        # Unknowns of the fit, then sizes of the effects; not the residual and other shapes
-        known = problem.prior_mean.size
-        size = known + len(shape_of)
+        # Unknowns of the fit, then the size of the effect; not the residual and other shapes
+        size = problem.prior_mean.size + 1
         residual_and_shapes = np.full(1 + products.n_shapes, -1)
-        residual_and_shapes[[1 + index for index in shape_of.values()]] = np.arange(known, size)
+        residual_and_shapes[1 + typical_shapes(tests, effect)[-1]] = size - 1
         index = np.concatenate([problem.index, np.tile(residual_and_shapes, (len(fit.trials), 1))], axis=1)
         of_trials = at_unknowns(products_without_trial_effects(products, fit.state), index, size)
         # 1e-6: prior precision of parameters that no trial determines yet, such as B of a vine that has not been made
-        # (chosen); sizes of effects have none.
-        prior = np.append(np.maximum(problem.prior_precision, 1e-6), np.zeros(len(shape_of)))
+        # (chosen); the size of the effect has none.
+        prior = np.append(np.maximum(problem.prior_precision, 1e-6), 0.0)
         # 12: frames of growth below which a trial is not worth filming (chosen)
         before = {trial.name for trial in design.trials}
         places = {trial.name: k for k, trial in enumerate(fit.trials)}
@@ -286,41 +279,23 @@ class DesignInformation:
         return np.asarray(self.so_far + self.each[list(chosen)].sum(axis=0))
 
     def of(self, totals: Floats) -> Floats:
-        """Information about the sizes of the effects with all other unknowns free. Shapes: totals (n_designs, n, n) →
-        (n_designs, n_effects, n_effects).
-        """
-        count = len(self.effects)
-        cross = totals[:, :-count, -count:]
-        solved = np.linalg.solve(totals[:, :-count, :-count], cross)
-        return np.asarray(totals[:, -count:, -count:] - np.swapaxes(cross, 1, 2) @ solved)
-
-    def of_first(self, totals: Floats) -> Floats:
-        """Information about the first effect alone, shape (n_designs,)."""
-        return np.asarray(np.maximum(self.of(totals)[:, 0, 0], 0.0))
+        """Information about the size with all other unknowns free. Shapes: totals (n_designs, n, n) → (n_designs,)."""
+        cross = totals[:, :-1, -1:]
+        solved = np.linalg.solve(totals[:, :-1, :-1], cross)
+        information = totals[:, -1:, -1:] - np.swapaxes(cross, 1, 2) @ solved
+        return np.asarray(np.maximum(information[:, 0, 0], 0.0))
 
     def of_design(self, chosen: Sequence[int]) -> float:
-        """Information about the first effect from these trials and those so far."""
-        return float(self.of_first(self.total(chosen)[None])[0])
+        """Information from these trials and those so far."""
+        return float(self.of(self.total(chosen)[None])[0])
 
-    def grown(self, allowed: NDArray[np.intp], worth: Worth, most: int, wanted: float = math.inf) -> list[int]:
-        """Groups of trials added one by one, up to the `wanted` worth or `most` groups, and exchanged."""
-        chosen: list[int] = []
-        now = float(worth(self.so_far[None])[0])
-        while now < wanted and len(chosen) < most:
-            values = worth(self.total(chosen) + self.each[allowed])
-            if not np.max(values) > now:
-                break
-            chosen.append(int(allowed[int(np.argmax(values))]))
-            now = float(np.max(values))
-        return self._improved(chosen, allowed, worth)
-
-    def _improved(self, chosen: list[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
+    def _improved(self, chosen: list[int], allowed: NDArray[np.intp]) -> list[int]:
         """The same number of groups, exchanged."""
-        now = float(worth(self.total(chosen)[None])[0])
-        return exchanged(chosen, now, allowed, lambda others: worth(self.total(others) + self.each[allowed]))[0]
+        now = self.of_design(chosen)
+        return exchanged(chosen, now, allowed, lambda others: self.of(self.total(others) + self.each[allowed]))[0]
 
     def fewest(self, wanted: float, most: int) -> tuple[list[int], dict[str, int]]:
-        """The fewest pairs that reach the wanted information about the first effect, else the best `most`; and how many
+        """The fewest pairs that reach the wanted information, else the best `most`; and how many
         trials by effort.
         """
 
@@ -334,7 +309,7 @@ class DesignInformation:
             new = list(dict.fromkeys(vines[places].tolist()))
             unlimited = [self.so_far + UNLIMITED_TRIALS * self.each[vines == vine].sum(axis=0) for vine in new]
             # 2: new vines that are tried, one at a time (chosen)
-            return [new[k] for k in np.argsort(-self.of_first(np.stack(unlimited)))[:2]]
+            return [new[k] for k in np.argsort(-self.of(np.stack(unlimited)))[:2]]
 
         options: dict[str, list[int]] = {}
         effort_words = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
@@ -348,16 +323,24 @@ class DesignInformation:
         """Pairs added one by one up to the wanted information, exchanged, and removed where not needed; the most
         informative first.
         """
-        chosen = self.grown(allowed, self.of_first, most, wanted)
+        chosen: list[int] = []
+        now = self.of_design(chosen)
+        while now < wanted and len(chosen) < most:
+            values = self.of(self.total(chosen) + self.each[allowed])
+            if not np.max(values) > now:
+                break
+            chosen.append(int(allowed[int(np.argmax(values))]))
+            now = float(np.max(values))
+        chosen = self._improved(chosen, allowed)
         while len(chosen) > 1:
-            least = int(np.argmax(self.of_first(self.total(chosen) - self.each[chosen])))
-            fewer = self._improved(chosen[:least] + chosen[least + 1 :], allowed, self.of_first)
+            least = int(np.argmax(self.of(self.total(chosen) - self.each[chosen])))
+            fewer = self._improved(chosen[:least] + chosen[least + 1 :], allowed)
             if self.of_design(fewer) < wanted:
                 break
             chosen = fewer
         order: list[int] = []
         while chosen:
-            gains_of = self.of_first(self.total(order) + self.each[chosen])
+            gains_of = self.of(self.total(order) + self.each[chosen])
             order.append(chosen.pop(int(np.argmax(gains_of))))
         return order
 
@@ -427,7 +410,7 @@ def further_trials(
     feasible = feasible_conditions(design.trials, limits)
     if before >= target or not feasible:
         return replace(plan, unlimited=before)
-    search = DesignInformation(design, feasible, (now.effect,))
+    search = DesignInformation(design, feasible, now.effect)
     deviation = abs(value - now.zero)
     wanted = search.of_design(()) * (abs(now.size_at(target) - now.zero) / deviation) ** 2
     if not math.isfinite(wanted):
@@ -459,58 +442,7 @@ def _evaluated(
             cells = _entry(condition, "yield_pressure_kPa", "capture_fps")
             known = {name: value for name, value in cells.items() if value == value}  # NaN is not equal to itself
             trials.append({**known, "probability": probability})
-    endless = search.of_first((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
+    endless = search.of((search.so_far + UNLIMITED_TRIALS * search.each.sum(axis=0))[None])[0]
     ratio = math.sqrt(endless / max(search.of_design(chosen[: len(trials) // REPLICATES]), 1e-300))
     unlimited = power.probability_at(power.zero + ratio * (plan.value - power.zero))
     return replace(plan, trials=tuple(trials), power=power, unlimited=max(unlimited, probability))
-
-
-# ------------------------------------------------------------------------------
-# Further trials for a campaign that goes on: those that reveal most where nothing is found, or confirm what is named.
-#
-# A size a of an effect is detected with probability Φ(a √I − c), with I the information about it
-# (`design_information`) and c the threshold of its score. Averaged over sizes spread evenly in their logarithm over
-# the decade below the largest plausible one, and summed over all candidates, that is the expected number of effects
-# that a design would detect if each were missing in turn. With I_ee − I_ef² / I_ff in place of I, for the most
-# similar other candidate f, it is the expected number that it would tell from every other. The design with the
-# largest sum of both is found by adding pairs of trials one by one and exchanging them (Fedorov 1972, Theory of
-# Optimal Experiments).
-
-# Sizes of an effect that are averaged over, relative to its largest plausible one (chosen)
-SIZES = np.geomspace(0.1, 1.0, 9)
-
-
-def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | None = None) -> InformativeTrials | None:
-    """Find the further trials within the limits that would reveal most of what could be missing."""
-    limits = limits or Limits()
-    feasible = feasible_conditions(design.trials, limits.model_copy(update={"new_vines": False}))
-    if not feasible or not power.effects:
-        return None
-    search = DesignInformation(design, feasible, [entry.effect for entry in power.effects])
-    if not search.conditions or not search.effects:
-        return None
-    largest = np.array([abs(power[name].largest - power[name].zero) for name in search.effects])
-
-    def expected_discoveries(totals: Floats) -> Floats:
-        """Expected numbers of effects that are detected, and that are told from all others, added up."""
-        information = np.stack(_alone_and_distinct(search.of(totals)))
-        scores = SIZES[:, None, None, None] * largest * np.sqrt(information)
-        return np.asarray(ndtr(scores - power.threshold).mean(axis=0).sum(axis=(0, 2)))
-
-    every = np.arange(len(search.conditions))
-    chosen = search.grown(every, expected_discoveries, max(limits.trials // REPLICATES, 1))
-    if not chosen:
-        return None
-    groups = [k for k in chosen for _ in range(min(REPLICATES, limits.trials))]
-    added = [search.conditions[k] for k in groups]
-    then = power_of(tests_of_designs(design, added)(added), nonlinear=True)
-    return InformativeTrials(trial_entries(search.conditions, groups), power, then)
-
-
-def _alone_and_distinct(information: Floats) -> tuple[Floats, Floats]:
-    """Information about each effect, alone and with its most similar rival free, shape (n_designs, n_effects)."""
-    alone = np.maximum(np.diagonal(information, axis1=1, axis2=2), 0.0)
-    shared = information**2 / np.maximum(alone, 1e-300)[:, None, :]
-    diagonal = np.arange(alone.shape[1])
-    shared[:, diagonal, diagonal] = 0.0
-    return alone, np.maximum(alone - shared.max(axis=2), 0.0)

@@ -188,17 +188,6 @@ class FurtherTrials:
         }
 
 
-@dataclass(frozen=True)
-class InformativeTrials:
-    """Recommended trials, and what they would show. `trials` are entries as of a next experiment; `now` and `then` are
-    the power of the trials so far, and of these together with those recommended.
-    """
-
-    trials: tuple[Mapping[str, Any], ...]
-    now: Power
-    then: Power
-
-
 StoredRemark = Annotated[Remark, BeforeValidator(Remark.from_json), PlainSerializer(Remark.to_json)]
 
 
@@ -221,7 +210,6 @@ class Power(JsonRecord):
     # Written below, and not read again
     simulated: Annotated[tuple[SimulatedRates, ...], Field(exclude=True, alias="unread_simulated")] = ()
     further: Annotated[tuple[FurtherTrials, ...], Field(exclude=True)] = ()
-    recommended: Annotated[InformativeTrials | None, Field(exclude=True)] = None
 
     @property
     def false_alarm_rate(self) -> float:
@@ -252,7 +240,6 @@ class Power(JsonRecord):
             "wary": str(self.wary),
             "simulated": [rates.to_json() for rates in self.simulated],
             "in_words": str(remark("detectable", power=self)).splitlines(),
-            **({"recommended_trials": list(self.recommended.trials)} if self.recommended else {}),
             **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
 

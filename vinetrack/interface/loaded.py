@@ -520,8 +520,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     **options
         Options of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
         `spread_B` (relative), `capture_fps`, `B`, `n`; `simulate`, `jobs`, `first_seed` for complete diagnoses
-        of simulated campaigns; `reach`, the probability with which further trials shall detect `name=size`;
-        `recommend`, whether to search for the trials that would reveal most.
+        of simulated campaigns; `reach`, the probability with which further trials shall detect `name=size`.
 
     Returns
     -------

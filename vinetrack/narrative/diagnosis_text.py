@@ -23,7 +23,6 @@ from vinetrack.effects import Effect, remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.narrative.verdict_text import (
     EXPECTED,
-    MOST_NAMED,
     SHARED_REMEDIES,
     estimates_text,
     expected_text,
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
     from vinetrack.core.problems import Remark
     from vinetrack.core.records import Trial
     from vinetrack.diagnosis.force_laws import Law
-    from vinetrack.diagnosis.further_trials import InformativeTrials
     from vinetrack.diagnosis.learned_force import LearnedForce
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power
     from vinetrack.diagnosis.propose import Proposal
@@ -172,8 +170,6 @@ def power_lines(power: Power) -> list[str]:
         halves = [percent(one.half_width) if one.is_relative else number(one.half_width, 2) for one in power.numbers]
         names = [f"{one.name} ({one.vine})" if one.vine else one.name for one in power.numbers]
         lines.append(f"95 % intervals: {', '.join(map(' ± '.join, zip(names, halves, strict=True)))}.")
-    if power.recommended is not None:
-        lines += ["", informative_text(power.recommended)]
     for plan in power.further:
         lines += ["", *further_lines(plan)]
     return lines + simulated_lines(power)
@@ -313,33 +309,6 @@ def advice_text(
     elif advice:
         text += f" A measurement would decide as well: {advice}"
     return text.rstrip()
-
-
-# ------------------------------------------------------------------------------
-# Trials that would reveal most, in words.
-
-
-def informative_text(plan: InformativeTrials) -> str:
-    """Return recommended trials in words, and the detectable sizes that they lower most."""
-    before = {entry.effect: entry for entry in plan.now.effects}
-    gains = []
-    for then in plan.then.effects:
-        now, size = before.get(then.effect), abs(then.size_at(0.9) - then.zero)
-        # Where the size detected with 90 % power is no larger than the largest plausible one: the factor by which it
-        # falls; 0 where either is unknown
-        if now is not None and size <= abs(then.largest - then.zero):
-            at_first = abs(now.size_at(0.9) - now.zero)
-            gains.append((now, then, at_first / size if math.isfinite(at_first) and size > 0 else 0.0))
-    # 1.1: factor by which a detectable size must fall to be stated (chosen)
-    gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > 1.1][:MOST_NAMED]
-    lower = [
-        f"{spaced_name(then.effect)} from {then.symbol or 'size'} = {size_text(now, now.size_at(0.9))} to "
-        f"{size_text(then, then.size_at(0.9))}"
-        for now, then, _ in gains
-    ]
-    sizes = f" They lower the size that is detected with 90 % power: {joined(lower)}." if lower else ""
-    made = trials_in_words(plan.trials)
-    return f"Make {made}. These trials are expected to reveal most of what could be missing.{sizes}"
 
 
 # ------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,7 @@ from vinetrack.diagnosis.campaign_power import (
     rates_of,
     simulated_diagnosis,
 )
-from vinetrack.diagnosis.further_trials import exploratory_trials, further_trials
+from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
@@ -68,25 +69,23 @@ class PowerRequest:
     jobs: int = 1
     first_seed: int = 1
     reach: float = math.nan
-    recommend: bool = False
     experiment: Path | None = None
 
-
-def _assumed(stated: tuple[float, float], otherwise: Sequence[float], origin: str) -> tuple[tuple[float, float], str]:
-    """A pair of numbers, each as stated, else as given otherwise; and where they come from."""
-    first, second = np.where(np.isnan(stated), otherwise, stated).tolist()
-    return (first, second), origin if np.isnan(stated).all() else "stated"
-
-
-def _inputs_in_words(
-    noise: tuple[float, float], of_noise: str, spreads: tuple[float, float], of_spreads: str
-) -> list[PowerInput]:
-    """Noise of a position, m, with its correlation, and standard deviations between trials of pressure and B."""
-    return [
-        PowerInput("noise of a position", f"{1e3 * noise[0]:.3g} mm, correlation {noise[1]:.2f}", of_noise),
-        PowerInput("spread of pressure from trial to trial", f"{100 * spreads[0]:.2g} %", of_spreads),
-        PowerInput("spread of B from trial to trial", f"{100 * spreads[1]:.2g} %", of_spreads),
-    ]
+    def scatter(
+        self, noise: Sequence[float], of_noise: str, spreads: Sequence[float], of_spreads: str
+    ) -> tuple[tuple[float, float], tuple[float, float], list[PowerInput]]:
+        """Noise of a position, m, with its correlation, and standard deviations of pressure and B between trials: each
+        as stated, else as given here; and both in words with where they come from.
+        """
+        stated = np.array([[self.noise_mm / 1e3, self.noise_correlation], [self.spread_P, self.spread_B]])
+        (sigma_m, correlation), (of_P, of_B) = np.where(np.isnan(stated), [noise, spreads], stated).tolist()
+        origins = np.where(np.isnan(stated).all(axis=1), [of_noise, of_spreads], "stated").tolist()
+        inputs = [
+            PowerInput("noise of a position", f"{1e3 * sigma_m:.3g} mm, correlation {correlation:.2f}", origins[0]),
+            PowerInput("spread of pressure from trial to trial", f"{100 * of_P:.2g} %", origins[1]),
+            PowerInput("spread of B from trial to trial", f"{100 * of_B:.2g} %", origins[1]),
+        ]
+        return (sigma_m, correlation), (of_P, of_B), inputs
 
 
 Campaign = tuple[Power, CampaignDesign, Limits]  # Power by linear theory, design, and constraints on further trials
@@ -94,21 +93,20 @@ Campaign = tuple[Power, CampaignDesign, Limits]  # Power by linear theory, desig
 
 def _campaign_of_target(request: PowerRequest) -> Campaign:
     """Return the campaign of the measured trials of a results folder or an experiment; without any, of the planned."""
-    target = request.target
-    experiment: Experiment | None
+    target, added = request.target, tuple[str, ...]()
+    experiment: Experiment | None = None
     if (target / PROVENANCE).exists():
         results, experiment = Results(target), read_source_experiment(target, request.experiment)
         diagnosis = read_diagnosis(results)
-        added = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
+        if diagnosis is not None and diagnosis.final_verdict == ADEQUATE:
+            added = diagnosis.effects
         pairs: Pairs = measured_trials(experiment, results)[0]
     else:
-        try:
+        with suppress(ExperimentError):  # recordings that do not exist yet: a plan
             experiment = read_experiment(target) if target.is_dir() else None
-        except ExperimentError:
-            experiment = None  # recordings that do not exist yet: a plan
         if experiment is None or all(trial.track is None for trial in experiment.trials):
             return _planned_campaign(request, planned_sheet(target, every_row=True))
-        pairs, added = pairs_of(experiment)[0], ()
+        pairs = pairs_of(experiment)[0]
     settings = experiment.settings
     names = dict.fromkeys((*settings.model, *added))
     model = make_model(names, effects_of(experiment.folder) if settings.effects else {})
@@ -121,31 +119,29 @@ def _measured_campaign(
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     host = host_for(model, candidates_of(model, candidates, model.user_effects))
     fitted = fit(model, pairs, host=host, profile=False, thorough=False)
-    otherwise = fitted.noise_m, fitted.noise_correlation
-    noise, of_noise = _assumed((request.noise_mm / 1e3, request.noise_correlation), otherwise, "fit")
-    spreads, of_spreads = _assumed((request.spread_P, request.spread_B), fitted.state.spread, "fit")
-    inputs: Sequence[PowerInput] = ()
-    if "stated" in (of_noise, of_spreads):
-        of_trials, of_points = spreads if of_spreads == "stated" else None, noise if of_noise == "stated" else None
+    noise, spreads, inputs = request.scatter(
+        (fitted.noise_m, fitted.noise_correlation), "fit", fitted.state.spread, "fit"
+    )
+    of_points = noise if inputs[0].origin == "stated" else None
+    of_trials = spreads if inputs[1].origin == "stated" else None
+    if of_points or of_trials:
         fitted = fit(model, pairs, spreads=of_trials, noise=of_points, host=host, profile=False, thorough=False)
-        inputs = _inputs_in_words(noise, of_noise, spreads, of_spreads)
+    else:
+        inputs = []
     power = power_of(*fitted_tests(fitted, candidates), inputs, nonlinear=True)
     return power, design_of_fit(fitted, candidates), limits
 
 
 def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
-    default_noise, default_capture_fps = (1e-4, 0.0), 1069.0  # Noise of a position, and frame rate (chosen)
     settings = planned.settings
     stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=effects_of_plan(planned))
-    first_of_vine = {trial.vine: trial for trial in reversed(planned.trials)}
-    by_vine = {
-        vine: predictive_inputs(first_of_vine[vine], stated) for vine in dict.fromkeys(t.vine for t in planned.trials)
-    }
+    of_vines = {trial.vine: trial for trial in reversed(planned.trials)}
+    by_vine = {trial.vine: predictive_inputs(of_vines[trial.vine], stated) for trial in planned.trials}
     first = next(iter(by_vine.values()))
-    noise, of_noise = _assumed((request.noise_mm / 1e3, request.noise_correlation), default_noise, "guess")
+    # 1e-4: noise of a position, m (chosen)
     usual = "guess: a usual batch of vines"
-    spreads, of_spreads = _assumed((request.spread_P, request.spread_B), first.spreads, usual)
+    noise, spreads, inputs = request.scatter((1e-4, 0.0), "guess", first.spreads, usual)
     systematic_m, systematic_origin = _planned_systematic(request, planned)
     trials, cameras = [], []
     for trial in planned.trials:
@@ -153,12 +149,11 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> Campaign
             assumed_Pa = by_vine[trial.vine].trial.yield_pressure_Pa
             trial = replace(trial, yield_pressure_Pa=assumed_Pa, yield_pressure_sigma_Pa=1e3 * YIELD_SIGMA_KPA)
         trials.append(replace(trial, position_systematic_m=systematic_m))
-        rates = (request.capture_fps, trial.capture_fps, default_capture_fps)
+        rates = (request.capture_fps, trial.capture_fps, 1069.0)  # the last: chosen
         cameras.append(FilmingPlan(next(filter(math.isfinite, rates)), *noise))
     is_in_sheet = all(math.isfinite(trial.capture_fps) for trial in trials)
     fps_origin = "stated" if math.isfinite(request.capture_fps) else "sheet" if is_in_sheet else "guess"
-    inputs = [
-        *_inputs_in_words(noise, of_noise, spreads, of_spreads),
+    inputs += [
         PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
         PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", fps_origin),
         *(
@@ -196,9 +191,6 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     power, asked = now, [_asked(text, now) for text in request.effects]
     if request.simulate:
         power = replace(power, simulated=tuple(_simulated_rates(request, design, now, asked)))
-    if request.recommend:
-        with waiting("searching for the trials to make next"):
-            power = replace(power, recommended=exploratory_trials(design, now, limits))
     if math.isfinite(request.reach):
         for text, (name, value) in zip(request.effects, asked, strict=True):
             if name in power.not_testable:
