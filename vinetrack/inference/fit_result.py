@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
+from scipy.special import ndtri
 
 from vinetrack.core.problems import Remark
 from vinetrack.core.records import Floats, Track, Trial
@@ -625,13 +626,11 @@ def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
 
 def _deviate(difference: Floats, covariance: Floats) -> float:
     """Normal deviate as unlikely as this difference of two parameters, from χ² with two degrees of freedom."""
-    from scipy.stats import norm
-
     if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
         return math.nan
     square = float(difference @ np.linalg.solve(covariance, difference))
     # ln P(χ²₂ > s) = −s/2; half of it on each side of the normal, in logarithms so that 40 σ is 40 σ.
     log_tail = -square / 2 - math.log(2)
     if log_tail > -700:
-        return float(norm.isf(math.exp(log_tail)))
+        return -float(ndtri(math.exp(log_tail)))
     return math.sqrt(square - math.log(square))

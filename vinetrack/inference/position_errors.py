@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
@@ -184,9 +185,7 @@ def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
 
 def student(dof: Floats) -> Floats:
     """Half width of a 95 % interval in standard errors."""
-    from scipy.stats import t
-
-    return np.asarray(t.ppf(0.975, np.minimum(dof, 1e6)))
+    return np.asarray(stdtrit(np.minimum(dof, 1e6), 0.975))
 
 
 def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:

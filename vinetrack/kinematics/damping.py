@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import stdtr, stdtrit
 
 from vinetrack.core.records import Floats
 
@@ -308,9 +309,7 @@ def _percentiles(estimate: Floats, draws: Floats, widening: Floats) -> tuple[Flo
 
 
 def _student(dof: int) -> float:
-    from scipy.stats import t
-
-    return float(t.ppf(0.975, dof)) if dof > 0 else math.inf
+    return float(stdtrit(dof, 0.975)) if dof > 0 else math.inf
 
 
 def _r_squared(log_force: Floats, residual: Floats) -> float:
@@ -499,8 +498,6 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     regression on one of them alone would confound. Returns by size `power, power_95, p`; `R2`, `n`; and `refused`:
     None, or why there is no trend. Shapes: sizes, values (n,).
     """
-    from scipy.stats import t
-
     known = np.isfinite(values) & (values > 0)
     varying = {name: np.log(size[known]) for name, size in sizes.items() if np.unique(size[known]).size > 1}
     words = " and ".join({"thickness_um": "wall", "diameter_mm": "diameter"}[name] for name in varying)
@@ -526,7 +523,7 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
         name: {
             "power": float(coefficients[i]),
             "power_95": [float(coefficients[i] - half_widths[i]), float(coefficients[i] + half_widths[i])],
-            "p": 2 * float(t.sf(abs(coefficients[i]) / errors[i], dof)) if errors[i] > 0 else 0.0,
+            "p": 2 * float(stdtr(dof, -abs(coefficients[i]) / errors[i])) if errors[i] > 0 else 0.0,
         }
         for i, name in enumerate(varying, start=1)
     }

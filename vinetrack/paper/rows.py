@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from vinetrack.core import published
 from vinetrack.core.published import SOURCE
@@ -353,7 +353,7 @@ def _fast_row(results: ExperimentResults) -> Row:
 def p_value(R2: float, n: int) -> float:
     """Return the two-sided p-value of the slope of a straight line from its R² and the number of points."""
     dof = n - 2
-    return 2 * float(student.sf(math.sqrt(R2 * dof / (1 - R2)), dof))
+    return 2 * float(stdtr(dof, -math.sqrt(R2 * dof / (1 - R2))))
 
 
 def weight_over_gas(diameter_mm: float) -> float:

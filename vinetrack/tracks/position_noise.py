@@ -440,7 +440,7 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
     if they remain without those: an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) →
     (n_points,).
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit  # scipy.stats takes most of a second to load
 
     most_rounds = 4  # Most rounds of rejection (measured)
     n = time_s.size
@@ -448,7 +448,7 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
     if n < FEWEST_POINTS + most_rounds or not np.all(np.diff(time_s) > 0):
         return is_outlier
     # Normal noise costs one track in a thousand a point; the local noise has 0.37 × 41 degrees of freedom.
-    limit = float(t.isf(1e-3 / (2 * n), 15.0))
+    limit = -float(stdtrit(15.0, 1e-3 / (2 * n)))
     for _ in range(most_rounds):
         candidates = np.flatnonzero(~is_outlier)
         if candidates.size < FEWEST_POINTS:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -74,10 +74,8 @@ def measure_recording(
         if settings.calibration is None:
             remedy = "give `calibration` in experiment.yaml, or mm_per_px in the sheet"
             raise RecordingError("there is no scale", remedy, trial.name)
-        image = folder / (getattr(settings.calibration, "image", None) or "")
-        state = image.stat().st_mtime_ns if image.is_file() else 0
         try:
-            calibration = _calibrated(settings.calibration, folder, recording.width, recording.height, state)
+            calibration = _calibrated(settings.calibration, folder, recording.width, recording.height)
         except CalibrationError as error:
             raise RecordingError(error.what, error.remedy, "calibration") from error
     m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
@@ -103,9 +101,14 @@ def measure_recording(
     return Measurement(tracking, m_per_px, rel_sigma, calibration, capture_fps, recording)
 
 
-@lru_cache(maxsize=8)
-def _calibrated(target: Calibration, folder: Path, width_px: int, height_px: int, _state: int) -> PlaneCalibration:
+def _calibrated(target: Calibration, folder: Path, *size_px: int) -> PlaneCalibration:
     """The calibration for a size of picture; a process looks at a target once while its picture stays the same."""
+    image = folder / (getattr(target, "image", None) or "")
+    return _seen(target, folder, *size_px, image.stat().st_mtime_ns if image.is_file() else 0)
+
+
+@lru_cache(maxsize=8)
+def _seen(target: Calibration, folder: Path, width_px: int, height_px: int, _state: int) -> PlaneCalibration:
     return calibrate(target, folder, width_px, height_px)
 
 
@@ -447,15 +450,12 @@ def _frames_present(recording: Recording) -> int | None:
         return None
 
 
-Calibrations = dict[tuple[int, int], "PlaneCalibration"]
-
-
 def _scale_problems(
     settings: ExperimentSettings, folder: Path, opened: dict[Trial, Recording]
-) -> tuple[list[Problem], Calibrations]:
+) -> tuple[list[Problem], dict[tuple[int, int], PlaneCalibration]]:
     """Problems of calibration and axis, for the recordings that open; and the calibration by picture size."""
     problems: list[Problem] = []
-    calibrations: Calibrations = {}
+    calibrations: dict[tuple[int, int], PlaneCalibration] = {}
     unscaled = [trial for trial in opened if not math.isfinite(trial.m_per_px)]
     sizes = sorted({(opened[trial].width, opened[trial].height) for trial in unscaled})
     if unscaled and settings.calibration is None:
@@ -469,7 +469,7 @@ def _scale_problems(
         notes: dict[str, None] = {}
         try:
             for size in sizes:
-                calibrations[size] = calibrate(settings.calibration, folder, *size)
+                calibrations[size] = _calibrated(settings.calibration, folder, *size)
                 notes |= dict.fromkeys(calibrations[size].notes if image is not None else ())
             problems += [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
         except CalibrationError as error:  # only the first is reported
@@ -485,7 +485,7 @@ def _scale_problems(
 
 def _axis_problems(
     trial: Trial, given: AxisSettings | PictureAxis, recording: Recording, place: dict[str, Any],
-    calibrations: Calibrations,
+    calibrations: Mapping[tuple[int, int], PlaneCalibration],
 ) -> list[Problem]:  # fmt: skip
     """Problems of a given axis in the picture of one recording, reported at its place in the files."""
     through = (given.from_px, *(given.via_px or ()), given.to_px)
