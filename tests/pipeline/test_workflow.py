@@ -89,6 +89,23 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
     assert workflow.path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
 
 
+def test_a_check_of_the_same_files_is_made_once_and_one_that_finds_an_error_each_time(tmp_path, monkeypatch):
+    made: list[Path] = []
+    check = workflow.check_folder
+    monkeypatch.setattr(workflow, "check_folder", lambda folder, keep: made.append(folder) or check(folder, keep))
+    sound = experiment(tmp_path / "sound", "a,a.csv,12,100,300,20,3,\n")
+    faulty = experiment(tmp_path / "faulty", "a,a.csv,12,100,300,20,3,\nb,gone.csv,12,100,300,20,3,\n")
+    said: list[list[str]] = []
+    for folder in (sound, sound, faulty, faulty):
+        workflow.check_before_run(folder, tmp_path / "results" / folder.name, (lines := list[str]()).append)
+        said.append(lines)
+    assert made == [sound, faulty, faulty]
+    assert said[0] == said[1]
+    os.utime(sound / "a.csv", (1, 1))
+    workflow.check_before_run(sound, tmp_path / "results" / "sound", print)
+    assert made[-1] == sound
+
+
 def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path):
     names = [f"t{i}" for i in range(2 * workflow.TRIALS_PER_JOB + 1)]
     plan = planned(experiment(tmp_path / "v", "".join(f"{name},{name}.csv,12,100,300,20,3,\n" for name in names)))

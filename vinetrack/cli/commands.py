@@ -42,7 +42,7 @@ def _track(recording: Path, say: Say, options: dict[str, Any]) -> Answer:
     from vinetrack.pipeline.overlays_stage import track_file
 
     with waiting(f"tracking {recording.name}"), compilation_told(say):
-        return (), track_file(recording, say, **options)
+        return track_file(recording, **options)
 
 
 @command()

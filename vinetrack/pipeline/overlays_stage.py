@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import INTERNAL_ERROR, UserError
 from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, hand_corrected, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
+from vinetrack.core.terminal import table
 from vinetrack.core.units import number
 from vinetrack.experiment.folder import Experiment
 from vinetrack.experiment.settings import ExperimentSettings, OverlaySettings, read_experiment_settings
-from vinetrack.experiment.sheet import closest_entry
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, draw_strip, levels
 from vinetrack.figures.style import GREEN, render
 from vinetrack.narrative.verdict_text import spaced_name
@@ -35,7 +36,7 @@ from vinetrack.results.folder_layout import (
 )
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import axis_entry, axis_from_entry
-from vinetrack.video.frames import CONTAINERS, IMAGES, Recording, RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
 from vinetrack.video.survey import Measurement, measure_recording
 from vinetrack.video.write import write_clip
 
@@ -92,12 +93,9 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
     """Write the clip of one trial; return why it could not be made, or blank."""
     try:
         _write_overlay(trial, results, settings)
-    except ResultsError as error:
-        log.warning("%s: no clip: %s", trial.name, error)
-        return f"{trial.name}: no clip: {error}"
-    except Exception:
+    except Exception as error:
         log.exception("%s: no clip", trial.name)
-        return f"{trial.name}: no clip: {INTERNAL_ERROR}"
+        return f"{trial.name}: no clip: {error if isinstance(error, ResultsError) else INTERNAL_ERROR}"
     return ""
 
 
@@ -128,12 +126,21 @@ def _write_clip(
     since_s: Floats, shown: range, settings: OverlaySettings,
 ) -> None:  # fmt: skip
     """Write a clip of the shown frames; `since_s` is the time since release. Shapes: since_s (n_frames,)."""
+
+    def drawn() -> Iterator[NDArray[np.uint8]]:
+        low = high = 0.0
+        for frame, picture in enumerate(islice(iterate_frames(recording), shown.stop)):
+            if frame in shown[::stride]:
+                if high == low:
+                    low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
+                yield compose(view, levels(picture, low, high), frame, 1e3 * float(since_s[frame]), edges)
+
     rate = 1.0 / float(np.median(np.diff(since_s))) if len(since_s) > 1 else math.nan
     play_fps, stride = playback_rate(len(shown), settings.seconds)
     size = recording.width, recording.height
     tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(size)
     view = ClipView(title, axis, tube_px, size, mm_per_px, rate / play_fps / stride, settings.width_px)
-    write_clip(path, draw_over(recording, view, edges, 1e3 * since_s, shown, stride), play_fps)
+    write_clip(path, drawn(), play_fps)
 
 
 def frames_to_show(track: pd.DataFrame) -> range:
@@ -153,21 +160,6 @@ def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
     fastest_fps, slowest_fps = 30.0, 4.0  # Limits of the playback rate of a clip, frames per second (chosen)
     stride = max(round(n_frames / seconds / fastest_fps), 1)
     return float(np.clip(n_frames / stride / seconds, slowest_fps, fastest_fps)), stride
-
-
-def draw_over(
-    recording: Recording, view: ClipView, edges: list[Edge], time_ms: Floats, shown: range, stride: int
-) -> Iterator[NDArray[np.uint8]]:
-    """Draw edges over the frames of a recording. Shapes: time_ms (n_frames,)."""
-    low = high = 0.0
-    for frame, picture in enumerate(iterate_frames(recording)):
-        if frame >= shown.stop:
-            break
-        if frame < shown.start or (frame - shown.start) % stride:
-            continue
-        if high == low:
-            low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
-        yield compose(view, levels(picture, low, high), frame, float(time_ms[frame]), edges)
 
 
 def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
@@ -219,33 +211,25 @@ def position_to_px(track: pd.DataFrame) -> Any:
 
 
 def track_file(
-    path: Path, say: Callable[[str], None], *, capture_fps: float = math.nan, exposure_us: float = math.nan,
-    mm_per_px: float = math.nan, calibration: Path | None = None, axis: PictureAxis | None = None,
-    frames_used: tuple[int, int] | None = None, body: bool = False, out: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    path: Path, *, capture_fps: float = math.nan, exposure_us: float = math.nan, mm_per_px: float = math.nan,
+    calibration: Path | None = None, axis: PictureAxis | None = None, frames_used: tuple[int, int] | None = None,
+    body: bool = False, out: Path | None = None,
+) -> tuple[list[str], dict[str, Any]]:  # fmt: skip
     """Track the leading edge of one recording; write table, strip and clip in `out`. NaN and None for what is not
-    given; the scale is `mm_per_px` or the `calibration:` of a settings file. Returns facts, units in the keys.
+    given; the scale is `mm_per_px` or the `calibration:` of a settings file. Returns the facts as lines and as JSON.
     """
-    settings, folder = _calibration(calibration, mm_per_px)
+    if out is not None and out.exists() and not out.is_dir():
+        raise UserError(f"{out}: is a file; name a folder with --out")
+    settings, folder = _settings_of(calibration, mm_per_px)
     scaled = math.isfinite(mm_per_px) or calibration is not None
     try:
-        recording = inspect_recording(_recording_path(path))
-        rate = _capture_fps(recording, capture_fps)
-        n_frames = recording.declared_frames
-        recording_facts = {
-            "recording": recording.path,
-            "width_px": recording.width,
-            "height_px": recording.height,
-            "bit_depth": recording.bit_depth,
-            "declared_frames": n_frames,
-            "playback_fps": recording.playback_fps,
-            "capture_fps": rate,
-            "capture_fps_from_file": recording.capture_fps is not None,
-            "exposure_us": math.nan if recording.exposure_s is None else 1e6 * recording.exposure_s,
-            "duration_s": math.nan if n_frames is None else n_frames / rate,
-        }
-        for line in _recording_lines(recording_facts):
-            say(line)
+        recording = inspect_recording(path)
+        rate = capture_fps if recording.capture_fps is None else recording.capture_fps
+        if math.isfinite(capture_fps) and abs(capture_fps / rate - 1) > 1e-3:
+            raise UserError(
+                f"{path.name}: --capture-fps is {capture_fps:g}, but the file states a capture rate of {rate:g}; "
+                "leave --capture-fps out"
+            )
         trial = Trial(
             name=path.stem,
             video=recording.path,
@@ -258,47 +242,31 @@ def track_file(
             axis=axis,
             frames_used=frames_used,
         )
-        measurement = measure_recording(trial, settings, folder)
+        measured = measure_recording(trial, settings, folder)
     except RecordingError as error:
         raise UserError(str(error)) from None
     if not math.isfinite(rate):
-        tracking = measurement.tracking
-        untimed = replace(tracking.track, time_s=np.full(len(tracking.track.time_s), math.nan))
-        measurement = replace(measurement, tracking=replace(tracking, track=untimed))
-    table = _table(measurement, scaled)
-    written = _write(out or Path(f"{recording.path.stem}_track"), measurement, table, scaled)
-    tracking_facts = _tracking_facts(measurement, table, axis is not None, scaled, rate)
-    for line in _tracking_lines(tracking_facts):
-        say(line)
-    say("Written: " + ", ".join(map(str, written.values())))
-    return recording_facts | tracking_facts | {"written": written}
+        track = measured.tracking.track
+        untimed = replace(track, time_s=np.full(len(track.time_s), math.nan))
+        measured = replace(measured, tracking=replace(measured.tracking, track=untimed))
+    written = _write(out or Path(f"{recording.path.stem}_track"), measured, scaled)
+    facts = _facts(measured, rate, 1e3 * measured.m_per_px if scaled else math.nan) | {"axis_given": axis is not None}
+    rows = {name: number(fact) if isinstance(fact, float) else str(fact) for name, fact in facts.items()}
+    ends = (*facts["axis"]["from_px"], *facts["axis"]["to_px"])
+    rows |= {"axis": "({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)}
+    lines = table([(name, text) for name, text in rows.items() if text not in ("–", "None") and name != "notes"])
+    lines += [] if math.isfinite(rate) else ["Capture rate unknown: without --capture-fps there are no times."]
+    lines += [f"warning: {note}" for note in facts["notes"]]
+    return [*lines, "Written: " + ", ".join(map(str, written.values()))], facts | {"written": written}
 
 
-def _recording_path(path: Path) -> Path:
-    """Return the path if it can be a single recording."""
-    if not path.exists():
-        near = closest_entry(path)
-        remedy = f"did you mean {path.with_name(near)}?" if near else "check its folder and its name"
-        raise UserError(f"{path}: there is no such file or folder; {remedy}")
-    if path.is_dir():
-        inside = sorted(entry for entry in path.iterdir() if entry.is_file() and not entry.name.startswith("."))
-        films = [entry for entry in inside if entry.suffix.lower() in CONTAINERS]
-        if films and not any(entry.suffix.lower() in IMAGES for entry in inside):
-            count = "a film is" if len(films) == 1 else f"{len(films)} films are"
-            raise UserError(f"{path}: a folder in which {count}; name one file, such as {films[0]}")
-        if not inside:
-            raise UserError(f"{path}: the folder holds no files; name a film, or a folder of numbered pictures")
-    return path
-
-
-def _calibration(file: Path | None, mm_per_px: float) -> tuple[ExperimentSettings, Path]:
+def _settings_of(file: Path | None, mm_per_px: float) -> tuple[ExperimentSettings, Path]:
     """Return settings with only the calibration, and the folder to which the path of its picture is relative."""
     if file is None:
         return ExperimentSettings(), Path()
     if math.isfinite(mm_per_px):
         raise UserError("--mm-per-px and --calibration are two scales: give one")
-    if file.is_dir():
-        file = file / "experiment.yaml"
+    file = file / "experiment.yaml" if file.is_dir() else file
     if not file.is_file():
         raise UserError(f"{file}: there is no such file; --calibration takes an experiment.yaml, or its folder")
     calibration = read_experiment_settings(file).calibration
@@ -307,120 +275,69 @@ def _calibration(file: Path | None, mm_per_px: float) -> tuple[ExperimentSetting
     return ExperimentSettings(calibration=calibration), file.parent
 
 
-def _capture_fps(recording: Recording, given_fps: float) -> float:
-    """Capture rate, Hz: that stated by the file, else that given by the user; NaN if neither is known."""
-    stated_fps = recording.capture_fps
-    if stated_fps is None:
-        return given_fps
-    if math.isfinite(given_fps) and abs(given_fps / stated_fps - 1) > 1e-3:
-        raise UserError(
-            f"{recording.path.name}: --capture-fps is {given_fps:g}, but the file states a capture rate of "
-            f"{stated_fps:g}; leave --capture-fps out"
-        )
-    return stated_fps
-
-
-def _recording_lines(facts: dict[str, Any]) -> list[str]:
-    n_frames, playback_fps = facts["declared_frames"], facts["playback_fps"]
-    picture = f"{facts['width_px']} × {facts['height_px']} px, {facts['bit_depth']} bit"
-    count = "an unknown number of frames" if n_frames is None else f"{n_frames} frames"
-    first = f"{facts['recording']}: {count} of {picture}"
-    if math.isfinite(facts["capture_fps"]):
-        origin = "stated by the file" if facts["capture_fps_from_file"] else "as given"
-        duration = f": {number(facts['duration_s'])} s" if math.isfinite(facts["duration_s"]) else ""
-        second = f"Captured at {facts['capture_fps']:g} frames per second, {origin}{duration}"
-        if math.isfinite(facts["exposure_us"]):
-            second += f"; exposure {facts['exposure_us']:g} µs"
-    else:
-        playback = f"; it plays at {playback_fps:.4g} per second" if playback_fps else ""
-        second = f"Capture rate unknown{playback}: without --capture-fps there are no times"
-    return [f"{first}.", f"{second}."]
-
-
-def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
-    """One row per frame: the edge along the axis and in the picture, with errors, and in metres if there is a scale."""
+def _write(folder: Path, measured: Measurement, scaled: bool) -> dict[str, Path]:
+    """Write the edge of every frame along the axis and in the picture, with errors, and in metres if there is a scale;
+    the strip; and the clip.
+    """
     import pandas as pd
 
-    tracking = measurement.tracking
-    track = tracking.track
-    edge_xy_px = tracking.axis.points(track.edge_px + tracking.shake_px)
-    systematic_m = track.lead_position_systematic_m
-    assert systematic_m is not None
+    tracking, recording, m_per_px = measured.tracking, measured.recording, measured.m_per_px
+    track, axis, name = tracking.track, tracking.axis, recording.path.name
+    assert track.lead_position_systematic_m is not None
+    along_px = track.edge_px + tracking.shake_px
     columns = {
         "frame": np.arange(len(track.time_s)),
         "time_s": track.time_s,
         "edge_px": track.edge_px,
-        "edge_sigma_px": track.lead_position_sigma_m / measurement.m_per_px,
-        "edge_systematic_px": systematic_m / measurement.m_per_px,
-        "x_px": edge_xy_px[:, 0],
-        "y_px": edge_xy_px[:, 1],
+        "edge_sigma_px": track.lead_position_sigma_m / m_per_px,
+        "edge_systematic_px": track.lead_position_systematic_m / m_per_px,
+        **dict(zip(("x_px", "y_px"), axis.points(along_px).T, strict=True)),
     }
     if scaled:
         columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m}
-        columns |= {"systematic_m": systematic_m}
-    return pd.DataFrame(columns | {"flag": track.flag})
-
-
-def _write(folder: Path, measurement: Measurement, table: pd.DataFrame, scaled: bool) -> dict[str, Path]:
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder}: is a file; name a folder with --out")
-    tracking, recording = measurement.tracking, measurement.recording
-    name, settings = recording.path.name, OverlaySettings()
+        columns |= {"systematic_m": track.lead_position_systematic_m}
+    content = pd.DataFrame(columns | {"flag": track.flag})
     written = {"table": folder / "track.csv", "strip": folder / "strip.png", "clip": folder / "overlay.mp4"}
-    write_csv(written["table"], table)
-    m_per_px = measurement.m_per_px if scaled else math.nan
+    write_csv(written["table"], content)
+    m_per_px = m_per_px if scaled else math.nan
     write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
-    shown, time_s = frames_to_show(table), tracking.track.time_s
-    tube_px = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else tracking.axis.width_px
-    edges = [Edge("tracked edge", TRACKED, tracking.track.edge_px + tracking.shake_px)]
-    since_s = time_s - time_s[min(shown.start + MARGIN_FRAMES, len(time_s) - 1)]
-    scale = tube_px, 1e3 * m_per_px
-    _write_clip(written["clip"], name, recording, tracking.axis, *scale, edges, since_s, shown, settings)
+    shown, edges = frames_to_show(content), [Edge("tracked edge", TRACKED, along_px)]
+    since_s = track.time_s - track.time_s[min(shown.start + MARGIN_FRAMES, len(track.time_s) - 1)]
+    scale = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else axis.width_px, 1e3 * m_per_px
+    _write_clip(written["clip"], name, recording, axis, *scale, edges, since_s, shown, OverlaySettings())
     return written
 
 
-def _tracking_facts(
-    measurement: Measurement, table: pd.DataFrame, axis_given: bool, scaled: bool, rate: float
-) -> dict[str, Any]:
-    tracking = measurement.tracking
-    edge_px = tracking.track.edge_px
-    usable = np.isfinite(edge_px) & ~with_flag(tracking.track.flag, *UNUSABLE_FLAGS)
-    moving = usable & ~with_flag(tracking.track.flag, "before_release")
-    frame = np.flatnonzero(usable)
-    scale = measurement.m_per_px if scaled else math.nan
-    growth_px = float(np.ptp(edge_px[usable])) if usable.any() else math.nan
-    steps = np.diff(edge_px[frame]) / np.diff(frame) if frame.size > 1 else np.full(1, math.nan)
-    sigma = table["edge_sigma_px"].to_numpy()[moving]
-    axis = tracking.axis
+def _facts(measured: Measurement, rate: float, mm_per_px: float) -> dict[str, Any]:
+    """What a recording is and what was found in it, by names with units; NaN or None where not known."""
+    recording, tracking, track = measured.recording, measured.tracking, measured.tracking.track
+    usable = np.isfinite(track.edge_px) & ~with_flag(track.flag, *UNUSABLE_FLAGS)
+    frame, edge_px = np.flatnonzero(usable), track.edge_px[usable]
+    growth_px = float(np.ptp(edge_px)) if frame.size else math.nan
+    fastest = float(np.nanmax(np.diff(edge_px) / np.diff(frame))) if frame.size > 1 else math.nan
+    sigma_px = track.lead_position_sigma_m[usable & ~with_flag(track.flag, "before_release")] / measured.m_per_px
+    declared = recording.declared_frames
     return {
-        "n_frames": len(edge_px),
-        "n_known": int(usable.sum()),
-        "axis": axis_entry(axis),
-        "axis_given": axis_given,
-        "mm_per_px": 1e3 * scale,
-        "scale_rel_sigma": measurement.scale_rel_sigma,
+        "recording": recording.path,
+        "width_px": recording.width,
+        "height_px": recording.height,
+        "bit_depth": recording.bit_depth,
+        "declared_frames": declared,
+        "playback_fps": recording.playback_fps,
+        "capture_fps": rate,
+        "capture_fps_from_file": recording.capture_fps is not None,
+        "exposure_us": math.nan if recording.exposure_s is None else 1e6 * recording.exposure_s,
+        "duration_s": math.nan if declared is None else declared / rate,
+        "n_frames": len(track.edge_px),
+        "n_known": frame.size,
+        "axis": axis_entry(tracking.axis),
+        "mm_per_px": mm_per_px,
+        "scale_rel_sigma": measured.scale_rel_sigma,
         "tube_width_px": tracking.tube_width_px,
         "growth_px": growth_px,
-        "growth_mm": 1e3 * scale * growth_px,
-        "fastest_px_per_frame": float(np.nanmax(steps)),
-        "fastest_m_s": float(np.nanmax(steps)) * scale * rate,
-        "edge_sigma_px": float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else math.nan,
-        "notes": list(tracking.track.notes),
+        "growth_mm": mm_per_px * growth_px,
+        "fastest_px_per_frame": fastest,
+        "fastest_m_s": fastest * mm_per_px / 1e3 * rate,
+        "edge_sigma_px": float(np.nanmedian(sigma_px)) if np.isfinite(sigma_px).any() else math.nan,
+        "notes": list(track.notes),
     }
-
-
-def _tracking_lines(facts: dict[str, Any]) -> list[str]:
-    ends = (*facts["axis"]["from_px"], *facts["axis"]["to_px"])
-    axis = "Axis ({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)
-    axis += ", a curve" if "via_px" in facts["axis"] else ""
-    width = f"; tube {number(facts['tube_width_px'])} px wide" if math.isfinite(facts["tube_width_px"]) else ""
-    millimetres = f" = {number(facts['growth_mm'])} mm" if math.isfinite(facts["growth_mm"]) else ""
-    speed = f"{number(facts['fastest_px_per_frame'])} px per frame"
-    speed += f" = {number(facts['fastest_m_s'])} m/s" if math.isfinite(facts["fastest_m_s"]) else ""
-    error = f"; ± {number(facts['edge_sigma_px'], 2)} px per point" if math.isfinite(facts["edge_sigma_px"]) else ""
-    return [
-        f"{axis}, {'given' if facts['axis_given'] else 'found from the motion'}{width}.",
-        f"Edge found in {facts['n_known']} of {facts['n_frames']} frames: it moves by "
-        f"{number(facts['growth_px'])} px{millimetres}, at most {speed}{error}.",
-        *(f"warning: {note}" for note in facts["notes"]),
-    ]

@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +52,7 @@ log = logging.getLogger(__name__)
 def draw_campaign(job: Job) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
     job.say("drawing figures")
+    import_module("matplotlib.backends.backend_svg")  # once, before processes are forked
     shares = [list(campaign_figures())[first :: job.threads] for first in range(job.threads)]
     work = partial(_drawn, folder=job.results, trials=job.experiment.trials, settings=job.settings.figures)
     return [f"{sum(map_unordered(work, shares, job.threads))} figures."]

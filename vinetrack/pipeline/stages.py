@@ -163,7 +163,7 @@ def _end_with_parent() -> None:
 
 
 # ------------------------------------------------------------------------------
-# What a run need not make twice: tracks in pixels and figures of trials, kept in the results by their inputs.
+# What a run need not make twice: the check, tracks in pixels, figures of trials; kept in the results by their inputs.
 #
 # Snakemake deletes the outputs of a job before it runs it again; what is kept lies beside them, in a folder that it
 # does not know. A file that is replaced, or another version of the program, has another key; what no run asks for in a
@@ -200,13 +200,27 @@ class Kept:
         assert isinstance(film, Path)
         libraries = [import_module(name).__version__ for name in ("numpy", "scipy", "numba", "av", "cv2", "skimage")]
         code = code_hash("core", "tracks", "video")  # the rooms that a track in pixels depends on
-        self.tracked = _key(code, libraries, film.resolve(), identity(film), others)
-        path = self.folder / f"{self.tracked}.track"
-        if not (data := _read(path)):
-            data = zlib.compress(pickle.dumps(make()), 1)
-            write_bytes(path, data)
-        tracking: Tracking = pickle.loads(zlib.decompress(data))  # the same, bit by bit, whether made now or before
-        return tracking
+        state = (code, libraries, film.resolve(), identity(film), others)
+        self.tracked = _key(*state)
+        return self.made("track", state, make)
+
+    def made(
+        self,
+        kind: str,
+        inputs: tuple[object, ...],
+        make: Callable[[], Answer],
+        lasts: Callable[[Answer], bool] = lambda _: True,
+    ) -> Answer:
+        """What was made for these inputs, kept or made: the same, bit by bit. It is kept if it `lasts`."""
+        path = self.folder / f"{_key(*inputs)}.{kind}"
+        if data := _read(path):
+            found: Answer = pickle.loads(zlib.decompress(data))
+            return found
+        content = pickle.dumps(made := make())
+        if lasts(made):
+            write_bytes(path, zlib.compress(content, 1))
+        found = pickle.loads(content)
+        return found
 
     def figure(
         self,

@@ -24,7 +24,7 @@ from vinetrack.core.problems import ExperimentError, Problem, UserError, format_
 from vinetrack.core.tables import is_readable, write_text
 from vinetrack.core.terminal import table, waiting
 from vinetrack.figures.registry import figures_of
-from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash
+from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_result
 
 if TYPE_CHECKING:
@@ -401,17 +401,27 @@ def run_paths(folder: Path, base: Path | None) -> tuple[Path, Path]:
 
 
 def check_before_run(experiment: Path, results: Path, say: Say) -> None:
-    """Print the problems of an experiment before its run."""
+    """Print the problems of an experiment before its run; a check of the same files that found no error is kept."""
     from vinetrack.experiment.folder import read_experiment
 
     if find_ground_truth(experiment, PACKAGE.parent):
         return  # The recordings of the demonstration do not exist yet: the run makes them.
-    report = check_folder(experiment, Kept(results).track)
-    errors = [problem for problem in report.problems if problem.severity == "error"]
-    trials = {trial.name for trial in read_experiment(experiment).trials}
-    faulty_trials = {problem.trial for problem in errors}  # "" stands for the experiment as a whole
-    if errors and ("" in faulty_trials or trials <= faulty_trials):
-        raise ExperimentError(report.problems)
+    kept, files = Kept(results), []
+    with contextlib.suppress(ExperimentError):
+        files = input_files(read_experiment(experiment, strict=False))
+    inside = experiment.resolve()
+    linked = [path for path in files if not path.resolve().is_relative_to(inside)]
+    report: CheckReport = kept.made(
+        "check",
+        (code_hash(), inside, [identity(path) for path in (experiment, *linked)]),
+        lambda: check_folder(experiment, kept.track),
+        lasts=lambda made: not made.failed,  # a fault may be mended without a change of a file
+    )
+    if report.failed:
+        trials = {trial.name for trial in read_experiment(experiment).trials}
+        faulty_trials = {problem.trial for problem in report.problems if problem.severity == "error"}
+        if "" in faulty_trials or trials <= faulty_trials:  # "" stands for the experiment as a whole
+            raise ExperimentError(report.problems)
     for line in replace(report, recording_lines=()).lines():
         say(line)
 
