@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from vinetrack.core.records import Trial
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Number
-from vinetrack.inference.fit_summary import FitSummary
+from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.kinematics.summary import CONDITION_COLUMNS
 from vinetrack.paper import motions
 from vinetrack.paper import rows as lines
@@ -124,7 +124,7 @@ FIG4 = [trial("a", 28, 35.6), trial("b", 28, 35.6), trial("c", 7, 35.6)]
 FIG5 = [trial("d", 41, 10, 150), trial("e", 41, 10, 150), trial("f", 41, 50, 150)]
 OTHERS = [trial("g", 28, 20), trial("h", 41, 0, 150), trial("i", 20, 35.6), trial("j", 28, 35.6, 100)]
 TRIALS = with_names([*FIG4, *FIG5, *OTHERS])
-RESTS = {"a": motions.Rest(0.03, -0.01), "b": motions.Rest(0.1, 0.02)}
+RESTS = {"a": TrialEstimates(0.03, origin_m=-0.01), "b": TrialEstimates(0.1, origin_m=0.02)}
 
 
 def filmed(**factors: float) -> dict[str, pd.DataFrame]:
@@ -136,13 +136,14 @@ def filmed(**factors: float) -> dict[str, pd.DataFrame]:
         rest = RESTS[name]
         grown_m = np.interp(time_s - rest.release_s, plain.time_s, factor * plain.lead_position_m)
         lead_position_m = rest.origin_m + np.minimum(grown_m, 0.28)
-        moved[name] = pd.DataFrame({"time_s": time_s, "lead_position_m": lead_position_m})
+        kinematics = pd.DataFrame({"time_s": time_s, "lead_position_m": lead_position_m})
+        moved[name] = motions.since_release(kinematics, rest)
     return moved
 
 
 def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent():
     """1.1 times Eq. (2) is there first, when Eq. (2) has grown to 0.95 · 280/1.1 = 242 mm."""
-    mean = motions.mean_motions(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.9), RESTS)
+    mean = motions.mean_motions(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.9))
     plain = motions.follow(TRIALS[0], motions.NONE, 6.44)
     assert set(mean["pressure_kPa"]) == {28.0}
     assert mean["time_s"].min() == 0.0
@@ -153,7 +154,7 @@ def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent():
     np.testing.assert_allclose(mean["lead_position_m"], grown_m, atol=2e-5)
     np.testing.assert_allclose(mean["lead_position_sigma_m"], math.sqrt(0.02) * grown_m, atol=2e-5)
     # 10 % ahead and 4 % behind: the mean is 3 % ahead, single trials √((0.1² + 0.04²)/2) = 7.62 %.
-    (row,) = motions.position_errors(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.96), RESTS).itertuples()
+    (row,) = motions.position_errors(motions.position_conditions(TRIALS), filmed(a=1.1, b=0.96)).itertuples()
     assert row.rms_single_m / row.rms_mean_m == pytest.approx(math.sqrt(0.0058) / 0.03, rel=0.01)
     assert row.n_trials == 2
 
@@ -161,9 +162,11 @@ def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent():
 def test_speeds_are_taken_at_12_cm_from_where_each_trial_rested():
     """Speed 10 y beyond the rest: 1.2 m/s there, 1.4 where the origin lies 20 mm lower; mean 1.3, error 0.1."""
     y = np.linspace(0, 0.28, 500)
-    kinematics = {name: pd.DataFrame({"lead_position_m": y, "lead_velocity_m_s": 10 * y}) for name in ("d", "e", "f")}
-    rests = {"d": motions.Rest(0.0, 0.0), "e": motions.Rest(0.0, 0.02)}
-    table = motions.final_speeds(motions.speed_conditions(TRIALS), kinematics, rests)
+    kinematics = pd.DataFrame({"time_s": 0.0, "lead_position_m": y, "lead_velocity_m_s": 10 * y})
+    origins_m = {"d": 0.0, "e": 0.02}
+    rests = {name: TrialEstimates(0.0, origin_m=origin_m) for name, origin_m in origins_m.items()}
+    grown = {name: motions.since_release(kinematics, rest) for name, rest in rests.items()}
+    table = motions.final_speeds(motions.speed_conditions(TRIALS), grown)
     (row,) = table.itertuples()
     assert (row.n_final, row.payload_g, row.pressure_kPa) == (2, pytest.approx(10), pytest.approx(41))
     assert row.final_lead_velocity_m_s == pytest.approx(1.3, rel=1e-6)

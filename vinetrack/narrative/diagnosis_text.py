@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -466,11 +465,6 @@ def diagnosis_page(diagnosis: Diagnosis) -> str:
     rows = [(row.question, row.answer, row.note) for row in verdict_table(diagnosis)[1:]]
     title = f"{diagnosis.verdict or 'refused'}: {verdict_sentence(diagnosis)}"
     return html_table(("", "", ""), rows, title, [diagnosis.explanation])
-
-
-def sentences_of(text: str) -> list[str]:
-    """Return the sentences of an explanation, for a line each."""
-    return re.split(r"(?<=[.!?]) (?=[A-Z])", text.strip())
 
 
 # ------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ that has fallen to the tip rests there without pushing it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,7 @@ from vinetrack.core.records import Floats, Trial, plain_track
 from vinetrack.core.units import AIR_DENSITY_KG_M3, AMBIENT_PRESSURE_PA
 from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
+from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.kinematics.damping import fit_laws
 from vinetrack.kinematics.force import paper_force_N
 from vinetrack.kinematics.steady import paper_window
@@ -66,10 +67,6 @@ class Departure:
             model = (model + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": self.gamma})
         return model.with_values({"eversion_damping.B": B, "eversion_damping.n": published.EXPONENT})
 
-    def trial(self, trial: Trial) -> Trial:
-        """Return the trial, whose tail may go slack if the departure says so."""
-        return replace(trial, tail_slack="free" if self.slack else "taut")
-
 
 NONE = Departure("eq2")
 DEPARTURES = (
@@ -81,8 +78,8 @@ DEPARTURES = (
 )
 
 DEPARTURE_COLUMNS = (
-    *("figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s", "slack_from_s"),
-)
+    "figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s", "slack_from_s",
+)  # fmt: skip
 
 
 def paper_trial(
@@ -131,7 +128,7 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
 def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
     """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`."""
     time_s = np.arange(0, LASTS_S, 1 / published.CAPTURE_FPS)
-    return simulate(departure.model(B), departure.trial(trial), time_s)
+    return simulate(departure.model(B), replace(trial, tail_slack="free" if departure.slack else "taut"), time_s)
 
 
 def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
@@ -239,11 +236,34 @@ SPEED_COLUMNS = (
 MEAN_COLUMNS = ("pressure_kPa", "time_s", "lead_position_m", "lead_position_sigma_m", "n_trials")
 
 
-class Rest(NamedTuple):
-    """Release time of a trial, on the clock of its track, and resting position of its edge."""
+def comparison_tables(
+    trials: Sequence[Trial], fit: FitSummary, kinematics_of: Callable[[str], pd.DataFrame]
+) -> dict[str, pd.DataFrame]:
+    """Compute the tables of the comparison, by file name; `kinematics_of` gives the kinematics of a trial."""
+    positions, speeds = position_conditions(trials), speed_conditions(trials)
+    known = {name: one for name, one in fit.trials.items() if math.isfinite(one.release_s + one.origin_m)}
+    grown = {
+        trial.name: since_release(kinematics_of(trial.name), known[trial.name])
+        for replicates in (*positions.values(), *speeds.values())
+        for trial in replicates
+        if trial.name in known
+    }
+    payloads_g = sorted({round(1e3 * replicates[0].payload_kg, 6) for replicates in speeds.values()})
+    return {
+        "paper_departures": departure_table(payloads_g),
+        "paper_motions": motion_table(),
+        "paper_means": mean_motions(positions, grown),
+        "paper_positions": position_errors(positions, grown),
+        "paper_pressures": pressure_table(),
+        "paper_speeds": final_speeds(speeds, grown),
+        "paper_speed_curves": speed_curves(speeds),
+    }
 
-    release_s: float
-    origin_m: float
+
+def since_release(kinematics: pd.DataFrame, estimates: TrialEstimates) -> pd.DataFrame:
+    """The kinematics of a trial on the clock of its release, and its positions from where it rested."""
+    time_s, position_m = kinematics["time_s"], kinematics["lead_position_m"]
+    return kinematics.assign(time_s=time_s - estimates.release_s, lead_position_m=position_m - estimates.origin_m)
 
 
 def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
@@ -267,26 +287,19 @@ def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
 
 
 def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float | None = None) -> bool:
-    pairs = [
-        (1e3 * trial.diameter_m, published.DIAMETER_MM[4]),
-        (1e6 * trial.thickness_m, thickness_um),
-        (trial.pressure_Pa / 1e3, float(pressure_kPa)),
-    ]
-    if payload_g is not None:
-        pairs.append((1e3 * trial.payload_kg, payload_g))
-    return all(math.isclose(ours, printed, rel_tol=0.02) for ours, printed in pairs)
+    ours = (1e3 * trial.diameter_m, 1e6 * trial.thickness_m, trial.pressure_Pa / 1e3, 1e3 * trial.payload_kg)
+    printed = (published.DIAMETER_MM[4], thickness_um, pressure_kPa, payload_g)
+    return all(two is None or math.isclose(one, two, rel_tol=0.02) for one, two in zip(ours, printed, strict=True))
 
 
-def mean_motions(
-    conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
-) -> pd.DataFrame:
+def mean_motions(conditions: Mapping[float, list[Trial]], grown: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Average the trials of each pressure since release, columns `MEAN_COLUMNS`, until the first has grown to 95 %. The
     release comes from a fit in which each trial has its own pressure and B. With one B for all, the release of a trial
     would absorb its deviation of speed.
     """
     parts = []
     for pressure_kPa, trials in conditions.items():
-        time_s, laid_m = _since_release(trials, kinematics, rests)
+        time_s, laid_m = _on_common_times(trials, grown)
         if not len(laid_m):
             continue
         sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
@@ -295,16 +308,13 @@ def mean_motions(
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(MEAN_COLUMNS), dtype=float)
 
 
-def _since_release(
-    trials: Sequence[Trial], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
-) -> tuple[Floats, Floats]:
+def _on_common_times(trials: Sequence[Trial], grown: Mapping[str, pd.DataFrame]) -> tuple[Floats, Floats]:
     """Common times since release, shape (n,), and positions from rest, shape (n_trials, n), of those that are known."""
     motions = []
     for trial in trials:
-        if trial.name in kinematics and trial.name in rests:
-            start, table = rests[trial.name], kinematics[trial.name]
-            grown_m = table["lead_position_m"].to_numpy(float) - start.origin_m
-            time_s, known = table["time_s"].to_numpy(float) - start.release_s, np.isfinite(grown_m)
+        if trial.name in grown:
+            time_s, grown_m = (grown[trial.name][name].to_numpy(float) for name in ("time_s", "lead_position_m"))
+            known = np.isfinite(grown_m)
             beyond = np.flatnonzero(known & (grown_m >= WITHIN * trial.length_m))
             stop = int(beyond[0]) + 1 if beyond.size else grown_m.size
             motions.append((time_s[:stop][known[:stop]], grown_m[:stop][known[:stop]]))
@@ -315,15 +325,13 @@ def _since_release(
     return common_s, np.array([np.interp(common_s, *motion) for motion in motions])
 
 
-def position_errors(
-    conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
-) -> pd.DataFrame:
+def position_errors(conditions: Mapping[float, list[Trial]], grown: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Compare positions with Eq. (2) and the printed B and n, of the mean and of single trials (`POSITION_COLUMNS`).
     From release until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
     """
     rows = []
     for pressure_kPa, trials in conditions.items():
-        time_s, laid_m = _since_release(trials, kinematics, rests)
+        time_s, laid_m = _on_common_times(trials, grown)
         if not len(laid_m):
             continue
         plain = follow(trials[0], NONE, published.DAMPING_B[4])
@@ -335,21 +343,15 @@ def position_errors(
     return pd.DataFrame(rows, columns=list(POSITION_COLUMNS))
 
 
-def final_speeds(
-    conditions: Mapping[str, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
-) -> pd.DataFrame:
+def final_speeds(conditions: Mapping[str, list[Trial]], grown: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Average the lead speed at the paper's 12 cm, and compute it by Eq. (2); columns `SPEED_COLUMNS`."""
     rows = []
     at_m = published.FINAL_SPEED_AT_MM / 1e3
     for condition, trials in conditions.items():
+        moved = [grown[trial.name] for trial in trials if trial.name in grown]
         speeds = [
-            lead_velocity_at(
-                kinematics[trial.name]["lead_position_m"].to_numpy(float) - rests[trial.name].origin_m,
-                kinematics[trial.name]["lead_velocity_m_s"].to_numpy(float),
-                at_m,
-            )
-            for trial in trials
-            if trial.name in kinematics and trial.name in rests
+            lead_velocity_at(one["lead_position_m"].to_numpy(float), one["lead_velocity_m_s"].to_numpy(float), at_m)
+            for one in moved
         ]
         mean, sigma, count = mean_with_error(np.array(speeds, dtype=float))
         if count:

@@ -74,14 +74,9 @@ def _texts() -> dict[str, dict[str, str]]:
 
 
 def row_of(
-    name: str,
-    ours: float = nan,
-    interval: Sequence[float] = (nan, nan),
-    *,
-    published_as: float = nan,
-    mark: str = "",
+    name: str, ours: float = nan, interval: Sequence[float] = (nan, nan), *, published_as: float = nan, mark: str = "",
     **facts: Any,
-) -> Row:
+) -> Row:  # fmt: skip
     """Return the row `name` of `rows.csv`, filled in with `facts`. `interval` is the 95 % interval of ours;
     `published_as` is NaN where the paper prints no number; `mark` tells whether the trials were simulated or filmed.
     """

@@ -11,18 +11,17 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR
-from vinetrack.core.records import Kinematics, Track, Trial
+from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.diagnosis.ladder import (
     COMPARISON_COLUMNS,
     LADDER_COLUMNS,
     MOVED_COLUMNS,
-    Comparison,
     candidates_of,
     compare,
     in_sample,
@@ -34,7 +33,7 @@ from vinetrack.diagnosis.locate import drift_groups
 from vinetrack.diagnosis.propose import add
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
-from vinetrack.dynamics.audit import Audit, audit, measured_motion
+from vinetrack.dynamics.audit import audit, measured_motion
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError, own_effects
 from vinetrack.experiment.folder import Experiment
@@ -48,7 +47,7 @@ from vinetrack.narrative.diagnosis_text import added_in_words
 from vinetrack.narrative.verdict_text import settled_rows, verdict_sentence, verdict_table
 from vinetrack.pipeline.stages import Job
 from vinetrack.pipeline.trials import fit_damping, model_of
-from vinetrack.pipeline.workflow import comparison_lines, diagnosis_lines
+from vinetrack.pipeline.workflow import comparison_lines
 from vinetrack.planning.predictive_inputs import pressure_problems
 from vinetrack.results.folder_layout import Results, empty_table, measured_trials, read_json, read_result
 from vinetrack.tracks.frame_timing import mean_speed
@@ -64,8 +63,8 @@ def fit_and_diagnose(job: Job) -> list[str]:
     """Gather the trials, fit the damping law and the model in use, compare and audit it, and diagnose what it lacks."""
     lines = fit_damping(job)
     job.say("fitting the model")
-    diagnose_results(job, fit_model(job))
-    return [*lines, *comparison_lines(job.results), *diagnosis_lines(job.results)]
+    told = diagnose_results(job, fit_model(job))
+    return [*lines, *comparison_lines(job.results), told]
 
 
 def fit_model(job: Job) -> Fit | None:
@@ -82,7 +81,12 @@ def fit_model(job: Job) -> Fit | None:
             check = check_damping(fit, damping["log_log" if damping["both_axes"].get("refused") else "both_axes"])
         except FitError as error:
             messages.append(str(error))
-        audited = _audit(fit, comparison, pairs, kinematics)
+        tracks, motions = {trial.name: track for trial, track in pairs}, []
+        for trial in comparison.trials:
+            track = tracks[trial.name]
+            trace = None if track.pressure_Pa is None else (track.time_s - trial.release_s, track.pressure_Pa)
+            motions.append(measured_motion(trial.trial, kinematics[trial.name], trial.release_s, trace))
+        audited = audit(fit.model, motions)
         content = summary_of(fit, audited.warnings, tuple(messages)).to_json()
         trajectories, tables = comparison.trajectories, [comparison.table, check, audited.table]
     except Exception as error:
@@ -120,18 +124,6 @@ def _fits(experiment: Experiment, pairs: list[tuple[Trial, Track]]) -> tuple[Fit
     return initial, replace(fit, pairs=initial.pairs)
 
 
-def _audit(
-    fit: Fit, comparison: Comparison, pairs: list[tuple[Trial, Track]], kinematics: dict[str, Kinematics]
-) -> Audit:
-    tracks = {trial.name: track for trial, track in pairs}
-    motions = []
-    for trial in comparison.trials:
-        track = tracks[trial.name]
-        trace = None if track.pressure_Pa is None else (track.time_s - trial.release_s, track.pressure_Pa)
-        motions.append(measured_motion(trial.trial, kinematics[trial.name], trial.release_s, trace))
-    return audit(fit.model, motions)
-
-
 def _reason(error: Exception) -> str:
     """Return why there is no fit or verdict; the traceback of an unexpected exception goes to the log."""
     if isinstance(error, FitError | EffectError | SimulationError):
@@ -149,8 +141,10 @@ Report = Callable[[str], None]
 Pairs = Sequence[tuple[Trial, Track]]
 
 
-def diagnose_results(job: Job, fitted: Fit | None) -> None:
-    """Diagnose the trials, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and `diagnosis/`."""
+def diagnose_results(job: Job, fitted: Fit | None) -> str:
+    """Diagnose the trials, from a fit if there is one; write `diagnosis.json`, `ladder.csv` and `diagnosis/`. Returns
+    the diagnosis in words.
+    """
     results = Results(job.results)
     try:
         diagnosis, pairs = diagnosed(job.experiment, results, job.say, fitted)
@@ -162,10 +156,11 @@ def diagnose_results(job: Job, fitted: Fit | None) -> None:
         write_csv(results.ladder, empty_table(LADDER_COLUMNS))
         write_json(results.diagnosis, {**refusal.to_json(), "model": list(job.experiment.settings.model)})
         log.info("%s", explanation)
-        return
+        return explanation
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
     job.say("fitting the damping law under every model")
     write_diagnosis(results, diagnosis, pairs, job.settings)
+    return str(diagnosis)
 
 
 def diagnosed(
@@ -192,15 +187,13 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Pairs) ->
 
 def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
     """Return a sentence for each column of the sheet that recordings or speeds contradict, by its name."""
-    noted: dict[str, list[tuple[str, str]]] = {}
+    noted: dict[str, list[str]] = {}
     for trial, _ in pairs:
         for entry in read_json(results.analysed(trial.name)).get("contradictions", []):
-            noted.setdefault(entry["column"], []).append((trial.name, entry["reason"]))
-    sentences = {
-        column: f"{of_trial[0][0]}: {of_trial[0][1]}"
-        + (f" (and {len(of_trial) - 1} more trial{'s' if len(of_trial) > 2 else ''})" if len(of_trial) > 1 else "")
-        for column, of_trial in noted.items()
-    }
+            noted.setdefault(entry["column"], []).append(f"{trial.name}: {entry['reason']}")
+    sentences = {}
+    for column, (first, *others) in noted.items():
+        sentences[column] = f"{first} (and {len(others)} more trial{'s'[: len(others) > 1]})" if others else first
     speeds = [(trial, mean_speed(track)) for trial, track in pairs]
     return sentences | {problem.column: problem.reason for problem in pressure_problems(speeds)}
 
@@ -208,16 +201,14 @@ def sheet_contradictions(results: Results, pairs: Pairs) -> dict[str, str]:
 def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> None:
     """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`."""
     folder = _emptied(results.folder / "diagnosis")
-    has_added = len(diagnosis.fits) > 1
-    parameter_changes = moved(diagnosis.fits, ("", *diagnosis.effects)) if has_added else empty_table(MOVED_COLUMNS)
-    tables = diagnosis_tables(diagnosis) | {
-        "moved.csv": parameter_changes,
-        "damping_laws.csv": _laws(diagnosis, pairs, settings),
-    }
+    tables = diagnosis_tables(diagnosis)
+    tables |= {"moved.csv": empty_table(MOVED_COLUMNS), "damping_laws.csv": empty_table(LAW_COLUMNS)}
+    if len(diagnosis.fits) > 1:
+        tables["moved.csv"] = moved(diagnosis.fits, ("", *diagnosis.effects))
+        tables["damping_laws.csv"] = _laws(diagnosis, pairs, settings)
+        write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in tables.items():
         write_csv(folder / name, table)
-    if has_added:
-        write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for one, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]):
         write_csv(results.predictions(one.name), table)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
@@ -227,14 +218,12 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis, pairs: Pairs, settin
 
 def _laws(diagnosis: Diagnosis, pairs: Pairs, settings: RunSettings) -> pd.DataFrame:
     """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
-    laws: dict[str, Any] = {}
-    if len(diagnosis.fits) > 1:
-        motions = look_at_motions(pairs, settings)
-        for fit in diagnosis.fits:
-            try:
-                laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings)
-            except ValueError as error:
-                log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
+    laws, motions = {}, look_at_motions(pairs, settings)
+    for fit in diagnosis.fits:
+        try:
+            laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings)
+        except ValueError as error:
+            log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
     return law_table(laws) if laws else empty_table(LAW_COLUMNS)
 
 

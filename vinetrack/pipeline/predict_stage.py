@@ -58,14 +58,13 @@ from vinetrack.planning.predictive_inputs import (
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json
 
 # ------------------------------------------------------------------------------
-# Choice of the fit from which predictions are made; a model that the diagnosis refuted is not used silently.
-#
-# If the diagnosis ended with `adequate`, its final model is used: the one in use, or the one with all added effects.
-# After any other verdict there is no prediction, unless the user insists with `--anyway`.
+# Inputs of the commands: options or a sheet, a fit, effects.
 
 
 def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[str, ...]]:
-    """Choose the fit of a results folder to predict from. Returns it, and the heading over all predicted from it."""
+    """Choose the fit of a results folder to predict from: of the model that the diagnosis ended with as `adequate`,
+    after any other verdict only `anyway`. Returns it, and the heading over all that is predicted from it.
+    """
     results = Results(folder)
     in_use, diagnosis = read_fit(results), read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
@@ -88,10 +87,6 @@ def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[st
     return final or in_use, (f"! {verdict}", f"! {caution}")
 
 
-# ------------------------------------------------------------------------------
-# Inputs of the commands about new vines: options or a sheet, a fit, effects; and formatting of their output.
-
-
 @dataclass(frozen=True)
 class PredictionBasis:
     """Planned trials, stated values, a fit if there is one; `heading` stands over everything predicted from them."""
@@ -108,16 +103,10 @@ class PredictionBasis:
 
 
 def read_basis(
-    needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
-    *,
-    cells: Mapping[str, str],
-    sheet: Path | None = None,
-    results: Path | None = None,
-    anyway: bool = False,
-    effects: Sequence[str] = (),
-    tail_slack: str | None = None,
+    needed: Sequence[str] = REQUIRED_FOR_PREDICTION, *, cells: Mapping[str, str], sheet: Path | None = None,
+    results: Path | None = None, anyway: bool = False, effects: Sequence[str] = (), tail_slack: str | None = None,
     **numbers: Any,
-) -> PredictionBasis:
+) -> PredictionBasis:  # fmt: skip
     """Read the sheet or the options, the fit, and the requested effects. `cells` are texts by column of the sheet, for
     the columns that were given; `anyway` allows a fit whose model was refuted; `numbers` are those of `StatedValues`.
     """
@@ -137,14 +126,10 @@ def read_basis(
     if tail_slack is not None:
         planned = replace(planned, trials=tuple(replace(trial, tail_slack=tail_slack) for trial in planned.trials))
     user_effects = effects_of_plan(planned) if fit is None else _effects_of_fit(fit)
-    sizes = [read_sizes(text, user_effects) for text in effects]
-    stated = StatedValues(
-        **numbers,
-        model=planned.settings.model,
-        effects=tuple(name for name, _ in sizes),
-        sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
-        user_effects=user_effects,
-    )
+    read = [read_sizes(text, user_effects) for text in effects]
+    names, sizes = tuple(name for name, _ in read), {key: size for _, of_one in read for key, size in of_one.items()}
+    model = planned.settings.model
+    stated = StatedValues(**numbers, model=model, effects=names, sizes=sizes, user_effects=user_effects)
     return PredictionBasis(planned, stated, fit, heading)
 
 
@@ -179,10 +164,18 @@ def planning_errors() -> Iterator[None]:
         message, remedy = f"is blank, and the effect {error.effect} needs it", f"give it as {option(error.column)}"
         problem = Problem(message=message, column=error.column, remedy=f"{remedy} or in the sheet")
         raise ExperimentError([problem]) from None
-    except SimulationError as error:
-        raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
-    except FitError as error:
-        raise ResultsError(str(error)) from None
+    except (SimulationError, FitError) as error:
+        remedy = " Leave an effect out, or give it another size." if isinstance(error, SimulationError) else ""
+        raise ResultsError(f"{error}{remedy}") from None
+
+
+def refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
+    """The error that refuses the value of an option."""
+    return ExperimentError([Problem(message=message, column=name, value=text, allowed=allowed, remedy=remedy)])
+
+
+# ------------------------------------------------------------------------------
+# The command `vinetrack predict`.
 
 
 def predict_conditions(
@@ -193,14 +186,12 @@ def predict_conditions(
 
     check_figure(figure)
     basis = read_basis(**given)
-    predictions: list[VinePrediction] = []
-    content = []
     with planning_errors():
-        for inputs in progress(basis.inputs, "predicting", unit="condition"):
-            predictions.append(predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction))
-            content.append(_json_entry(predictions[-1]))
-    several = len(predictions) > 1
-    lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
+        all_inputs = progress(basis.inputs, "predicting", unit="condition")
+        predictions = [predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
+        content = [_json_entry(prediction) for prediction in predictions]
+        several = len(predictions) > 1
+        lines = [*basis.heading, *(_table_lines(predictions) if several else _condition_lines(predictions[0]))]
     lines += [f"! {warning}" for warning in format_problems(basis.planned.problems)]
     if figure is not None:
         titles = [trial_text(prediction.inputs.trial) for prediction in predictions]
@@ -321,24 +312,10 @@ def read_si_range(column: str, text: str, name: str = "") -> tuple[float, float]
     return COLUMNS[column].to_si(low), COLUMNS[column].to_si(high)
 
 
-def refusal(name: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
-    """The error that refuses the value of an option."""
-    return ExperimentError([Problem(message=message, column=name, value=text, allowed=allowed, remedy=remedy)])
-
-
 def design_vine(
-    *,
-    films: str,
-    diameter: str,
-    length: str,
-    burst_share: float,
-    burst_stress_MPa: float,
-    samples: int,
-    seed: int,
-    at_fraction: float,
-    figure: Path | None = None,
-    **given: Any,
-) -> tuple[list[str], dict[str, Any]]:
+    *, films: str, diameter: str, length: str, burst_share: float, burst_stress_MPa: float, samples: int, seed: int,
+    at_fraction: float, figure: Path | None = None, **given: Any,
+) -> tuple[list[str], dict[str, Any]]:  # fmt: skip
     """Find the fastest vine of every film; draw the choice if requested. Returns lines, and JSON content."""
     check_figure(figure)
     basis = read_basis(("pressure_kPa",), **given)
@@ -371,7 +348,7 @@ def design_vine(
             **{name: COLUMNS[name].of_trial(choice.prediction.inputs.trial) for name in REQUIRED_FOR_PREDICTION},
             "final_speed_m_s": {
                 "y_over_L": (final := choice.prediction.final).y_over_L,
-                **{key: value for key, value in _band(final).items() if key not in ("name", "unit")},
+                **{"median": final.median, "low_90": final.low, "high_90": final.high},
             },
             "fastest_in_share_of_draws": choice.odds,
             "limited_by": list(choice.limits),
@@ -430,26 +407,26 @@ def design_reservoir(
     """Find the chamber that limits the loss of gauge pressure; with a wall, speeds too. Returns lines, JSON."""
     check_figure(figure)
     basis = read_basis(("diameter_mm", "length_mm", "pressure_kPa"), **given)
-    trial = basis.planned.trials[0]
-    loss = within_percent / 100
+    trial, loss, swept = basis.planned.trials[0], within_percent / 100, swept_m3(basis.planned.trials[0])
     with planning_errors(), waiting("simulating"):
         inputs = basis.inputs[0] if math.isfinite(trial.thickness_m) else None
-        lines = [*basis.heading, *_reservoir_lines(trial, inputs, loss, at_fraction)]
+        found = chambers(trial, loss)
+        lost = {name: _losses(trial, volume_m3) for name, volume_m3 in found.items()}
+        lines = [*basis.heading, *_reservoir_lines(trial, inputs, loss, found, lost, at_fraction)]
         if math.isfinite(supply_s) and inputs is not None:
             volumes = {law: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
             lines.append(str(remark("supplied_chambers", ms=1e3 * supply_s, volumes=volumes)))
     if math.isfinite(supply_s) and inputs is None:
         lines.append(f"! {remark('supply_needs_wall')}")
     if figure is not None:
-        swept = swept_m3(trial)
         drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
         drawn = [_losses(trial, volume_m3) for volume_m3 in drawn_m3.tolist()]
         losses = {law: np.array([one[law] for one in drawn]) for law in GAMMAS}
         write_figure(draw_reservoir(drawn_m3, losses, loss, swept, trial.chamber_m3), figure)
         lines.append(f"Figure: {figure}")
     entries = [
-        {"chamber": name, "volume_l": 1e3 * volume_m3, "loss_of_gauge_pressure": _losses(trial, volume_m3)}
-        for name, volume_m3 in chambers(trial, loss).items()
+        {"chamber": name, "volume_l": 1e3 * volume_m3, "loss_of_gauge_pressure": lost[name]}
+        for name, volume_m3 in found.items()
     ]
     return lines, {"warnings": basis.heading, "chambers": entries}
 
@@ -459,15 +436,17 @@ def _losses(trial: Trial, volume_m3: float) -> dict[str, float]:
     return {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()}
 
 
-def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
+def _reservoir_lines(
+    trial: Trial, inputs: PredictiveInputs | None, loss: float, found: Mapping[str, float],
+    lost: Mapping[str, Mapping[str, float]], at_fraction: float,
+) -> Iterator[str]:  # fmt: skip
     yield str(remark("sweeps", trial=trial, swept_m3=swept_m3(trial), in_full=inputs is not None))
     yield str(remark("keeps_pressure", percent=100 * loss))
     yield ""
     laws = [law.split(",")[0] for law in GAMMAS]
     rows, speeds = [], [] if inputs is None else [f"speed, {law}" for law in laws]
-    for name, volume_m3 in chambers(trial, loss).items():
-        cells = [name, volume_text(volume_m3)]
-        cells += [f"{100 * lost:.1f}" for lost in _losses(trial, volume_m3).values()]
+    for name, volume_m3 in found.items():
+        cells = [name, volume_text(volume_m3), *(f"{100 * share:.1f}" for share in lost[name].values())]
         if inputs is not None:
             finals = [final_with(inputs, volume_m3, gamma, at_fraction) for gamma in GAMMAS.values()]
             cells += [value_in_unit(final, "m/s") for final in finals]

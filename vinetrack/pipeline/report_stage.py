@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
@@ -19,8 +18,8 @@ from vinetrack.experiment.settings import FigureSettings
 from vinetrack.figures.diagnosis_figures import DiagnosisTables
 from vinetrack.figures.registry import FigureTables, RegisteredFigure, campaign_figures, draw, figures_of
 from vinetrack.figures.style import blank, render
-from vinetrack.paper import motions
 from vinetrack.paper import rows as paper
+from vinetrack.paper.motions import comparison_tables
 from vinetrack.pipeline.overlays_stage import draw_overlays
 from vinetrack.pipeline.stages import Job, map_unordered
 from vinetrack.pipeline.workflow import SHARED_FILES, input_files
@@ -83,13 +82,14 @@ def compare_with_paper(job: Job) -> list[str]:
     """Write `paper.csv`, and the tables and figures of the comparison."""
     experiment, results = job.experiment, Results(job.results)
     mark = paper.SIMULATED if experiment.settings.published == "simulated" else paper.MEASURED
-    tables = _tables(experiment, results)
+    fit = read_fit(results)
+    tables = comparison_tables(experiment.trials, fit, lambda name: read_result(results.kinematics(name)))
     measured = paper.ExperimentResults(
         mark=mark,
         damping=read_json(results.damping),
         scaling=read_json(results.scaling),
         conditions=read_result(results.conditions),
-        fit=read_fit(results),
+        fit=fit,
         positions=tables["paper_positions"],
         speeds=tables["paper_speeds"],
         departures=tables["paper_departures"],
@@ -110,33 +110,6 @@ def compare_with_paper(job: Job) -> list[str]:
         drawn = draw(name, shown) or blank("No trial of this experiment is compared with this figure.")
         _write(drawn, partial(results.figure, name), job.settings.figures)
     return [f"Comparison with the paper: {tally(table)}"]
-
-
-def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]:
-    """Return the tables of all figures, by file name."""
-    trials = experiment.trials
-    positions, speeds = motions.position_conditions(trials), motions.speed_conditions(trials)
-    starts = {
-        name: motions.Rest(fitted_trial.release_s, fitted_trial.origin_m)
-        for name, fitted_trial in read_fit(results).trials.items()
-    }
-    rests = {name: start for name, start in starts.items() if math.isfinite(start.release_s + start.origin_m)}
-    kinematics = {
-        trial.name: read_result(results.kinematics(trial.name))
-        for replicates in (*positions.values(), *speeds.values())
-        for trial in replicates
-        if trial.name in rests
-    }
-    payloads_g = sorted({round(1e3 * replicates[0].payload_kg, 6) for replicates in speeds.values()})
-    return {
-        "paper_departures": motions.departure_table(payloads_g),
-        "paper_motions": motions.motion_table(),
-        "paper_means": motions.mean_motions(positions, kinematics, rests),
-        "paper_positions": motions.position_errors(positions, kinematics, rests),
-        "paper_pressures": motions.pressure_table(),
-        "paper_speeds": motions.final_speeds(speeds, kinematics, rests),
-        "paper_speed_curves": motions.speed_curves(speeds),
-    }
 
 
 MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have

@@ -215,9 +215,8 @@ def draw_trial(results: Results, trial: Trial | None, name: str) -> Figure | Non
     """Draw position, speed and steady windows of one trial; None if there are no positions."""
     title, ratio = _described(name, trial)
     windows = _frame(read_json(results.analysed(name))["windows"], STEADY_COLUMNS)
-    return draw_trial_motion(
-        title, read_result(results.track(name)), read_result(results.kinematics(name)), windows, ratio
-    )
+    tables = read_result(results.track(name)), read_result(results.kinematics(name))
+    return draw_trial_motion(title, *tables, windows, ratio)
 
 
 # ------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from vinetrack.core.tables import is_readable, write_text
 from vinetrack.core.terminal import table, waiting
 from vinetrack.figures.registry import figures_of
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_result
+from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -466,33 +466,24 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
 
 
 # ------------------------------------------------------------------------------
-# What results say in the terminal; the stage of the model, which says the same, takes longer to load.
+# What results say in the terminal.
 
 
-def run_lines(results: Path) -> list[str]:
+def run_lines(folder: Path) -> list[str]:
     """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last."""
-    trials = read_result(Results(results).trials)
+    from vinetrack.narrative.diagnosis_text import table_lines
+    from vinetrack.narrative.verdict_text import verdict_line
+
+    results = Results(folder)
+    trials, diagnosis = read_result(results.trials), read_diagnosis(results)
     failed = trials[trials["status"] == "failed"]
     lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
     lines += [f"… and {len(failed) - 3} more failed"] if len(failed) > 3 else []
-    verdict, *reasons = diagnosis_lines(results, brief=True)
-    return [*lines, f"Report: {Results(results).report}", *reasons, verdict]
-
-
-def diagnosis_lines(folder: Path, brief: bool = False) -> list[str]:
-    """Return the verdict of a results folder in one line, then its reasons, one sentence per line; a few if `brief`."""
-    from vinetrack.narrative.diagnosis_text import sentences_of, table_lines
-    from vinetrack.narrative.verdict_text import verdict_line
-
-    diagnosis = read_diagnosis(Results(folder))
-    if diagnosis is None:
-        raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
-    if not diagnosis.verdict:
-        return [diagnosis.explanation]
-    lines = [verdict_line(diagnosis), *table_lines(diagnosis, notes=not brief)]
-    if not brief:
-        lines += [f"  {line}" for line in sentences_of(diagnosis.explanation)]
-    return [*lines, *(f"! {note}" for note in diagnosis.notes[: 1 if brief else None])]
+    lines.append(f"Report: {results.report}")
+    if diagnosis is None or not diagnosis.verdict:
+        return [*lines, "" if diagnosis is None else diagnosis.explanation]
+    notes = [f"! {note}" for note in diagnosis.notes[:1]]
+    return [*lines, *table_lines(diagnosis, notes=False), *notes, verdict_line(diagnosis)]
 
 
 def comparison_lines(folder: Path) -> list[str]:
