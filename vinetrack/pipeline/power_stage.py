@@ -209,18 +209,16 @@ def _asked(text: str, power: Power) -> tuple[str, float]:
     name, _, size = text.partition("=")
     if name in power.not_testable:
         return name, math.nan
-    known = {entry.effect: entry for entry in power.effects}
+    known = {entry.effect: entry.unit for entry in power.effects}
     if name not in known:
         candidates = sorted([*known, *power.not_testable])
         close = difflib.get_close_matches(name, candidates, 1, 0.6)
         remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(candidates)}"
         message = "is in the model already" if name in power.model else "is not a candidate for these trials"
         raise refusal("--effect", name, message, remedy)
-    if not size:
-        return name, math.nan
-    unit, factor = display_unit(known[name].unit)
+    unit, factor = display_unit(known[name])
     try:
-        return name, float(size) / factor
+        return name, float(size or "nan") / factor
     except ValueError:
         remedy = f"write a number in {unit or 'the unit of the parameter'}"
         raise refusal("--effect", text, "is not a size", remedy) from None
@@ -243,12 +241,10 @@ def _simulated_rates(
 ) -> Iterator[SimulatedRates]:
     """Simulate campaigns of the design and diagnose each in full; yield the rate of each kind, the null first."""
     wanted: list[tuple[str, tuple[float, ...], float]] = [("", (math.nan,), power.false_alarm_rate)]
-    for name, size in asked:
-        if name not in power.not_testable:
-            entry = power[name]
-            sizes = [size] if math.isfinite(size) else [entry.size_at(0.5), entry.size_at(0.9)]
-            known = filter(math.isfinite, sizes)
-            wanted += [(name, (value, *entry.other_values), entry.probability_at(value)) for value in known]
+    for entry, size in ((power[name], size) for name, size in asked if name not in power.not_testable):
+        sizes = [size] if math.isfinite(size) else [entry.size_at(0.5), entry.size_at(0.9)]
+        known = filter(math.isfinite, sizes)
+        wanted += [(entry.effect, (value, *entry.other_values), entry.probability_at(value)) for value in known]
     seeds = range(request.first_seed, request.first_seed + request.simulate)
     bar: Progress[None]
     with progress(len(wanted) * len(seeds), "simulating", unit="campaign") as bar:

@@ -205,40 +205,34 @@ class Kept:
         return self.made("track", state, make)
 
     def made(
-        self,
-        kind: str,
-        inputs: tuple[object, ...],
-        make: Callable[[], Answer],
+        self, kind: str, inputs: tuple[object, ...], make: Callable[[], Answer],
         lasts: Callable[[Answer], bool] = lambda _: True,
-    ) -> Answer:
+    ) -> Answer:  # fmt: skip
         """What was made for these inputs, kept or made: the same, bit by bit. It is kept if it `lasts`."""
         path = self.folder / f"{_key(*inputs)}.{kind}"
-        if data := _read(path):
-            found: Answer = pickle.loads(zlib.decompress(data))
-            return found
-        content = pickle.dumps(made := make())
-        if lasts(made):
-            write_bytes(path, zlib.compress(content, 1))
-        found = pickle.loads(content)
+        try:
+            os.utime(path)  # it counts as asked for now
+            content = zlib.decompress(path.read_bytes())
+        except FileNotFoundError:
+            content = pickle.dumps(made := make())
+            if lasts(made):
+                write_bytes(path, zlib.compress(content, 1))
+        found: Answer = pickle.loads(content)
         return found
 
     def figure(
-        self,
-        inputs: tuple[object, ...],
-        path: Callable[..., Path],
-        settings: FigureSettings,
+        self, inputs: tuple[object, ...], path: Callable[..., Path], settings: FigureSettings,
         draw: Callable[[], Figure],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Write a figure in every format, kept for these inputs or drawn; `path` gives the path for a suffix."""
-        key = _key(code_hash(), settings.dpi, inputs)
-        found: dict[str, bytes] = {form: _read(self.folder / f"{key}.{form}") for form in settings.formats}
-        if missing := [form for form, data in found.items() if not data]:
+
+        def rendered() -> dict[str, bytes]:
             from vinetrack.figures.style import render
 
-            for form, data in render(draw(), missing, settings.dpi).items():
-                write_bytes(self.folder / f"{key}.{form}", data)
-                found[form] = data
-        for form, data in found.items():
+            return render(draw(), settings.formats, settings.dpi)
+
+        state = code_hash(), settings.dpi, settings.formats, inputs
+        for form, data in self.made("figure", state, rendered).items():
             write_bytes(path(suffix=f".{form}"), data)
 
     def forget(self) -> None:
@@ -250,12 +244,3 @@ class Kept:
 
 def _key(*inputs: object) -> str:
     return hashlib.sha256(repr(inputs).encode()).hexdigest()[:32]
-
-
-def _read(path: Path) -> bytes:
-    """Content of a kept file, which counts as asked for now; empty where there is none."""
-    try:
-        os.utime(path, (time.time(), time.time()))
-        return path.read_bytes()
-    except FileNotFoundError:
-        return b""

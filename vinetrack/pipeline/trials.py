@@ -70,16 +70,15 @@ def analyse_trials(job: Job) -> list[str]:
     names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
     model_of(experiment)
     work = partial(_analyse, experiment=experiment, results=Results(job.results), settings=job.settings)
-    failed = {}
+    reasons = {}
     for count, (name, reason, fault) in enumerate(map_unordered(work, names, job.threads), 1):
+        reasons[name] = reason
         log.info("%s: %s", name, reason or "analysed")
         if fault:
             log.error("trial %s:\n%s", name, fault)
-        if reason:
-            failed[name] = reason
         job.say(f"{count} of {len(names)} trials")
     Kept(job.results).forget()
-    return [f"  {name}: {failed[name]}" for name in names if name in failed][:10]
+    return [f"  {name}: {reasons[name]}" for name in names if reasons[name]][:10]
 
 
 def _analyse(name: str, experiment: Experiment, results: Results, settings: RunSettings) -> tuple[str, str, str]:
@@ -87,8 +86,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
     reason, fault, kept = experiment.failed.get(name, ""), "", Kept(results.folder)
     trial = None if reason else experiment.trial(name)
     measurement, summary = None, None
-    columns: dict[str, float] = {}
-    view: dict[str, Any] = {}
+    columns, view = dict[str, float](), dict[str, Any]()
     try:
         if trial is not None and trial.video is None:
             summary = summarise_trial(trial, load_track(trial), settings, model_of(experiment))
@@ -144,11 +142,9 @@ def model_of(experiment: Experiment) -> Model:
 
 def _bare_row(name: str, status: str, reason: str, trial: Trial | None = None) -> dict[str, Any]:
     """Return a row of `trials.csv` for a trial without results; `trial` is None if its row of the sheet is faulty."""
-    blank: dict[str, Any] = dict.fromkeys(TRIALS_COLUMNS, np.nan)
     vine, condition = ("", "") if trial is None else (trial.vine, trial.condition)
-    return blank | {
-        "trial": name, "vine": vine, "condition": condition, "status": status, "reason": reason, "steady_rule": "",
-    }  # fmt: skip
+    known = {"trial": name, "vine": vine, "condition": condition, "status": status, "reason": reason, "steady_rule": ""}
+    return dict.fromkeys(TRIALS_COLUMNS, np.nan) | known
 
 
 def _write(results: Results, name: str, summary: TrialResult | None, row: dict[str, Any], view: dict[str, Any]) -> None:
@@ -259,9 +255,10 @@ def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]
     """Return, as failed trials, those whose axis is askew to that of most other trials with the same growth angle."""
     if experiment.settings.axis is not None:
         return {}
-    axes = {name: content.get("axis") for name, content in analysed.items() if content["row"]["status"] != "failed"}
     slopes_deg = {
-        name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis) for name, axis in axes.items() if axis
+        name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis)
+        for name, content in analysed.items()
+        if content["row"]["status"] != "failed" and (axis := content.get("axis"))
     }
     failed: dict[str, dict[str, Any]] = {}
     for names, agreed in askew_trials(slopes_deg, experiment.trials):

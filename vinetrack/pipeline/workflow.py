@@ -77,15 +77,12 @@ def find_ground_truth(folder: Path, base: Path) -> Path | None:
 
 def refuse_shared_results(results: Path, experiment: Path) -> None:
     """Refuse a results folder that holds the results of another experiment."""
+    other = "choose another results folder (vinetrack run --results DIR, snakemake --config results=DIR)"
     for name in ("provenance.json", CLAIM_FILE):
-        stated = _claim(results / name).get("experiment")
-        made_from = Path(str(stated))
-        if stated and made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
+        made_from = Path(str(_claim(results / name).get("experiment", "")))
+        if made_from.name and made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
             message = f"holds the results of {made_from}, not of {experiment.absolute()}"
-            remedy = (
-                "choose another results folder (vinetrack run --results DIR, snakemake --config results=DIR), "
-                "or rename one of the two"
-            )
+            remedy = f"{other}, or rename one of the two"
             raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)])
 
 
@@ -100,14 +97,9 @@ def _claim(path: Path) -> dict[str, Any]:
 
 def path_problems(*folders: Path) -> list[Problem]:
     """Report folders whose path Snakemake would take for a pattern."""
-    return [
-        Problem(
-            message="has braces or a word in < > in its path, which Snakemake cannot handle", file=str(folder),
-            remedy="rename the folder, or run the stages one by one with vinetrack",
-        )
-        for folder in folders
-        if has_wildcard(folder)
-    ]  # fmt: skip
+    message = "has braces or a word in < > in its path, which Snakemake cannot handle"
+    remedy = "rename the folder, or run the stages one by one with vinetrack"
+    return [Problem(message=message, file=str(folder), remedy=remedy) for folder in folders if has_wildcard(folder)]
 
 
 def has_wildcard(path: Path) -> bool:
@@ -274,14 +266,14 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     refuse_shared_results(results, folder)
     # The virtual laboratory has yet to make the measurements of its experiments.
     inputs = [path for path in input_files(experiment) if is_readable(path) or (ground_truth and not _is_stated(path))]
-    unwatched = [(path.name, path.stat()) for path in inputs if has_wildcard(path) and path.exists()]
+    unwatched = [identity(path) for path in inputs if has_wildcard(path)]
     return WorkflowPlan(
         experiment=folder,
         results=results,
         trials=tuple(name for name in experiment.names if name not in experiment.left_out),
         filmed=tuple(trial.name for trial in experiment.trials if trial.video is not None),
         inputs=tuple(path for path in inputs if not has_wildcard(path)),
-        unwatched=";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in unwatched),
+        unwatched=repr(unwatched),
         settings=settings,
         ground_truth=ground_truth,
         published=experiment.settings.published is not None,
@@ -302,11 +294,10 @@ def print_report_path(plan: WorkflowPlan, workflow: Any) -> None:
     report is newer than all inputs; not after a listing, a dry run, or a run that failed.
     """
     path = plan.results / "report.html"
-    if workflow.execution_settings is None or workflow.dryrun or not path.exists():
-        return
-    made = path.stat().st_mtime
-    if all(source.stat().st_mtime <= made for source in plan.inputs if source.exists()):
-        print(f"Report: {path}", flush=True)
+    if workflow.execution_settings is not None and not workflow.dryrun and path.exists():
+        made = path.stat().st_mtime
+        if all(source.stat().st_mtime <= made for source in plan.inputs if source.exists()):
+            print(f"Report: {path}", flush=True)
 
 
 # ------------------------------------------------------------------------------
@@ -354,10 +345,9 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     except ExperimentError:
         return CheckReport(tuple(problems), (), (), ())
     problems += model_problems(experiment)
-    facts = {trial.name: recording_facts for trial, recording_facts in surveyor.facts.items()}
+    facts = {trial.name: found for trial, found in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
-    entries = [facts[trial.name] for trial in trials]
-    tracks = []
+    entries, tracks = [facts[trial.name] for trial in trials], []
     for trial in experiment.trials:
         if trial.track is not None:
             with contextlib.suppress(TrackError):
@@ -374,8 +364,7 @@ def check_folder(folder: Path, keep: Keep | None = None) -> CheckReport:
     notes = list(experiment.blank_notes)
     notes += [*direction_notes(entries, trials, experiment.angle_blank), *axis_notes(entries, trials)]
     rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in tracks])
-    smoothing = detect_smoothing(tracks, rounding_m)
-    if smoothing is not None:
+    if smoothing := detect_smoothing(tracks, rounding_m):
         notes.append(smoothing.note)
     if rounding_m > 0:
         notes.append(
