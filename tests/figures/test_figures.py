@@ -2,7 +2,6 @@
 
 import math
 
-import matplotlib.colors as mcolors
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,13 +9,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from vinetrack.core.records import Track
-from vinetrack.dynamics.simulate import effect_motion
-from vinetrack.effects import catalogue
 from vinetrack.figures import damping_figures, motion_figures, overlay
 from vinetrack.figures.damping_figures import draw_damping_law, draw_scaling
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, draw_strip
-from vinetrack.figures.prediction_figures import draw_effect
-from vinetrack.figures.style import BLUE, RULE_COLOURS, look, render
+from vinetrack.figures.style import RULE_COLOURS, look, render
 from vinetrack.report.build import inline_picture
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
@@ -192,37 +188,6 @@ def test_every_condition_has_a_panel_with_its_numbers(draw, n_conditions: int) -
     assert len(render(fig, ["svg"])["svg"]) < 1_500_000
     if draw is motion_figures.draw_model_residuals:
         assert shown[0].lines[-1].get_ydata()[-1] == pytest.approx(5.0)
-
-
-# The figure of one effect: its table and its drawing.
-FASTER = {"fold_inertia", "wall_stretch", "gravity"}
-
-
-def test_both_curves_are_drawn_in_millimetres_and_milliseconds():
-    t = np.linspace(0, 0.2, 50)
-    table = pd.DataFrame({"time_s": t, "without_position_m": t, "with_position_m": 0.9 * t, "difference_m": -0.1 * t})
-    table = table.assign(without_velocity_m_s=1.0, with_velocity_m_s=0.9)
-    fig = draw_effect("drag", "C = 1", "a vine", table)
-    position, speed, gap = fig.axes
-    drawn = {mcolors.to_hex(line.get_color()).upper(): line for line in position.lines}
-    np.testing.assert_allclose(drawn[BLUE.upper()].get_ydata(), 900 * t)
-    np.testing.assert_allclose(drawn[BLUE.upper()].get_xdata(), 1e3 * t)
-    assert gap.lines[-1].get_ydata()[-1] == pytest.approx(-20.0)
-    assert "m/s" in speed.get_ylabel()
-    assert [text.get_text() for text in position.get_legend().get_texts()] == ["without", "with"]
-    assert "drag: C = 1" in [text.get_text() for text in fig.texts]
-    assert render(fig, ["png"])["png"].startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("name", [name for name, effect in catalogue().items() if effect.parameters])
-def test_every_effect_shows_on_the_reference_vine(name):
-    found = effect_motion(catalogue()[name])
-    assert np.isfinite(found.to_numpy()).all()
-    assert np.max(np.abs(found["difference_m"])) > 1e-6
-    if catalogue()[name].kind == "physical" and name not in ("tail_stretch", "supply_pulsation", *FASTER):
-        assert found["difference_m"].iloc[-1] < 0
-    if name in FASTER:
-        assert found["difference_m"].iloc[-1] > 0
 
 
 def assert_nothing_is_cut_off(figure: Figure) -> None:

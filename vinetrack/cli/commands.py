@@ -178,12 +178,12 @@ def _settings(page: Path | None) -> Answer | None:
 
 
 @command()
-def _effects(name: str | None, experiment: Path | None, figure: Path | None) -> Answer:
+def _effects(name: str | None, experiment: Path | None) -> Answer:
     """List all effects with formulas, parameters and units, or explain one."""
     from vinetrack.pipeline.effects_stage import describe_effects
     from vinetrack.pipeline.workflow import find_experiment
 
-    return describe_effects(name, None if experiment is None else find_experiment(experiment), figure)
+    return describe_effects(name, None if experiment is None else find_experiment(experiment))
 
 
 # ------------------------------------------------------------------------------

@@ -5,17 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import Bend, Floats, Trial
+from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.equations import TOO_HARD
 from vinetrack.dynamics.kernel import RELATIVE_TOLERANCE, Batch, Trace, lay_out, starts_of
-from vinetrack.dynamics.model import Model, base_model, check_needs, host_for
-from vinetrack.effects import REFERENCE_TRIAL, Effect, TrialInputs, catalogue
+from vinetrack.dynamics.model import Model, check_needs
+from vinetrack.effects import TrialInputs
 
 
 @dataclass(frozen=True)
@@ -161,74 +160,3 @@ def prepare(
 def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
     """The bends of a trial as numbers."""
     return [(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]
-
-
-# ------------------------------------------------------------------------------
-# Motion of a reference vine with and without one effect: the data of the effect's figure.
-
-REFERENCE_VALUES = {"eversion_damping.B": 6.44, "eversion_damping.n": 0.37}
-
-
-def _reference(effect: Effect) -> tuple[Trial, Trace | None, str]:
-    """The trial in which an effect shows, its measured pressure, and both in words."""
-    vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
-    still = f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm"
-    if set(effect.functions) == {"rest_force"}:
-        level = replace(REFERENCE_TRIAL, growth_angle_rad=math.pi / 2)
-        trace = np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3])
-        return level, trace, f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
-    if "trace_time" in effect.functions:
-        trace = np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3])
-        return REFERENCE_TRIAL, trace, f"{vine}, straight down, a pressure recorded while it rises to 28 kPa in 20 ms"
-    if effect.name == "capstan_friction":
-        return replace(REFERENCE_TRIAL, bends=(Bend(0.1, 0.1, 0.1),)), None, f"{still}, one radian of bend after 100 mm"
-    return REFERENCE_TRIAL, None, still
-
-
-def reference_words(effect: Effect) -> str:
-    """Describe the vine and trial of `effect_motion`, for the caption of a picture."""
-    return _reference(effect)[2]
-
-
-def size_words(effect: Effect) -> str:
-    """List the parameters of an effect with their values in `effect_motion`, such as `C_D = 1`."""
-    return ", ".join(p.words(REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default)) for p in effect.parameters)
-
-
-def effect_motion(effect: Effect) -> pd.DataFrame:
-    """Motion of the reference vine with an effect at its default size and without it. An effect of the base model is
-    removed from it, any other is added.
-    """
-    models = _models(effect)
-    trial, trace, _ = _reference(effect)
-    # Shortly before the earlier end of growth; to that of the pressure if it is measured.
-    grown = [] if trace is not None else [simulate(model, trial, np.linspace(0.0, 2.0, 50)) for model in models]
-    end_s = 0.99 * min((motion.end_time_s for motion in grown if motion.status == "ended"), default=0.5 / 0.99)
-    times = np.linspace(0.0, end_s if trace is None else float(trace[0][-1]), 400)
-    with_m, without_m = (simulate(model, trial, times, trace=trace).observed_position_m for model in models)
-    return pd.DataFrame(
-        {
-            "time_s": times,
-            "without_position_m": without_m,
-            "with_position_m": with_m,
-            "without_velocity_m_s": np.gradient(without_m, times),
-            "with_velocity_m_s": np.gradient(with_m, times),
-            "difference_m": with_m - without_m,
-        }
-    )
-
-
-def _models(effect: Effect) -> tuple[Model, Model]:
-    """The base model with an effect and without. Both are the whole catalogue with all other effects at size zero, so
-    that one compiled model serves all figures.
-    """
-    if effect.kind == "base" and not effect.parameters:
-        base = base_model().with_values(REFERENCE_VALUES)
-        return base, base - effect
-    whole = host_for(base_model()) if catalogue().get(effect.name) == effect else base_model() + effect
-    nothing = {f"{e.name}.{p.name}": p.zero for e in whole for p in e.parameters if e.kind != "base"}
-    none = whole.with_values({**nothing, **REFERENCE_VALUES})
-    sizes = {f"{effect.name}.{p.name}": p for p in effect.parameters}
-    if effect.kind == "base":
-        return none, none.with_values({name: p.zero for name, p in sizes.items()})
-    return none.with_values({name: p.default for name, p in sizes.items()}), none

@@ -174,36 +174,6 @@ def _draw_shares(ax: Axes, prediction: VinePrediction) -> None:
     ax.set_title("Uncertainty budget", fontsize=10.5)
 
 
-@st.look()
-def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
-    """Draw position and speed of the leading edge with and without one effect, and the difference."""
-    time_ms = st.column(table, "time_s", 1e3)
-    width_in = 7.2
-    fig = st.new_figure(width_in, 7.0, layout=None)
-    position, speed, gap = fig.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
-    for axes, key, factor in ((position, "position_m", 1e3), (speed, "velocity_m_s", 1.0)):
-        axes.plot(time_ms, st.column(table, f"without_{key}", factor), color=st.MUTED, lw=2.4, label="without")
-        axes.plot(time_ms, st.column(table, f"with_{key}", factor), color=st.BLUE, label="with")
-    difference_mm = st.column(table, "difference_m", 1e3)
-    gap.axhline(0.0, color=st.INK, lw=0.8)
-    gap.plot(time_ms, difference_mm, color=st.VERMILLION)
-    st.band(gap, time_ms, 0.0, difference_mm, st.VERMILLION, 0.15)
-    # Up to the 99th percentile, since a jump at the start or a divergence would hide the rest
-    speeds = np.concatenate([table["without_velocity_m_s"], table["with_velocity_m_s"]])
-    bottom, top = (1.15 * float(np.quantile(speeds, share)) for share in (0.01, 0.99))
-    speed.set_ylim(min(0.0, bottom), top if top > 0 else 1.0)
-    position.set_ylabel("leading edge y (mm)")
-    speed.set_ylabel("its speed ẏ (m/s)")
-    gap.set(xlabel="time since release (ms)", ylabel="difference (mm)")
-    title = name + (f": {size}" if size else "")
-    fig.text(0.12, 0.955, title, fontweight="bold", fontsize=st.fitting_size(title, 0.52 * 72 * width_in, 11))
-    position.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-    fig.align_ylabels()
-    fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.135, hspace=0.14)
-    fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=st.MUTED, fontsize=8.8, va="bottom")
-    return fig
-
-
 # ------------------------------------------------------------------------------
 # Detection power of a campaign: the probability of detecting each effect against its size, as a map.
 #

@@ -17,29 +17,15 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_diagnosis
 
 
-def describe_effects(
-    name: str | None, experiment: Path | None, figure: Path | None
-) -> tuple[list[str], list[dict[str, Any]]]:
-    """List all effects, or explain one and draw it. Returns lines, and the same for a program."""
-    from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
-    from vinetrack.figures.prediction_figures import draw_effect
-    from vinetrack.figures.style import check_figure, write_figure
-
+def describe_effects(name: str | None, experiment: Path | None) -> tuple[list[str], list[dict[str, Any]]]:
+    """List all effects, or explain one. Returns lines, and the same for a program."""
     own = {} if experiment is None else effects_of(experiment)
-    if name is not None:
-        effect = find_effect(name, own)
-        shown, lines = [effect], explanation(effect)
-        if figure is not None:
-            check_figure(figure)
-            drawing = draw_effect(effect.name, size_words(effect), reference_words(effect), effect_motion(effect))
-            write_figure(drawing, figure)
-            lines.append(f"Picture: {figure}")
-    elif figure is None:
+    if name is None:
         shown = [*(effect for effect in catalogue().values() if effect.name not in own), *own.values()]
         lines = listing(shown, own)
     else:
-        problem = Problem(message="needs the name of one effect to draw", file=str(figure), remedy="give NAME")
-        raise ExperimentError([problem])
+        shown = [find_effect(name, own)]
+        lines = explanation(shown[0])
     return lines, [
         {
             "name": effect.name,
