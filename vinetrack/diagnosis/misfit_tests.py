@@ -264,7 +264,7 @@ SINGLE_PROBE_LEVEL = 3e-4  # Level of the test of the single most significant pr
 FAR_OFF_CHI2_PER_DOF = 4.0
 
 # Root mean square misfit of the median trial, as a fraction of its growth, that exceeds the slow errors of any tracker
-MISSED_FRACTION, MISSED_FRACTION_WITHOUT_SLOW_ERRORS = 6e-4, 1.5e-4
+MISSED_FRACTION = 6e-4
 
 # A model that passes every test is searched nevertheless from this χ² per degree of freedom; an effect must then reach
 # this many standard deviations (chosen)
@@ -275,16 +275,13 @@ TESTABLE_SIGMAS = 3.0
 
 
 def exceeds_slow_errors(fit: Fit) -> bool:
-    """Whether the misfit of a fit exceeds the noise and, as a fraction of growth, the slow errors of the tracks. Slow
-    errors may explain less of it where neither tracks nor a gauge have any.
-    """
+    """Whether the misfit of a fit exceeds the noise and, as a fraction of growth, the slow errors of the tracks."""
     data = fit.predictor.data
     systematic = float(
         np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
     )
-    has_slow_errors = any(trial_data.slow_m is not None or trial_data.trace is not None for trial_data in data)
-    explained = max(MISSED_FRACTION if has_slow_errors else MISSED_FRACTION_WITHOUT_SLOW_ERRORS, systematic)
-    return fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and relative_residual(fit.predictor, fit.solution) > explained
+    missed = relative_residual(fit.predictor, fit.solution)
+    return fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and missed > max(MISSED_FRACTION, systematic)
 
 
 @dataclass(frozen=True)

@@ -99,8 +99,7 @@ class EffectSets:
 
     def grow(self, size: int) -> list[LikelihoodRatio]:
         """Forward step: fit sets of this many effects, built on the best sets of one fewer."""
-        # 4, 3: partners tried with each base, of pairs and of larger sets (chosen)
-        n_partners = 4 if size == 2 else 3
+        n_partners = 3  # partners tried with each base (chosen)
         for base in self._bases(size - 1):
             names = frozenset(base.names)
             if names in self.extended:
@@ -129,10 +128,8 @@ class EffectSets:
         if size == 1:
             # 3: best single effects from which pairs are built (chosen)
             return strong[:3]
-        # 2: best sets of one effect fewer from which larger ones are built, besides the best of credible sizes (chosen)
-        bases = strong[:2]
-        credible = [hypothesis for hypothesis in strong if hypothesis.credible]
-        return [*bases, *(best for best in credible[:1] if best not in bases)]
+        # 2: best sets of one effect fewer from which larger ones are built (chosen)
+        return strong[:2]
 
     def prune(self, hypothesis: LikelihoodRatio) -> bool:
         """Backward step: remove each member from a set in turn."""
@@ -271,7 +268,7 @@ def adequate_hypotheses(
             only_best = hypothesis is best and not adequate
             if film_free and (hypothesis in adequate or only_best or hypothesis.film_gain < ANSWER_SET_DELTA_CHI2):
                 continue
-            tests = search.tests_after(hypothesis.fit, film=film_free) if has_credible_sizes(hypothesis) else None
+            tests = search.tests_after(hypothesis.fit, film=film_free) if hypothesis.credible else None
             # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
             # first round, which rejects more readily.
             if tests is None:
@@ -286,22 +283,7 @@ def adequate_hypotheses(
                 rejected.pop(hypothesis.label, None)
         if adequate:
             return sorted(adequate, key=lambda ratio: -ratio.fit.log_likelihood), rejected, after
-        # With film of another mass the best leaves nothing to a candidate or a force: a set of both is tried instead of
-        # hypotheses that are further behind.
-        film_may_suffice = best.film_gain > ANSWER_SET_DELTA_CHI2 and best.credible
-        if film_may_suffice and not _candidate_or_probe_rejects(search.tests_after(best.fit, film=True)):
-            break
     return [], rejected, None
-
-
-def _candidate_or_probe_rejects(tests: MisfitTests) -> bool:
-    """Whether a candidate or a smooth force would still improve the fit, whatever the trial effects absorb."""
-    return bool(tests.exceeds_slow_errors or tests.probes_reject or tests.largest_excess(tests.family) > 0)
-
-
-def has_credible_sizes(hypothesis: LikelihoodRatio) -> bool:
-    """Whether the fitted sizes can be an explanation; with three effects or more all must be plausible."""
-    return hypothesis.plausible and hypothesis.credible if len(hypothesis.effects) > 2 else hypothesis.credible
 
 
 # ------------------------------------------------------------------------------
@@ -552,7 +534,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report) -> list[
     # Sets of effects.
     hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in alone]
     credible = [hypothesis for hypothesis in hypotheses if hypothesis.credible]
-    if not credible or not _any_exceeds_threshold(credible, tests):
+    if not credible or not _exceeds_threshold(best_of(credible), tests):
         # A score that no refit confirms counts only if another test rejects the model too.
         rejected = tests.omnibus_rejects or tests.exceeds_slow_errors
         verdict = UNEXPLAINED if rejected else ADEQUATE
@@ -577,25 +559,13 @@ def _exceeds_threshold(hypothesis: LikelihoodRatio, tests: MisfitTests) -> bool:
     return hypothesis.sigma >= tests.family.threshold(hypothesis.names[-1])
 
 
-def _any_exceeds_threshold(hypotheses: Sequence[LikelihoodRatio], tests: MisfitTests) -> bool:
-    """Whether the best hypothesis, or one that cannot be excluded beside it, exceeds its threshold. Significances
-    differ within the answer set, because each is reduced by the scatter of its own size between trials.
-    """
-    best = best_of(hypotheses)
-    return any(
-        _exceeds_threshold(hypothesis, tests)
-        for hypothesis in hypotheses
-        if hypothesis.deviance_excess(best) <= ANSWER_SET_DELTA_CHI2 * best.inflation
-    )
-
-
 def _single_effect_rounds(
     tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio]
 ) -> list[SelectionStep] | None:
     """Rounds in which a single effect explains the misfit; None where none does."""
     if not hypotheses:
         return None
-    if not _any_exceeds_threshold(hypotheses, tests):
+    if not _exceeds_threshold(best_of(hypotheses), tests):
         return None
     adequate, rejected, after = adequate_hypotheses(hypotheses, search)
     if after is None:
