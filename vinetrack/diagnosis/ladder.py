@@ -23,7 +23,6 @@ from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.core.terminal import plot
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.replicates import (
-    Expected,
     Replicates,
     by_condition,
     expected_error,
@@ -32,6 +31,7 @@ from vinetrack.diagnosis.replicates import (
     replicates_by_condition,
     residual_courses,
 )
+from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, catalogue, find_effect
@@ -98,7 +98,7 @@ def initial_fit(
 
 COMPARISON_COLUMNS = (
     *("model", "condition", "rms_position_m", "rms_final_velocity_m_s", "replicate_floor_m", "ratio", "worst_at_s"),
-    *("worst_at_m", "expected_m", "expected_low_m", "expected_high_m"),
+    *("worst_at_m", *EXPECTED),
 )
 FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at which the final speed is taken (chosen)
 
@@ -152,7 +152,7 @@ def compare(
                 "model": "+".join(fit.model.names),
                 "condition": condition,
                 **position_errors(together),
-                **_expected(expected_error(of_condition[condition], scatter)),
+                **expected_error(of_condition[condition], scatter),
                 "rms_final_velocity_m_s": math.sqrt(np.mean(np.square(known))) if known else math.nan,
             }
         )
@@ -179,11 +179,6 @@ def position_errors(together: Replicates) -> dict[str, float]:
         "worst_at_s": worst_at_s,
         "worst_at_m": worst_at_m,
     }
-
-
-def _expected(expected: Expected) -> dict[str, float]:
-    """Columns of what an adequate model would show."""
-    return {"expected_m": expected.rms_m, "expected_low_m": expected.low_m, "expected_high_m": expected.high_m}
 
 
 def _worst(together: Replicates) -> tuple[float, float]:
@@ -265,7 +260,7 @@ def trajectory_table(together: Replicates) -> pd.DataFrame:
 
 LADDER_COLUMNS = (
     *("model", "added", "rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m"),
-    *("expected_m", "expected_low_m", "expected_high_m", "partial"),
+    *(*EXPECTED, "partial"),
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
@@ -310,7 +305,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     inside = [in_sample(each) for each in fits]
     floor_m = inside[0].floor_m
     courses, _ = residual_courses(fits[0])
-    expected = _expected(expected_error(courses, replicate_scatter(fits[0], courses)))
+    expected = expected_error(courses, replicate_scatter(fits[0], courses))
     for place, (enlarged, name) in enumerate(zip(fits, added, strict=True)):
         outside, highest = left_out(enlarged), highest_pressure(enlarged)
         rows.append(

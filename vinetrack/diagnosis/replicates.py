@@ -23,7 +23,15 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats, Track, Trial, plain_track, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
-from vinetrack.diagnosis.result import ADEQUATE, ARTEFACT, DROPPED_FRAMES, MAX_STRETCHES, UNEXPLAINED, Diagnosis
+from vinetrack.diagnosis.result import (
+    ADEQUATE,
+    ARTEFACT,
+    DROPPED_FRAMES,
+    EXPECTED,
+    MAX_STRETCHES,
+    UNEXPLAINED,
+    Diagnosis,
+)
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit import aligned_to_trials, predict_prepared, rest_is_seen
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
@@ -476,23 +484,16 @@ def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
     return Scatter(pressure, damping, residual, dof)
 
 
-class Expected(NamedTuple):
-    """Error of position that an adequate model shows, rms, m, and the ends of its 95 % range; NaN if not known."""
-
-    rms_m: float
-    low_m: float
-    high_m: float
-
-
-def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> Expected:
-    """Error of an adequate model over these trials, of equal weight, that scatter like their replicates. A residual
-    S u + e, with u ~ N(0, Σ), has the mean square tr(GΣ) + σ², G = SᵀS/n, of variance 2 tr((GΣ)²): as many degrees of
-    freedom (Satterthwaite) as a trial has, so many has every replicate that Σ was estimated from. The range is of F.
+def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[str, float]:
+    """Error of an adequate model over these trials, of equal weight, that scatter like their replicates, rms, m, and
+    the ends of its 95 % range; NaN without replicates. A residual S u + e, u ~ N(0, Σ), has a mean square of tr(GΣ) +
+    σ², G = SᵀS/n, with the variance 2 tr((GΣ)²). As many degrees of freedom (Satterthwaite) as a trial has, so many has
+    every replicate that Σ was estimated from: the range is of F.
     """
     from scipy.stats import f as fisher
 
     if not scatter.dof:
-        return Expected(math.nan, math.nan, math.nan)
+        return dict.fromkeys(EXPECTED, math.nan)
     mean_m2 = variance_m4 = 0.0
     for course in courses:
         response_m = course.values_m[:, 1:]
@@ -503,4 +504,4 @@ def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> Expec
         variance_m4 += 2 * (float(np.trace(shared @ shared)) + independent_m4)
     count, degrees = len(courses), 2 * mean_m2**2 / variance_m4
     ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * degrees / count)
-    return Expected(*(math.sqrt(mean_m2 / count * part) for part in (1.0, *ends)))
+    return dict(zip(EXPECTED, (math.sqrt(mean_m2 / count * part) for part in (1.0, *ends)), strict=True))

@@ -61,6 +61,8 @@ REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"  
 
 DROPPED_FRAMES = "dropped_frames"  # Member of an answer set where a recording has dropped frames
 
+EXPECTED = ["expected_m", "expected_low_m", "expected_high_m"]  # Columns of the error of an adequate model
+
 MAX_STRETCHES = 8  # Most stretches of the growth over which a diagnosis and its figures average residuals (chosen)
 
 BETWEEN_TRIALS = "between_trials"  # Kind of a hypothesis that trials differ

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.units import number
+from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
 from vinetrack.narrative.diagnosis_text import drift_condition
-from vinetrack.narrative.verdict_text import EXPECTED, estimates_text, expected_text, listed_names
+from vinetrack.narrative.verdict_text import estimates_text, expected_text, listed_names
 from vinetrack.results.folder_layout import Results, empty_table, read_diagnosis, read_result
 
 if TYPE_CHECKING:

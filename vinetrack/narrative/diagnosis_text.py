@@ -13,6 +13,7 @@ from vinetrack.core.problems import joined
 from vinetrack.core.terminal import html_table
 from vinetrack.core.units import PREDICTION_UNITS, decimals, display_unit, number, with_error, with_interval
 from vinetrack.diagnosis.result import (
+    EXPECTED,
     NOT_TESTABLE,
     Candidate,
     Diagnosis,
@@ -21,7 +22,6 @@ from vinetrack.diagnosis.result import (
 from vinetrack.effects import Effect, remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.narrative.verdict_text import (
-    EXPECTED,
     SHARED_REMEDIES,
     estimates_text,
     expected_text,

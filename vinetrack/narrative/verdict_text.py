@@ -17,6 +17,7 @@ from vinetrack.diagnosis.result import (
     BETWEEN,
     BETWEEN_TRIALS,
     DROPPED_FRAMES,
+    EXPECTED,
     MISSING,
     N_BY_VINE,
     NOT_TESTABLE,
@@ -245,9 +246,6 @@ def _errors(ladder: pd.DataFrame | None) -> str:
     then = f" → {number(1e3 * float(last[key]))}" if len(ladder) > 1 else ""
     adequate = f", of an adequate model {expected}" if (expected := expected_text(*last[EXPECTED])) else ""
     return f"{what} {number(1e3 * float(first[key]))}{then} mm{adequate}"
-
-
-EXPECTED = ["expected_m", "expected_low_m", "expected_high_m"]  # Columns of the error of an adequate model
 
 
 def expected_text(error_m: float, low_m: float, high_m: float) -> str:

@@ -18,6 +18,7 @@ from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.result import EXPECTED
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for, values_by_key
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
 from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
@@ -26,7 +27,7 @@ from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.fit_result import DAMPING, YIELD_PRESSURE, Fit, Number, TrialFit, group_names
 from vinetrack.inference.optimiser import Step, Watch
 from vinetrack.inference.sensitivity import initial_trial_effects
-from vinetrack.narrative.verdict_text import EXPECTED, spaced_name
+from vinetrack.narrative.verdict_text import spaced_name
 from vinetrack.pages.local_page import THREAD_PREFIX
 from vinetrack.results.folder_layout import Results, ResultsError, measured_trials, read_fit, read_result
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from vinetrack.core import published
 from vinetrack.core.records import split_flags
 from vinetrack.core.units import display_unit, interval, number, with_error
-from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
+from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.figures.registry import all_figures
@@ -38,7 +38,6 @@ from vinetrack.narrative.diagnosis_text import (
     status_tally,
 )
 from vinetrack.narrative.verdict_text import (
-    EXPECTED,
     bounds_text,
     estimates_text,
     expected_text,
