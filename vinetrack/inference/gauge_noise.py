@@ -5,11 +5,11 @@ moved, and a noisy pressure crosses a threshold early, at a different time in ev
 
 Where a few parameters explain a trace, a curve is fitted: a polynomial in time; or, since the pressure falls as the
 tube fills and has its corner where growth begins, a polynomial in time and in the observed growth, shifted by the clock
-offset of gauge and camera (`vinetrack.inference.gauge_noise`), on the scale on which the pressure of an expanding gas
-is linear in the growth. Of the curves that leave only noise, the one with the least BIC is taken (Schwarz, Ann. Stat.
-6, 461, 1978): a superfluous term bends the speed through the whole trial, at 0.1 kPa of noise by more than its position
-errors. The frequency of each kind of curve in the campaign is estimated too and used as a prior (empirical Bayes:
-Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956), and so is the exponent of the gas, which all trials share.
+offset of gauge and camera, on the scale on which the pressure of an expanding gas is linear in the growth. Of the
+curves that leave only noise, that of least BIC is taken (Schwarz, Ann. Stat. 6, 461, 1978): a superfluous term bends
+the speed through the whole trial, at 0.1 kPa of noise by more than its position errors. The frequency of each kind of
+curve in the campaign is estimated too and used as a prior (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp. 1, 157,
+1956). Any other trace is smoothed by a spline.
 """
 
 from __future__ import annotations
@@ -147,9 +147,7 @@ def _interpolated_readings(pressure_Pa: Floats) -> tuple[Readings, float] | None
     if begins.size == 1 or np.sum(np.maximum(within, 0)) < INTERPOLATED_PART * pressure_Pa.size:
         return None
     places, values_Pa = _line_intersections(pressure_Pa, begins)
-    return _with_rounding(places, values_Pa), _noise_of_uneven(
-        places, values_Pa
-    ) / digit_Pa if digit_Pa > 0 else math.inf
+    return _with_rounding(places, values_Pa), rough_noise(values_Pa) / digit_Pa if digit_Pa > 0 else math.inf
 
 
 def _with_rounding(places: Floats, values_Pa: Floats) -> Readings:
@@ -187,16 +185,6 @@ def _straight_runs(values: Floats, reach: float) -> NDArray[np.intp]:
             begins.append(j)
             low, high = -math.inf, math.inf
     return np.array(begins)
-
-
-def _noise_of_uneven(places: Floats, values: Floats) -> float:
-    """Noise of values at uneven places on a smooth curve, from divided differences of up to third order."""
-    windows = np.lib.stride_tricks.sliding_window_view
-    x, y = (windows(each, min(values.size, 4)) for each in (places, values))
-    differences = x[:, :, None] - x[:, None, :]
-    np.einsum("kii->ki", differences)[:] = 1.0
-    weights = 1 / np.prod(differences, axis=2)
-    return float(np.median(np.abs(np.sum(weights * y, axis=1)) / np.linalg.norm(weights, axis=1))) / 0.6745
 
 
 def _sample_and_hold_readings(pressure_Pa: Floats, digit_Pa: float) -> tuple[Floats, Floats] | None:
@@ -489,14 +477,14 @@ def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise
     return np.asarray(-0.5 * (residual_squares - least) / variance)
 
 
-# Half widths of the windows of local lines, samples (chosen)
+# Half widths of the windows in which a residual may not show a local part, samples (chosen)
 HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135, 200, 300, 450, 680, 1000)
 
 
 LARGEST_DEGREE = 6  # Largest degree of a polynomial in time (chosen)
 
 
-EXPONENTS = (1.0, 1.1, 1.2, 1.3, 1.4)  # Exponents γ with which a chamber may empty into the tube, (derived)
+GAMMA = 1.2  # Exponent with which a chamber empties into the tube, between isothermal and adiabatic (derived)
 
 # Degrees in time and in growth of the other kinds of curves (chosen)
 GROWTH_DEGREES = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
@@ -541,18 +529,18 @@ class DenoisedTrace:
 
 @dataclass(frozen=True)
 class _Recorded:
-    """A trace to be denoised: readings, number of samples, noise; growth and clock offset, None where unknown. The
-    exponent of the emptying chamber has an error, which is shared by `n_trials` trials.
-    """
+    """A trace to be denoised: readings, number of samples, noise; growth and clock offset, None where unknown."""
 
     readings: Readings
     count: int
     noise: GaugeNoise
     growth: Growth | None
     clock: Clock | None
-    exponent: float = EXPONENTS[len(EXPONENTS) // 2]
-    exponent_sigma: float = 0.0
-    n_trials: int = 1
+
+    @property
+    def typical_Pa(self) -> float:
+        """Absolute pressure at which the scale of `_linearised` has unit slope."""
+        return max(float(np.median(self.readings.values_Pa)), -0.5 * AMBIENT_PRESSURE_PA) + AMBIENT_PRESSURE_PA
 
     def basis(self, kind: int, offset_sigmas: float = 0.0) -> tuple[Floats, Floats]:
         """Basis functions of a kind of curve at the readings, orthonormal, and at all samples; the first is the mean.
@@ -579,31 +567,26 @@ class _Recorded:
         grown = (self.growth.at(where + offset) - seen_m[0]) / np.ptp(seen_m)
         return polynomial_along(t, grown, *GROWTH_DEGREES[kind - LARGEST_DEGREE - 1])
 
-    def criteria(self, exponents: Sequence[float]) -> Floats:
-        """BIC of every kind of curve for several exponents of the emptying chamber, infinite where its residual is more
-        than noise. Shape (n_exponents, n_kinds).
-        """
-        recorded = [replace(self, exponent=exponent) for exponent in exponents]
-        y = whitened(np.column_stack([each._linearised(self.readings.values_Pa) for each in recorded]), self.noise.rho)
+    def criteria(self) -> Floats:
+        """BIC of every kind of curve, infinite where its residual is more than noise. Shape (n_kinds,)."""
+        y = whitened(_linearised(self.readings.values_Pa, self.typical_Pa), self.noise.rho)
         size, degrees = len(y), self.noise.degrees
         # 12: further degrees that a residual may not show (chosen)
         polynomials = _polynomials(size, min(LARGEST_DEGREE + 12, size // 3))
         time_only = [kind + 1 < polynomials.shape[1] for kind in range(LARGEST_DEGREE + 1)]
         with_growth = [self.clock is not None and sum(of) <= size // 3 - 2 for of in GROWTH_DEGREES]
-        values = np.full((len(recorded), len(time_only) + len(with_growth)), math.inf)
+        values = np.full(len(time_only) + len(with_growth), math.inf)
         for kind in np.flatnonzero(time_only + with_growth):
             basis = np.linalg.qr(whitened(self.basis(int(kind))[0], self.noise.rho))[0]
             numbers, clock_cost = basis.shape[1], 0.0
             if kind > LARGEST_DEGREE:
                 assert self.clock is not None
                 numbers, clock_cost = numbers + 1, self.clock.cost - math.log(size)
-            for value, residual in zip(values, (y - basis @ (basis.T @ y)).T, strict=True):
-                if _is_noise(residual, self.noise, numbers, polynomials):
-                    # A noise estimated from few differences makes the likelihood a Student t.
-                    relative_squares = float(residual @ residual) / (degrees * self.noise.sigma_Pa**2)
-                    value[kind] = (
-                        (degrees + size) * math.log1p(relative_squares) + math.log(size) * numbers + clock_cost
-                    )
+            residual = y - basis @ (basis.T @ y)
+            if _is_noise(residual, self.noise, numbers, polynomials):
+                # A noise estimated from few differences makes the likelihood a Student t.
+                relative_squares = float(residual @ residual) / (degrees * self.noise.sigma_Pa**2)
+                values[kind] = (degrees + size) * math.log1p(relative_squares) + math.log(size) * numbers + clock_cost
         return values
 
     def averaged(self, weights: Floats) -> tuple[Floats, float, Floats]:
@@ -615,7 +598,7 @@ class _Recorded:
         if not kinds.size:
             return self.curve(None)
         _, of_mean_Pa, errors_Pa = self.curve(int(np.argmax(weights)))
-        all_errors_Pa = [errors_Pa, *self._clock_and_exponent_errors(int(np.argmax(weights)))]
+        all_errors_Pa = [errors_Pa, *self._clock_errors(int(np.argmax(weights)))]
         shares = weights[kinds] / weights[kinds].sum()
         curves_Pa = np.column_stack([self.curve(int(kind))[0] for kind in kinds])
         mean_Pa = curves_Pa @ shares
@@ -623,60 +606,43 @@ class _Recorded:
         all_errors_Pa.append(between_Pa - np.mean(between_Pa, axis=0))
         return mean_Pa, of_mean_Pa, _principal_errors(np.column_stack(all_errors_Pa))
 
-    def _clock_and_exponent_errors(self, kind: int) -> list[Floats]:
-        """Errors of a curve in growth due to one standard deviation of clock offset and of exponent, Pa. The error σ of
-        the exponent is common to n trials.
-        """
+    def _clock_errors(self, kind: int) -> list[Floats]:
+        """Error of a curve in growth due to one standard deviation of the clock offset, Pa."""
         if kind <= LARGEST_DEGREE:
             return []
-        changes_Pa = [
-            0.5 * (self.curve(kind, offset_sigmas=1.0)[0] - self.curve(kind, offset_sigmas=-1.0)[0]),
-            0.5 * (self._with_exponent(1.0).curve(kind)[0] - self._with_exponent(-1.0).curve(kind)[0]),
-        ]
-        return [each - np.mean(each) for each in changes_Pa if np.ptp(each) > 0]
-
-    def _with_exponent(self, offset_sigmas: float) -> _Recorded:
-        sigma = min(math.sqrt(self.n_trials) * self.exponent_sigma, (EXPONENTS[-1] - EXPONENTS[0]) / math.sqrt(12))
-        return replace(self, exponent=self.exponent + offset_sigmas * sigma)
+        change_Pa = 0.5 * (self.curve(kind, offset_sigmas=1.0)[0] - self.curve(kind, offset_sigmas=-1.0)[0])
+        return [change_Pa - np.mean(change_Pa)] if np.ptp(change_Pa) > 0 else []
 
     def curve(self, kind: int | None, offset_sigmas: float = 0.0) -> tuple[Floats, float, Floats]:
         """The curve of a kind at all samples, Pa, the error of its mean, Pa, and one column per other error. Without a
-        kind the curve consists of local lines. Errors are one standard deviation each.
+        kind it is a smoothing spline. Errors are one standard deviation each.
         """
         noise, values_Pa = self.noise, self.readings.values_Pa
         if kind is None:
             # White noise is assumed: a changing pressure can mimic a correlation of the noise.
-            white_Pa = white_noise_sd(values_Pa) if values_Pa.size >= FEWEST_SAMPLES else noise.sigma_Pa
-            noise = replace(noise, sigma_Pa=white_Pa, rho=0.0)
-            # Wide local lines have slow errors: their size is taken as that of a polynomial of this degree.
-            basis = _polynomials(values_Pa.size, min(LARGEST_DEGREE, values_Pa.size - 2))
-            curves = np.column_stack([_local_lines(values_Pa, noise), noise.sigma_Pa * basis])
-            at_samples = _at_samples(curves, self.readings.places, self.count)
-            smooth, per_error = at_samples[:, 0], at_samples[:, 1:]
+            white_Pa = white_noise_sd(values_Pa) if values_Pa.size >= FEWEST_SAMPLES else 0.0
+            noise = replace(noise, sigma_Pa=white_Pa or noise.sigma_Pa, rho=0.0)
+        # A spline has slow errors: their size is taken as that of a polynomial of the largest degree.
+        basis, basis_at_samples = self.basis(
+            min(LARGEST_DEGREE, values_Pa.size - 2) if kind is None else kind, offset_sigmas
+        )
+        q, r = np.linalg.qr(whitened(basis, noise.rho))
+        per_error = noise.sigma_Pa * np.linalg.solve(r.T, basis_at_samples.T).T
+        if kind is None:
+            smooth = _spline(self.readings.places, values_Pa, noise.sigma_Pa, self.count)
         else:
-            basis, basis_at_samples = self.basis(kind, offset_sigmas)
-            q, r = np.linalg.qr(whitened(basis, noise.rho))
-            per_error = noise.sigma_Pa * np.linalg.solve(r.T, basis_at_samples.T).T
-            straight = basis_at_samples @ np.linalg.solve(r, q.T @ whitened(self._linearised(values_Pa), noise.rho))
-            smooth, slope = self._from_linearised(straight)
-            per_error = per_error * slope[:, None]
+            white = whitened(_linearised(values_Pa, self.typical_Pa), noise.rho)
+            part = np.maximum(-basis_at_samples @ np.linalg.solve(r, q.T @ white) / (GAMMA * self.typical_Pa), 0.01)
+            smooth = self.typical_Pa * part**-GAMMA - AMBIENT_PRESSURE_PA
+            per_error = per_error * part[:, None] ** (-GAMMA - 1)
         means = np.mean(per_error, axis=0)
         return smooth, float(np.linalg.norm(means)), (per_error - means)[:, 1:]
 
-    @property
-    def _typical_Pa(self) -> float:
-        """Absolute pressure at which the linearised scale has unit slope."""
-        return max(float(np.median(self.readings.values_Pa)), -0.5 * AMBIENT_PRESSURE_PA) + AMBIENT_PRESSURE_PA
 
-    def _linearised(self, pressure_Pa: Floats) -> Floats:
-        """Pressure on the scale on which that of a chamber emptying into the tube is linear in the growth, Pa."""
-        whole = np.maximum(pressure_Pa + AMBIENT_PRESSURE_PA, 0.1 * AMBIENT_PRESSURE_PA) / self._typical_Pa
-        return np.asarray(-self.exponent * self._typical_Pa * whole ** (-1 / self.exponent))
-
-    def _from_linearised(self, straight: Floats) -> tuple[Floats, Floats]:
-        """The pressure of values on the linearised scale, Pa, and its derivative with respect to them."""
-        part = np.maximum(-straight / (self.exponent * self._typical_Pa), 0.01)
-        return self._typical_Pa * part**-self.exponent - AMBIENT_PRESSURE_PA, part ** (-self.exponent - 1)
+def _linearised(pressure_Pa: Floats, typical_Pa: float) -> Floats:
+    """Pressure on the scale on which that of a chamber emptying into the tube is linear in the growth, Pa."""
+    whole = np.maximum(pressure_Pa + AMBIENT_PRESSURE_PA, 0.1 * AMBIENT_PRESSURE_PA) / typical_Pa
+    return np.asarray(-GAMMA * typical_Pa * whole ** (-1 / GAMMA))
 
 
 def _principal_errors(errors_Pa: Floats) -> Floats:
@@ -712,46 +678,29 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
     rho = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
     noises = noise_of_traces(read, rho)
     clocks = gauge_clocks(read, list(growths.values()), noises)
-    noisy = _with_common_exponent(
-        {
-            i: _Recorded(readings, raw[i].time_s.size, noise, growths[i], clock)
-            for i, readings, noise, clock in zip(raw, read, noises, clocks, strict=True)
-            if noise.sigma_Pa > 0
-        }
-    )
+    noisy = {
+        i: _Recorded(readings, raw[i].time_s.size, noise, growths[i], clock)
+        for i, readings, noise, clock in zip(raw, read, noises, clocks, strict=True)
+        if noise.sigma_Pa > 0
+    }
     if noisy:
-        weights = _weights(np.array([recorded.criteria([recorded.exponent])[0] for recorded in noisy.values()]))
+        weights = _weights(np.array([recorded.criteria() for recorded in noisy.values()]))
         for (i, recorded), weight in zip(noisy.items(), weights, strict=True):
             denoised[i] = DenoisedTrace(raw[i].time_s, *recorded.averaged(weight), bool(np.any(weight)))
     return denoised
 
 
-def _with_common_exponent(noisy: dict[int, _Recorded]) -> dict[int, _Recorded]:
-    """The traces with the exponent of their chamber, common to all, and its error, from BIC and a flat prior."""
-    lowest = np.array([np.min(each.criteria(EXPONENTS), axis=1) for each in noisy.values()])
-    informative = lowest[np.isfinite(lowest).all(axis=1)] if noisy else np.zeros((0, len(EXPONENTS)))
-    criteria = np.sum(informative, axis=0)
-    probability = np.exp(-0.5 * (criteria - np.min(criteria)))
-    exponent = float(np.average(EXPONENTS, weights=probability))
-    width = (EXPONENTS[-1] - EXPONENTS[0]) / (len(EXPONENTS) - 1)
-    variance = float(np.average((np.array(EXPONENTS) - exponent) ** 2, weights=probability)) + width**2 / 12
-    return {
-        i: replace(each, exponent=exponent, exponent_sigma=math.sqrt(variance), n_trials=len(noisy))
-        for i, each in noisy.items()
-    }
+def _spline(places: Floats, values_Pa: Floats, sigma_Pa: float, count: int) -> Floats:
+    """Smoothing spline through readings at all samples, with knots where the pressure bends (Dierckx, IMA J. Numer.
+    Anal. 1, 267, 1981); of fewer than five readings lines.
+    """
+    from scipy.interpolate import UnivariateSpline
 
-
-def _at_samples(curves: Floats, places: Floats, count: int) -> Floats:
-    """Interpolate columns from places to all samples, with linear extrapolation at both ends."""
-    samples = np.arange(count)
-    if places.size == count:
-        return curves
-    inside = np.column_stack([np.interp(samples, places, curve) for curve in curves.T])
-    for end, outside in (([0, 1], samples < places[0]), ([-1, -2], samples > places[-1])):
-        edge, next_to = end
-        slope = (curves[edge] - curves[next_to]) / (places[edge] - places[next_to])
-        inside[outside] = curves[edge] + np.outer(samples[outside] - places[edge], slope)
-    return inside
+    # 0.85: part of the squares of the noise that the spline leaves, the rest for its knots (measured)
+    few = places.size < 5
+    weights = np.full(places.size, 1 / sigma_Pa)
+    spline = UnivariateSpline(places, values_Pa, weights, k=1 if few else 3, s=0.0 if few else 0.85 * places.size)
+    return np.asarray(spline(np.arange(float(count))))
 
 
 def _weights(criteria: Floats) -> Floats:
@@ -798,40 +747,3 @@ def _largest_residual_squares(noise: GaugeNoise, degrees: Floats | int) -> Any:
 
     # 1e-5: probability with which pure noise leaves a larger residual sum of squares than is accepted (chosen)
     return noise.sigma_Pa**2 * degrees * fdtri(degrees, noise.degrees, 1 - 1e-5)
-
-
-def _local_lines(pressure_Pa: Floats, noise: GaugeNoise) -> Floats:
-    """The value at every sample of a line over its widest admissible window."""
-    smooth = pressure_Pa.copy()
-    low, high = np.full(smooth.size, -np.inf), np.full(smooth.size, np.inf)
-    agrees = np.ones(smooth.size, dtype=bool)
-    for half in HALF_WIDTHS:
-        value, part, residual_squares, degrees = _local_line(pressure_Pa, half)
-        # 4.0: half width, in standard deviations, of the intervals of local lines that must overlap (chosen)
-        half_width = 4.0 * noise.sigma_Pa * part
-        low, high = np.maximum(low, value - half_width), np.minimum(high, value + half_width)
-        agrees &= (low <= high) & (residual_squares < _largest_residual_squares(noise, degrees))
-        if not agrees.any():
-            break
-        smooth[agrees] = value[agrees]
-    return smooth
-
-
-def _local_line(y: Floats, half: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Value at every sample of the line through its neighbours, up to `half` to each side. Also its standard deviation
-    relative to that of a sample, the residual sum of squares and its degrees of freedom; all of shape (n,).
-    """
-    y_mean = float(np.mean(y))
-    y = y - y_mean
-    place = np.arange(y.size)
-    first, last = np.maximum(place - half, 0), np.minimum(place + half, y.size - 1) + 1
-    x = place - 0.5 * (y.size - 1)
-    sums = [np.concatenate([[0.0], np.cumsum(values)]) for values in (x, x * x, y, x * y, y * y)]
-    count = (last - first).astype(float)
-    mean_x, mean_xx, mean_y, mean_xy, mean_yy = ((values[last] - values[first]) / count for values in sums)
-    spread = mean_xx - mean_x**2
-    distance = x - mean_x
-    joint = mean_xy - mean_x * mean_y
-    residual_squares = np.maximum(mean_yy - mean_y**2 - joint**2 / spread, 0.0) * count
-    relative_sd = np.sqrt((1 + distance**2 / spread) / count)
-    return y_mean + mean_y + joint / spread * distance, relative_sd, residual_squares, count - 2
