@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,7 +48,8 @@ def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarr
 
 
 def crossed(columns: list[np.ndarray]) -> np.ndarray:
-    return all_products(columns, [np.arange(len(columns[0])) == 0] * len(columns))
+    one_stretch = SimpleNamespace(first=np.arange(len(columns[0])) == 0, relative_sd=None)
+    return all_products(columns, [one_stretch] * len(columns))
 
 
 def test_cross_products_agree_with_the_dense_inverse_covariance():

@@ -64,9 +64,8 @@ def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
 
 def full_fit(before: Fit, shape: CandidateShape, size: float, best: float = -math.inf) -> Fit | None:
     """Fit a model with an effect added, from a shape at its predicted size; None where the fit fails. `best` is the
-    largest ln L of the others: a fit that stays far behind it is given up.
+    largest ln L of the others: a fit that stays far behind it is not continued.
     """
-    goal = before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood)
     try:
         # 14, 40, 50.0: iterations of a full fit at first and in all (chosen)
         fit = refit(
@@ -75,7 +74,6 @@ def full_fit(before: Fit, shape: CandidateShape, size: float, best: float = -mat
             start=start_values(shape, size),
             most_iterations=14,
             thorough=False,
-            goal=goal,
         )
         poor = is_poor_fit(fit.predictor, fit.solution)
         if fit.noise_correlation > SLOW_NOISE and poor:

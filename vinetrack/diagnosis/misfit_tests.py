@@ -24,7 +24,6 @@ from vinetrack.diagnosis.score_test import (
     Scores,
     effect_sensitivities,
     family_test,
-    fit_columns,
     linear_gains,
     plausible_range,
     products_of,
@@ -467,7 +466,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: boo
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     sensitivities = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials, film=film)
-    columns = fit_columns(fit)
+    columns = fit.solution.columns
     products = products_of(fit, columns, sensitivities, systematics)
     structure = structure_of(fit, columns, systematics)
     return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), structure, level)
