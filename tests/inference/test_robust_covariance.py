@@ -12,9 +12,10 @@ from scipy.stats import t as student
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.locate import against_the_sheet
-from vinetrack.inference import fit_result, optimiser, position_errors
+from vinetrack.inference import fit_result, optimiser
 from vinetrack.inference import robust_covariance as sandwich
 from vinetrack.inference.optimiser import solve
+from vinetrack.inference.precision import precision
 
 Pairs = list[tuple[Trial, Track]]
 FALL = vt.make_model(["gravity", "air_drag"])
@@ -50,7 +51,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds)
     by_noise, stated = [], []
     for seed in seeds:
         found = vt.fit(vt.base_model(), make(seed), profile=False)
-        narrow = np.sqrt(np.diag(position_errors.precision(found.solution).covariance))
+        narrow = np.sqrt(np.diag(precision(found.solution).covariance))
         for k, number in enumerate(found.numbers):
             if number.key == "yield_pressure.P_y":
                 continue
@@ -73,7 +74,7 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch):
     found = vt.fit(vt.base_model(), unlike(20620), profile=False)
     plain, robust = (np.diag(matrix) for matrix in sandwich.sandwich(found.predictor, found.solution)[:2])
     assert np.max(robust / plain) > 1.5
-    known = position_errors.precision(found.solution)
+    known = precision(found.solution)
     nothing = sandwich.Systematics.none([trial.time_s.size for trial in found.predictor.data])
     monkeypatch.setattr("vinetrack.inference.robust_covariance.systematics_of", lambda *_, **__: nothing)
     stated = np.diag(sandwich.widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
@@ -167,7 +168,7 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     model = vt.base_model().with_values({"eversion_damping.n": 0.4})
     found = vt.fit(model, pairs, fixed=["n", "P_y"], profile=False)
     B = found["B"]
-    assert position_errors.precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
+    assert precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
     standard_error = float(np.std(np.log(factors), ddof=1)) / math.sqrt(trials)
     assert B.sigma / B.value == pytest.approx(standard_error, rel=0.1)
     half_width = math.log(B.high / B.low) / 2

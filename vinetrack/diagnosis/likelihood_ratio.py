@@ -31,7 +31,7 @@ from vinetrack.inference.marginal_likelihood import (
     marginal,
 )
 from vinetrack.inference.optimiser import Solution, is_poor_fit
-from vinetrack.inference.position_errors import with_shapes
+from vinetrack.inference.precision import with_shapes
 from vinetrack.inference.robust_covariance import (
     FEWEST_CLUSTERS,
     Systematics,

@@ -40,7 +40,7 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effects_eliminated,
 )
 from vinetrack.inference.marginal_likelihood import trial_deviation_sd as between_trial_sd
-from vinetrack.inference.position_errors import with_shapes
+from vinetrack.inference.precision import with_shapes
 from vinetrack.inference.robust_covariance import Systematics, cluster_variance, coarsest_groups
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
 from vinetrack.inference.whitening import all_products, at_correlation

@@ -41,7 +41,7 @@ from vinetrack.inference.optimiser import (
     make_problem,
     solve,
 )
-from vinetrack.inference.position_errors import Pooled, pool, student, trial_information
+from vinetrack.inference.precision import Pooled, pool, student, trial_information
 from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -77,7 +77,7 @@ if TYPE_CHECKING:
 #     e = M (X δθ + X u + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
 #
 # δθ is the error of the shared parameters, u the difference of the trial's parameters from those
-# (`position_errors.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
+# (`precision.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
 # position, 30 Pa of a set pressure) and ε noise of covariance K, which includes the misfit of the model along each
 # trial, since the noise of a fit is that of its residuals. The variance at a time is the diagonal of
 #

@@ -20,7 +20,7 @@ from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.marginal_likelihood import MixedProblem, by_parameter, inverse_of_block, matrix_root
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.position_errors import Pooled, Precision, trial_information, with_shapes
+from vinetrack.inference.precision import Pooled, Precision, trial_information, with_shapes
 from vinetrack.inference.sensitivity import PRESSURE, Predictor, position_change
 
 # ------------------------------------------------------------------------------

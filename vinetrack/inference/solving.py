@@ -49,7 +49,7 @@ from vinetrack.inference.optimiser import (
     solve,
     track_correlation,
 )
-from vinetrack.inference.position_errors import (
+from vinetrack.inference.precision import (
     Pooled,
     Precision,
     near_bound,
