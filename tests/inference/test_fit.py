@@ -489,7 +489,7 @@ def test_a_release_that_returns_does_not_jump_for_ever(only_in_motion, monkeypat
 def test_a_search_converges_if_the_model_is_close_to_the_tracks(only_in_motion):
     """And one whose trajectories overflow costs infinitely much, without a warning."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
-    found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4)
+    found = solve(predictor, solution.problem, solution.state, FixedTerms())
     assert found.converged
     far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
     assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
