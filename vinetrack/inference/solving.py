@@ -70,6 +70,7 @@ from vinetrack.inference.sensitivity import (
     candidates,
     initial_trial_effects,
 )
+from vinetrack.inference.trial_effects import trial_costs
 from vinetrack.inference.whitening import whiten
 
 # Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks (chosen)
@@ -188,8 +189,17 @@ def solve_onward(
     )
     state = replace(before.state, theta=theta)
     # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
-    near = fixed_terms.noise is not None or cost(predictor, problem, state) < 1.5 * float(np.sum(problem.points))
-    return solve(predictor, problem, state, fixed_terms, warm=near, **how)
+    if fixed_terms.noise is None and cost(predictor, problem, state) > 1.5 * float(np.sum(problem.points)):
+        # Free noise would absorb the misfit of bad starting values and stall the optimiser: it is fixed at first. An
+        # apparently late release may be the action of the new effect: each trial starts at the one that fits best.
+        aligned, _ = align(predictor.data, predictor, state.theta, state.trial_effects)
+        options = [state, replace(state, trial_effects=aligned)]
+        best = np.argmin([trial_costs(predictor, problem, option) for option in options], axis=0)
+        effects = np.array([options[option].trial_effects[i] for i, option in enumerate(best)])
+        noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
+        state, most = replace(state, trial_effects=effects), TRACK_CORRELATION_ITERATIONS
+        state = solve(predictor, problem, state, noise, warm=True, most_iterations=most).state
+    return solve(predictor, problem, state, fixed_terms, warm=True, **how)
 
 
 def solve_again(
