@@ -35,9 +35,6 @@ from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import SLOW_NOISE, assemble
 
-# Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
-MIN_SHARE_OF_BEST_GAIN = 0.3
-
 
 def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
     """Values of an effect's parameters to start from: the predicted size, limited to what is possible. Returns by
@@ -152,7 +149,6 @@ class CandidateFits:
     report: Report
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     failed: set[str] = field(default_factory=set)
-    nested_checked: list[Fit] = field(default_factory=list)
     nested_labels: set[str] = field(default_factory=set)
     nested_tried: set[NestedForm] = field(default_factory=set)
     tests_by_fit: list[tuple[Fit, bool, MisfitTests]] = field(default_factory=list)
@@ -162,11 +158,6 @@ class CandidateFits:
         """Effects to which trials respond, the largest predicted gain first."""
         names = dict.fromkeys(self.tests.sensitivities.effects)
         return sorted(names, key=lambda name: -self.tests.predicted_gain(name))
-
-    @property
-    def credible_fits(self) -> list[LikelihoodRatio]:
-        """Fitted hypotheses of plausible and credible sizes."""
-        return [hypothesis for hypothesis in self.fitted.values() if hypothesis.plausible and hypothesis.credible]
 
     def tests_after(self, fit: Fit, *, film: bool = False) -> MisfitTests:
         """Run the misfit tests of one of the fits, at the level of later rounds."""
@@ -196,10 +187,8 @@ class CandidateFits:
         before = self.tests.fit
         best = max((hypothesis.fit.log_likelihood for hypothesis in self.fitted.values()), default=0.0)
         for hypothesis in list(self.fitted.values()):
-            excluded = 2 * (best - hypothesis.fit.log_likelihood) > OUT_OF_REACH
-            if excluded or any(checked is hypothesis.fit for checked in self.nested_checked):
+            if 2 * (best - hypothesis.fit.log_likelihood) > OUT_OF_REACH:
                 continue
-            self.nested_checked.append(hypothesis.fit)
             for effects, fit in simpler_forms(before, hypothesis, self.tests.effects, self.nested_tried):
                 simpler = likelihood_ratio(before, effects, fit)
                 self.nested_labels.add(simpler.label)
@@ -219,7 +208,8 @@ class CandidateFits:
         for index in self.tests.ranked_shapes(name)[:STARTS_PER_EFFECT]:
             shape, size = self.tests.sensitivities.shapes[index], float(self.tests.predicted_gains[1][index])
             # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
-            best = max((known.fit.log_likelihood for known in self.credible_fits), default=-math.inf)
+            credible = [known for known in self.fitted.values() if known.plausible and known.credible]
+            best = max((known.fit.log_likelihood for known in credible), default=-math.inf)
             fit = full_fit(self.tests.fit, shape, size, best)
             hypothesis = None if fit is None else likelihood_ratio(self.tests.fit, (shape.effect,), fit)
             if hypothesis is None or hypothesis.delta_chi2 < FAILED_FIT_DELTA_CHI2:

@@ -517,7 +517,6 @@ def refit(
     shared: Mapping[str, str] | None = None,
     between: Sequence[BetweenTerm] | None = None,
     start: Mapping[str, Value] | None = None,
-    yields_Pa: Mapping[str, float] | None = None,
     hold_spreads: bool = False,
     hold_noise: bool = False,
     profile: bool = False,
@@ -541,8 +540,6 @@ def refit(
         Differences between trials to estimate, in place of those of the previous fit.
     start : mapping, optional
         Starting values of parameters, mainly of a new effect: a time constant that starts at zero stays there.
-    yields_Pa : mapping, optional
-        Starting values of yield pressures, Pa, by `Number.name`, in place of the fitted ones.
     hold_spreads, hold_noise : bool
         Keep the between-trial standard deviations, or the noise, of the previous fit instead of estimating them again.
     profile : bool
@@ -597,7 +594,7 @@ def refit(
     theta = layout.start
     former = before.predictor.layout
     values = dict(zip([each.name for each in former.free], former.values(before.state.theta).tolist(), strict=True))
-    values |= {number.name: number.value for number in before.numbers} | dict(yields_Pa or {})
+    values |= {number.name: number.value for number in before.numbers}
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
             theta[k] = number.to_scaled(float(np.clip(values[number.name], number.lower, number.upper)))
