@@ -27,7 +27,7 @@ from vinetrack.core.tables import write_json
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.diagnosis import propose as proposing
 from vinetrack.diagnosis.propose import add, propose
-from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.model import Model, probe
 from vinetrack.effects import own_effects
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.inference.fit_summary import summary_of
@@ -180,7 +180,9 @@ def test_a_law_is_written_beside_the_experiment_and_added(tmp_path, monkeypatch)
     assert "exists already" in again.output
     assert run("add", shutil.copy(path, results), results, "--save").exit_code == 1
     # Without the rest of the catalogue, with which this effect would be compiled once more.
-    monkeypatch.setattr("vinetrack.diagnosis.ladder.host_for", lambda model, more: Model((*model.effects, *more)))
+    monkeypatch.setattr(
+        "vinetrack.diagnosis.ladder.host_for", lambda model, more: Model((*model.effects, probe(), *more))
+    )
     succeed("add", path, results, "--save")
     settings = read_experiment_settings(experiment / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("proposed_time", ("proposed_time.py",))

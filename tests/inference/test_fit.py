@@ -130,7 +130,7 @@ def test_a_parameter_at_its_bound_has_an_interval_by_profile_and_gains_no_likeli
 
 
 def test_a_profile_interval_is_as_wide_as_the_error_that_is_stated(monkeypatch):
-    """Behind a lens, of which the profile once knew nothing: it was three quarters as wide."""
+    """Behind a lens, of which the profile knows nothing: it was three quarters as wide."""
     pairs = [(replace(t, position_systematic_m=1e-3), track) for t, track in small_campaign(seed=5, replicates=2)[0]]
     linear = vt.fit(vt.base_model(), pairs, profile=False)
     place = linear.numbers.index(linear["n"])
@@ -298,8 +298,7 @@ def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campai
     whole, pairs, _ = campaign
     rest = [pair for pair in pairs if pair[0].condition != pairs[0][0].condition]
     warm = fit_subset(whole, [trial.name for trial, _ in rest])
-    spreads = (whole.spreads["pressure"].value, whole.spreads["B"].value)
-    cold = vt.fit(vt.base_model(), rest, profile=False, spreads=spreads)
+    cold = vt.fit(vt.base_model(), rest, profile=False)
     assert [trial.name for trial in warm.trials] == [trial.name for trial, _ in rest]
     for one, other in zip(warm.numbers, cold.numbers, strict=True):
         assert one.name == other.name
@@ -307,11 +306,11 @@ def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campai
         assert one.sigma == pytest.approx(other.sigma, rel=0.05)
     # The parameters of a vine that is left out are dropped.
     stays = pairs[0][0].vine
-    alone = fit_subset(whole, [trial.name for trial in whole.trials if trial.trial.vine == stays])
+    alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
     assert {number.vine for number in alone.numbers} == {"", stays}
     with pytest.raises(vt.FitError):
         vt.predict(alone, [next(pair for pair in pairs if pair[0].vine != stays)])
-    for keep in (["elsewhere"], []):
+    for keep in (["elsewhere"], [False] * len(whole.trials), [True, False]):
         with pytest.raises(vt.FitError):
             fit_subset(whole, keep)
 
@@ -319,7 +318,7 @@ def test_leaving_out_a_condition_or_a_vine_agrees_with_a_fit_from_scratch(campai
 def test_variance_components_can_be_fixed_and_noise_that_a_user_gave_is_kept(campaign):
     whole, pairs, _ = campaign
     names = [trial.name for trial in whole.trials[:9]]
-    held = fit_subset(whole, names)
+    held = fit_subset(whole, names, hold_spreads=True, hold_noise=True)
     assert [held.spreads[k].value for k in ("pressure", "B")] == [whole.spreads[k].value for k in ("pressure", "B")]
     assert held.noise_correlation == whole.noise_correlation
     part = fit_subset(vt.fit(vt.base_model(), pairs, profile=False, noise=(2e-4, 0.3)), names)
@@ -475,21 +474,36 @@ def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho
         assert np.allclose(product, white.T @ white, rtol=1e-12, atol=1e-12)
 
 
-def test_a_release_that_returns_does_not_jump_for_ever(only_in_motion, monkeypatch):
-    """3 of 400 trials cycled eight times, in 40 steps of all trials."""
+def test_a_jump_is_remembered_by_later_searches(only_in_motion, monkeypatch):
+    """A search one step later forgot the jump: 3 of 400 trials cycled eight times, in 40 steps of all trials."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     residuals = residuals_in(predictor.linearise(solution.state.theta, solution.state.trial_effects))
-    earlier = np.array([-0.004, 0.0, 0.0, 0.0])
-    monkeypatch.setattr(trial_effects, "_best_release", lambda *given: (given[1] + earlier, 1.0))
+    there = solution.state.trial_effects.copy()
+    there[:, 0] -= 0.004
+    elsewhere = replace(solution.state, trial_effects=there)
     monkeypatch.setattr(trial_effects.ReleaseSearch, "_confirmed", lambda *given: given[-1])
     search = trial_effects.ReleaseSearch(predictor, solution.problem)
-    assert [search.likelier(solution.state, residuals) is None for _ in range(5)] == [False] * 4 + [True]
+    for begins, likelier in ((solution.state, elsewhere), (elsewhere, None), (solution.state, None)):
+        monkeypatch.setattr(trial_effects.ReleaseSearch, "_by_linear_model", lambda *_, at=likelier: at)
+        search.likelier(begins, residuals)
+    assert search.returned.all()
+
+
+def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motion):
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    start = replace(solution.state, theta=solution.state.theta + 0.3 * (np.arange(solution.state.theta.size) == 0))
+    led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, goal=solution.log_likelihood() - 1)
+    assert led.converged
+    assert led.log_likelihood() == pytest.approx(solution.log_likelihood(), abs=0.5)
+    given_up = solve(predictor, solution.problem, start, FixedTerms(), warm=True, goal=1e9)
+    assert not given_up.converged
+    assert given_up.iterations < led.iterations
 
 
 def test_a_search_converges_if_the_model_is_close_to_the_tracks(only_in_motion):
     """And one whose trajectories overflow costs infinitely much, without a warning."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
-    found = solve(predictor, solution.problem, solution.state, FixedTerms())
+    found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4, search=True)
     assert found.converged
     far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
     assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()

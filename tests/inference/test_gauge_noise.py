@@ -345,8 +345,9 @@ def test_errors_without_influence_on_the_motion_are_zero(fit):
     deaf = replace(fit.solution, state=replace(state, variance=1e8 * state.variance))
     felt = [each for each in fit.predictor.data if each.trace_errors_Pa is not None]
     far = [replace(each, trace_error_sizes=np.full(each.trace_errors_Pa.shape[1], 3.0)) for each in felt]
-    for size in solving.fitted_trace_errors(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf):
-        np.testing.assert_allclose(size, 0.0, atol=0.05)
+    moved = solving.trace_error_step(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf)
+    for back, each in zip(moved, far, strict=True):
+        np.testing.assert_allclose(back[: each.trace_error_sizes.size], -3.0, atol=0.05)
 
 
 @pytest.mark.slow

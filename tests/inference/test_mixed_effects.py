@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from fractions import Fraction
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from scipy.stats import multivariate_normal
 from vinetrack.inference import marginal_likelihood as marginal
 from vinetrack.inference.fit_result import _deviate
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
-from vinetrack.inference.precision import degrees_of_freedom, precision
+from vinetrack.inference.position_errors import degrees_of_freedom, precision
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 RHO, SIGMA = 0.45, 0.3
@@ -48,8 +47,7 @@ def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarr
 
 
 def crossed(columns: list[np.ndarray]) -> np.ndarray:
-    one_stretch = SimpleNamespace(first=np.arange(len(columns[0])) == 0, relative_sd=None)
-    return all_products(columns, [one_stretch] * len(columns))
+    return all_products(columns, [np.arange(len(columns[0])) == 0] * len(columns))
 
 
 def test_cross_products_agree_with_the_dense_inverse_covariance():

@@ -12,10 +12,9 @@ from scipy.stats import t as student
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.locate import against_the_sheet
-from vinetrack.inference import fit_result, optimiser
+from vinetrack.inference import fit_result, optimiser, position_errors
 from vinetrack.inference import robust_covariance as sandwich
 from vinetrack.inference.optimiser import solve
-from vinetrack.inference.precision import precision
 
 Pairs = list[tuple[Trial, Track]]
 FALL = vt.make_model(["gravity", "air_drag"])
@@ -51,7 +50,7 @@ def test_robust_errors_are_correct_where_model_errors_are_too_small(make, seeds)
     by_noise, stated = [], []
     for seed in seeds:
         found = vt.fit(vt.base_model(), make(seed), profile=False)
-        narrow = np.sqrt(np.diag(precision(found.solution).covariance))
+        narrow = np.sqrt(np.diag(position_errors.precision(found.solution).covariance))
         for k, number in enumerate(found.numbers):
             if number.key == "yield_pressure.P_y":
                 continue
@@ -72,9 +71,9 @@ def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch):
     What trials err by together, which here is more, is left aside.
     """
     found = vt.fit(vt.base_model(), unlike(20620), profile=False)
-    plain, robust = (np.diag(matrix) for matrix in sandwich.sandwich(found.predictor, found.solution)[:2])
+    plain, robust = (np.diag(matrix) for matrix in sandwich.robust_covariance(found.predictor, found.solution))
     assert np.max(robust / plain) > 1.5
-    known = precision(found.solution)
+    known = position_errors.precision(found.solution)
     nothing = sandwich.Systematics.none([trial.time_s.size for trial in found.predictor.data])
     monkeypatch.setattr("vinetrack.inference.robust_covariance.systematics_of", lambda *_, **__: nothing)
     stated = np.diag(sandwich.widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
@@ -149,10 +148,10 @@ def test_correlated_errors_of_a_day_enlarge_the_standard_errors():
     pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
     found = vt.fit(vt.base_model(), bent(pairs, bends_m), profile=False)
-    alone = np.diag(sandwich.sandwich(found.predictor, found.solution)[1])
+    alone = np.diag(sandwich.robust_covariance(found.predictor, found.solution)[1])
     told = enumerate(found.predictor.data)
     found.predictor.data = [replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in told]
-    by_day = np.diag(sandwich.sandwich(found.predictor, found.solution)[1])
+    by_day = np.diag(sandwich.robust_covariance(found.predictor, found.solution)[1])
     assert np.all(by_day >= alone)
     assert np.max(by_day / alone) > 1.2
 
@@ -162,13 +161,12 @@ def test_the_mean_of_replicates_has_one_degree_of_freedom_less_and_students_inte
     """Replicates of one condition whose B scatters by far more than any is measured: Student's problem."""
     draw = np.random.default_rng([20640, trials])
     factors = np.exp(0.04 * draw.standard_normal(trials))
-    known_lens = {"vine": "v", "condition": "c", "position_systematic_m": 0.0}
-    vines = [replace(vine_trial(f"t{k}", 20), **known_lens) for k in range(trials)]
+    vines = [replace(vine_trial(f"t{k}", 20), vine="v", condition="c") for k in range(trials)]
     pairs = [(trial, filmed(trial, draw, damping=f)[0]) for trial, f in zip(vines, factors.tolist(), strict=True)]
     model = vt.base_model().with_values({"eversion_damping.n": 0.4})
     found = vt.fit(model, pairs, fixed=["n", "P_y"], profile=False)
     B = found["B"]
-    assert precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
+    assert position_errors.precision(found.solution).degrees[0] == pytest.approx(trials - 1, rel=0.05)
     standard_error = float(np.std(np.log(factors), ddof=1)) / math.sqrt(trials)
     assert B.sigma / B.value == pytest.approx(standard_error, rel=0.1)
     half_width = math.log(B.high / B.low) / 2

@@ -44,6 +44,7 @@ from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, BetweenTerm, Fit, Number
 from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.position_errors import with_smooth_errors
 
 # ------------------------------------------------------------------------------
 # Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is confounded.
@@ -262,7 +263,7 @@ def differences(fit: Fit) -> list[Difference]:
     """Hypotheses that trials differ, with their predicted gains and p-values."""
     if DAMPING not in fit.predictor.layout.keys:
         return []
-    plain = fit.solution
+    plain = with_smooth_errors(fit)
     base = with_trace_errors(fit, plain)
     best: dict[str, Difference] = {}
     for difference in forms_of(fit, base):

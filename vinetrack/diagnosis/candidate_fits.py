@@ -35,6 +35,9 @@ from vinetrack.inference.optimiser import is_poor_fit
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import SLOW_NOISE, assemble
 
+# Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
+MIN_SHARE_OF_BEST_GAIN = 0.3
+
 
 def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
     """Values of an effect's parameters to start from: the predicted size, limited to what is possible. Returns by
@@ -61,8 +64,9 @@ def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
 
 def full_fit(before: Fit, shape: CandidateShape, size: float, best: float = -math.inf) -> Fit | None:
     """Fit a model with an effect added, from a shape at its predicted size; None where the fit fails. `best` is the
-    largest ln L of the others: a fit that stays far behind it is not continued.
+    largest ln L of the others: a fit that stays far behind it is given up.
     """
+    goal = before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood)
     try:
         # 14, 40, 50.0: iterations of a full fit at first and in all (chosen)
         fit = refit(
@@ -71,6 +75,7 @@ def full_fit(before: Fit, shape: CandidateShape, size: float, best: float = -mat
             start=start_values(shape, size),
             most_iterations=14,
             thorough=False,
+            goal=goal,
         )
         poor = is_poor_fit(fit.predictor, fit.solution)
         if fit.noise_correlation > SLOW_NOISE and poor:

@@ -389,7 +389,7 @@ def tests_of_designs(
             solution, state=state, problem=problem, cross_products=solution.cross_products[rows], columns=columns
         )
         trials = tuple(fit.trials[k] for k in places)
-        of_part = replace(fit, predictor=predictor, solution=part, trials=trials)
+        of_part = replace(fit, predictor=predictor, solution=part, trials=trials, smooth=None)
         products = tests.products.of(places)
         sensitivities = replace(tests.sensitivities, columns=[tests.sensitivities.columns[k] for k in places])
         scores = scores_of(of_part, products)

@@ -363,8 +363,13 @@ def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
     """Predictions of the trials left out (`gone`) by the model fitted to the others."""
     data = [as_recorded(trial_data) for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
-        names = [trial.name for trial, out in zip(fit.trials, gone, strict=True) if not out]
-        others = fit_subset(fit, names, MOST_ITERATIONS)
+        others = fit_subset(
+            fit,
+            [not out for out in gone],
+            hold_spreads=True,
+            hold_noise=True,
+            most_iterations=MOST_ITERATIONS,
+        )
     except FitError as error:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
     undetermined = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}

@@ -31,13 +31,13 @@ from vinetrack.inference.marginal_likelihood import (
     marginal,
 )
 from vinetrack.inference.optimiser import Solution, is_poor_fit
-from vinetrack.inference.precision import with_shapes
+from vinetrack.inference.position_errors import with_shapes, with_smooth_errors
 from vinetrack.inference.robust_covariance import (
     FEWEST_CLUSTERS,
     Systematics,
     film_errors,
     recorded_pressures,
-    sandwich,
+    robust_covariance,
     systematics_of,
 )
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE
@@ -105,7 +105,7 @@ def with_shared_errors(fit: Fit, base: Solution) -> Solution:
     They are common to all replicates of a condition. With enough replicates they exceed the scatter of trials, and
     would pass for a difference between groups of conditions.
     """
-    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials))
+    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
 
 
 def with_trace_errors(fit: Fit, base: Solution) -> Solution:
@@ -185,7 +185,7 @@ def film_gain(fit: Fit) -> float:
     errors = film_errors(fit.predictor, fit.solution, fit.trials)
     if not errors.n_columns:
         return 0.0
-    base = fit.solution
+    base = with_smooth_errors(fit)
     return max(_deviance(base, base) - _deviance(with_errors(fit, base, errors), base), 0.0)
 
 
@@ -444,7 +444,7 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     """
     if not names or len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
-    matrices = sandwich(after.predictor, after.solution)[:2]
+    matrices = robust_covariance(after.predictor, after.solution)
     plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)
     chosen = [
         k

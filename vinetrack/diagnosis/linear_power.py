@@ -59,15 +59,13 @@ from vinetrack.inference.whitening import at_correlation
 
 
 def noiseless_start(fit: Fit) -> Fit:
-    """The fit with deviations of trials and smooth errors set to zero, linearised there: the start for every effect."""
-    trial_effects, theta = fit.state.trial_effects.copy(), fit.state.theta.copy()
+    """The fit with the deviations of its trials set to zero, linearised there: the same start for every effect."""
+    trial_effects = fit.state.trial_effects.copy()
     trial_effects[:, DEVIATION_COLUMNS] = 0.0
-    theta[len(fit.numbers) :] = 0.0
-    predictor = _predictor_of(fit, fit.predictor.data)
-    state = replace(fit.state, theta=theta, trial_effects=trial_effects)
-    columns = tuple(predictor.linearise(theta, trial_effects))
+    state, predictor = replace(fit.state, trial_effects=trial_effects), _predictor_of(fit, fit.predictor.data)
+    columns = tuple(predictor.linearise(state.theta, trial_effects))
     solution = replace(fit.solution, state=state, columns=columns)
-    return replace(fit, predictor=predictor, solution=solution)
+    return replace(fit, predictor=predictor, solution=solution, smooth=None)
 
 
 def _predictor_of(fit: Fit, data: Sequence[FitTrial]) -> Predictor:
@@ -113,6 +111,7 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Fit) -
         if not sensitivities.shapes:
             return 1.0
         systematics = systematics_of(refit.predictor, refit.solution, refit.trials)
+        # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
         scores = scores_of(refit, products_of(refit, refit.solution.columns, sensitivities, systematics))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0

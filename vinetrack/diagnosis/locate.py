@@ -44,7 +44,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED, RIG
 from vinetrack.inference.fit import fit_subset
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, FreeParameter, Number
-from vinetrack.inference.robust_covariance import sandwich
+from vinetrack.inference.robust_covariance import robust_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
 
 if TYPE_CHECKING:
@@ -295,7 +295,7 @@ class ConstancyTest:
 
 def _tests(fit: Fit, scatter: Scatter, notes: list[Remark]) -> Iterator[ConstancyTest]:
     aligned = align_trials(fit)
-    for key in dict.fromkeys(number.key for number in fit.numbers):
+    for key in fit.predictor.layout.keys:
         if key in (YIELD_PRESSURE, EXPONENT):
             continue
         try:
@@ -637,7 +637,9 @@ def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
             continue
         names = [trial.name for trial in members]
         try:
-            alone[vine] = fit_subset(rescaled, names, MOST_ITERATIONS)
+            alone[vine] = fit_subset(
+                rescaled, names, hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS
+            )
         except FitError:
             continue
     for common in shared:
@@ -663,8 +665,8 @@ def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
     the sheet's own value is part of the fitted one, and their difference has the variance σ₀² − σ², not σ₀²; what the
     fit adds to σ² for scatter and shared errors comes on top.
     """
-    plain = np.diag(sandwich(fit.predictor, fit.solution)[0])
-    for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=False):
+    plain = np.diag(robust_covariance(fit.predictor, fit.solution)[0])
+    for number, free, exact in zip(fit.numbers, fit.predictor.layout.free, plain, strict=True):
         variance = free.prior_sd**2 + number.sigma**2 - 2 * float(exact) * free.derivative(number.value) ** 2
         if number.key != YIELD_PRESSURE or not 0 < variance < math.inf:
             continue

@@ -24,6 +24,7 @@ from vinetrack.diagnosis.score_test import (
     Scores,
     effect_sensitivities,
     family_test,
+    fit_columns,
     linear_gains,
     plausible_range,
     products_of,
@@ -466,7 +467,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: boo
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     sensitivities = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials, film=film)
-    columns = fit.solution.columns
+    columns = fit_columns(fit)
     products = products_of(fit, columns, sensitivities, systematics)
     structure = structure_of(fit, columns, systematics)
     return MisfitTests(fit, effects, sensitivities, products, scores_of(fit, products), structure, level)

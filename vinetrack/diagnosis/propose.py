@@ -35,7 +35,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
 )
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, RankedLaw, missing_force
-from vinetrack.dynamics.model import Model, check_needs, make_model
+from vinetrack.dynamics.model import Model, check_needs, make_model, probe
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
 from vinetrack.inference.fit import refit
@@ -283,10 +283,14 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         files = [Path(folder) / f"proposed_{law.law.name}.py" for law in best]
         effects = [_loaded(path, effect_text(law)) for path, law in zip(files, best, strict=True)]
         if best:
-            # Compiled without the catalogue, which is not needed here.
-            before = with_host(before, Model((*model, *effects)))
+            before = _with_own_host(before, effects)
         proposal = _fitted_laws(before, best, effects, report)
         return replace(proposal, table=_fitted_table(proposal, force.learned, Path(folder), report))
+
+
+def _with_own_host(fit: Fit, effects: Sequence[Effect]) -> Fit:
+    """The fit, compiled with these effects but without the catalogue, which is not needed here."""
+    return with_host(fit, Model((*fit.model, probe(), *effects)))
 
 
 def _loaded(path: Path, text: str) -> Effect:
@@ -343,7 +347,7 @@ def _fitted_table(
         return None
     effect = _loaded(folder / f"{table_name(learned)}.py", table_text(learned))
     try:
-        start = with_host(before, before.model + effect)
+        start = _with_own_host(before, [effect])
         ratio = likelihood_ratio(start, (effect,), fit_with(start, effect, report))
     except FitError:
         return None

@@ -40,7 +40,7 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effects_eliminated,
 )
 from vinetrack.inference.marginal_likelihood import trial_deviation_sd as between_trial_sd
-from vinetrack.inference.precision import with_shapes
+from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import Systematics, cluster_variance, coarsest_groups
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
 from vinetrack.inference.whitening import all_products, at_correlation
@@ -360,7 +360,7 @@ class Products:
         """Cross products of a part of the trials, see `whitening`. They are cached where there is only one part; those
         of several would be three times as large as the columns. Shape (n_trials, 3, n_columns, n_columns).
         """
-        return self._all_cross_products if len(self.parts) == 1 else all_products(self.columns[part], self.data[part])
+        return self._all_cross_products if len(self.parts) == 1 else self._cross_products_of(part)
 
     def of(self, places: Sequence[int]) -> Products:
         """The same for some of the trials, which may be repeated."""
@@ -369,7 +369,25 @@ class Products:
 
     @cached_property
     def _all_cross_products(self) -> Floats:
-        return all_products(self.columns, self.data)
+        return self._cross_products_of(self.parts[0])
+
+    def _cross_products_of(self, part: slice) -> Floats:
+        data = self.data[part]
+        first = [trial_data.first for trial_data in data]
+        relative = [trial_data.relative_sd for trial_data in data]
+        return all_products(self.columns[part], first, relative)
+
+
+def fit_columns(fit: Fit) -> list[Floats]:
+    """Columns of a fit's trial effects, parameters and residual, with the same derivatives as those of the candidates.
+    Shape (n_points, 4 + n_keys + 1).
+    """
+    state = fit.solution.state
+    try:
+        return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
+    except SimulationError:
+        # A vine that sticks may fail to simulate with another finite-difference step: use the last columns of the fit.
+        return list(fit.solution.columns)
 
 
 def products_of(
@@ -495,8 +513,7 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
     score = blocks[:, C, r].sum(axis=0) - cross[:-1].T @ step
     score[empty] = 0.0
     lever_of_fit, step_of_fit = held @ cross[:-1], held @ gradient
-    fitted = int(np.count_nonzero(of_fit < len(fit.numbers)))  # Smooth errors of position have priors of their own.
-    return Projection(blocks, lever, step, lever_of_fit, step_of_fit, fitted, score, information, empty)
+    return Projection(blocks, lever, step, lever_of_fit, step_of_fit, of_fit.size, score, information, empty)
 
 
 def _deviation(problem: MixedProblem, state: FitState) -> Floats:
@@ -509,7 +526,7 @@ def levers_of(fit: Fit, products: Products) -> Floats:
     parameter falls by this much when the effect is added. Returns I_θθ⁻¹ I_θs in units of the parameter over those of
     the size. Shape (n_numbers, n_shapes).
     """
-    free = fit.predictor.layout.numbers
+    free = fit.predictor.layout.free
     derivatives = [
         number.value if parameter.logarithmic else parameter.scale
         for parameter, number in zip(free, fit.numbers, strict=True)

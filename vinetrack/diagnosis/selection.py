@@ -21,6 +21,7 @@ from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.candidate_fits import (
+    MIN_SHARE_OF_BEST_GAIN,
     CandidateFits,
     Report,
     drop_curves,
@@ -69,9 +70,6 @@ if TYPE_CHECKING:
 # Backward, each member of the best set of k + 1 is removed: an effect added early may only have stood in for two added
 # later, and a smaller set that is better than all known of its size is followed instead (floating search; Pudil,
 # Novovičová & Kittler, Pattern Recognition Letters 15, 1119, 1994).
-
-# Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
-MIN_SHARE_OF_BEST_GAIN = 0.3
 
 MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 

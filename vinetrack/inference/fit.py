@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -41,7 +41,7 @@ from vinetrack.inference.optimiser import (
     make_problem,
     solve,
 )
-from vinetrack.inference.precision import Pooled, pool, student, trial_information
+from vinetrack.inference.position_errors import pool, position_shapes, student, trial_information
 from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -62,7 +62,7 @@ from vinetrack.inference.solving import (
     trial_fit,
     with_fitted_trace_errors,
 )
-from vinetrack.inference.trial_effects import subset
+from vinetrack.inference.trial_effects import Indices, subset
 from vinetrack.inference.whitening import at_correlation, whiten
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ if TYPE_CHECKING:
 #     e = M (X δθ + X u + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
 #
 # δθ is the error of the shared parameters, u the difference of the trial's parameters from those
-# (`precision.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
+# (`position_errors.pool`), d its deviations of pressure and B, s errors that replicates do not show (smooth errors of
 # position, 30 Pa of a set pressure) and ε noise of covariance K, which includes the misfit of the model along each
 # trial, since the noise of a fit is that of its residuals. The variance at a time is the diagonal of
 #
@@ -100,6 +100,18 @@ class Calibration(NamedTuple):
     discrepancy: float
     reach: float
     degrees: float
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """The fit as predictions use it: scaled parameters, including smooth errors of position where there are any.
+    `information` and `scores` are those of the trials, `between` is the between-trial covariance of the parameters.
+    """
+
+    solution: Solution
+    information: Floats
+    scores: Floats
+    between: Floats
 
 
 def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
@@ -132,19 +144,16 @@ def _simultaneous(loadings: Floats, degrees: float) -> float:
     return float(np.quantile(np.quantile(curves, COVERED_POSITIONS, axis=0), COVERAGE))
 
 
-def _pooled_basis(fit: Fit) -> Pooled:
-    """The fit as predictions use it: with its trials pooled where they disagree."""
-    if fit.between is not None and fit.between.any():
-        pooled = pool(fit.predictor, fit.solution)
-        if pooled is not None:
-            return pooled
-    problem, (information, scores) = fit.solution.problem, trial_information(fit.solution)
-    total = information.sum(axis=0) + np.diag(problem.prior_precision)
-    covariance = inverse_of_block(total, np.flatnonzero(problem.free & (np.diag(total) > 0)))
-    return Pooled(fit.solution, information, scores, covariance, np.zeros_like(covariance))
+def _pooled_basis(fit: Fit) -> _Basis:
+    disagree = fit.between is not None and fit.between.any()
+    pooled = pool(fit.predictor, fit.solution, len(fit.numbers)) if disagree else None
+    if pooled is not None:
+        return _Basis(pooled.solution, pooled.information, pooled.scores, pooled.between)
+    size = fit.solution.problem.prior_mean.size
+    return _Basis(fit.solution, *trial_information(fit.solution), np.zeros((size, size)))
 
 
-def _calibrated(fit: Fit, basis: Pooled) -> Calibration:
+def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
     """The discrepancy between trials and its degrees of freedom."""
     solution, data = basis.solution, fit.predictor.data
     pairs = [_leave_one_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
@@ -182,7 +191,7 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
     return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, highest))
 
 
-def _leave_one_out(basis: Pooled, trial_data: FitTrial, i: int, fit_correlation: float) -> tuple[Floats, Floats] | None:
+def _leave_one_out(basis: _Basis, trial_data: FitTrial, i: int, fit_correlation: float) -> tuple[Floats, Floats] | None:
     """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order. None where the other
     trials do not determine all parameters on which it depends.
     """
@@ -228,7 +237,7 @@ def _deviation_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -
     return np.asarray(moved * [spread[0], spread[1], misset])
 
 
-def _loadings_of_new_trial(fit: Fit, basis: Pooled, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
+def _loadings_of_new_trial(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
     """Displacement of a new trial by one standard deviation of each error, m, and the variance of its noise, m²."""
     layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
     theta, places = values_for_trial(fit, layout, trial_data)
@@ -246,8 +255,9 @@ def _loadings_of_new_trial(fit: Fit, basis: Pooled, trial_data: FitTrial, trial:
     state = basis.solution.state
     spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
     spread *= [predictor.has_pressure_deviation[0], predictor.has_damping_deviation[0]]
+    shapes = position_shapes(predictor, [trial_data.lead_position_m - trial_effects[0, ORIGIN] - columns[:, -1]])[0]
     loadings = np.column_stack(
-        [design @ matrix_root(parameter_covariance), _deviation_loadings(spread, columns, trial_data)]
+        [design @ matrix_root(parameter_covariance), _deviation_loadings(spread, columns, trial_data), shapes]
     )
     noise = float(np.mean(state.variance)) / (1 - state.rho**2)
     return _with_release_and_origin_fitted(
@@ -270,10 +280,13 @@ def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tu
     return theta, places
 
 
-def _covariance(fit: Fit, basis: Pooled) -> Floats:
+def _covariance(fit: Fit, basis: _Basis) -> Floats:
     """Covariance of the parameters, scaled, with everything that widens their errors."""
-    plain = basis.covariance[: len(fit.numbers), : len(fit.numbers)]
-    held = fit.predictor.layout.numbers
+    problem = basis.solution.problem
+    total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
+    count = len(fit.numbers)
+    plain = inverse_of_block(total, np.flatnonzero(problem.free & (np.diag(total) > 0)))[:count, :count]
+    held = fit.predictor.layout.free
     sigma = np.array(
         [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]
     )
@@ -329,23 +342,48 @@ def _correlation(trial_data: FitTrial, rho: float) -> Floats:
 # dropped.
 
 
-def fit_subset(fit: Fit, names: Iterable[str], most_iterations: int = MOST_ITERATIONS) -> Fit:
-    """Fit the same model to some of the trials of a fit, from its solution, whose noise and between-trial standard
-    deviations are kept.
-    """
-    wanted, known = set(names), [trial.name for trial in fit.trials]
-    if unknown := wanted - set(known):
-        raise FitError(f"The fit has no trial {', '.join(sorted(unknown))}.")
-    rows = np.flatnonzero([name in wanted for name in known])
-    if not rows.size:
-        raise FitError("No trial is left to fit: keep one at least.")
+def fit_subset(
+    fit: Fit,
+    keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_],
+    *,
+    hold_spreads: bool = False,
+    hold_noise: bool = False,
+    most_iterations: int = MOST_ITERATIONS,
+) -> Fit:
+    """Fit the same model to some of the trials of a fit, starting from its solution."""
+    rows = _rows(fit, keep)
     predictor, problem, (state,) = subset(fit.predictor, fit.solution.problem, rows, fit.state)
-    held = FixedTerms(state.spread, (state.rho, state.variance))
+    fixed_terms: FixedTerms = fit.options.get("held", FixedTerms())
+    if fixed_terms.noise is not None:
+        rho, variance = fixed_terms.noise
+        fixed_terms = replace(fixed_terms, noise=(rho, variance[rows]))
+    fixed_terms = FixedTerms(
+        state.spread if hold_spreads else fixed_terms.spread,
+        (state.rho, state.variance) if hold_noise else fixed_terms.noise,
+    )
     try:
-        solution = solve(predictor, problem, state, held, warm=True, most_iterations=most_iterations)
+        solution = solve(predictor, problem, state, fixed_terms, warm=True, most_iterations=most_iterations)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated for these trials: {error}") from error
-    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": held}, profile=False)
+    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms}, profile=False)
+
+
+def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) -> Indices:
+    """Indices of the trials to keep, in the order of the fit."""
+    wanted = list(keep)
+    names = [trial.name for trial in fit.trials]
+    if wanted and all(isinstance(entry, (bool, np.bool_)) for entry in wanted):
+        if len(wanted) != len(names):
+            raise FitError(f"The mask has {len(wanted)} entries for {len(names)} trials.")
+        rows = np.flatnonzero(wanted)
+    else:
+        unknown = sorted(set(map(str, wanted)) - set(names))
+        if unknown:
+            raise FitError(f"The fit has no trial {', '.join(unknown)}.")
+        rows = np.array([i for i, name in enumerate(names) if name in set(wanted)], dtype=int)
+    if not rows.size:
+        raise FitError("No trial is left to fit: keep one at least.")
+    return rows
 
 
 # ------------------------------------------------------------------------------
@@ -523,6 +561,7 @@ def refit(
     most_iterations: int = MOST_ITERATIONS,
     thorough: bool = True,
     afresh: bool = False,
+    goal: float = -math.inf,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other parameters of the same model, to the same data, starting from a previous fit.
@@ -551,6 +590,8 @@ def refit(
         iterated to convergence with free noise; otherwise only as far as a comparison with other models needs.
     afresh : bool
         Whether release, deviations and noise start from the tracks alone instead of the previous fit.
+    goal : float
+        A poor fit is abandoned as soon as it can no longer reach this ln L.
     watch : callable, optional
         Called with every `Step` of the iterations; an exception that it raises ends the fit.
 
@@ -592,9 +633,7 @@ def refit(
     host = before.predictor.host
     predictor = Predictor(layout, data, host if host is not None and set(model.names) <= set(host.names) else None)
     theta = layout.start
-    former = before.predictor.layout
-    values = dict(zip([each.name for each in former.free], former.values(before.state.theta).tolist(), strict=True))
-    values |= {number.name: number.value for number in before.numbers}
+    values = {number.name: number.value for number in before.numbers}
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
             theta[k] = number.to_scaled(float(np.clip(values[number.name], number.lower, number.upper)))
@@ -603,7 +642,7 @@ def refit(
         previous_state.spread if hold_spreads else None,
         (previous_state.rho, previous_state.variance) if hold_noise else None,
     )
-    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch}
+    how: dict[str, Any] = {"most_iterations": most_iterations, "watch": watch, "search": not thorough}
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))
@@ -612,7 +651,7 @@ def refit(
             solution = solve_onward(predictor, before.solution, theta, fixed_terms, **how)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
-    solution = solve_again(predictor, solution, fixed_terms, watch, thorough=thorough)
+    solution = solve_again(predictor, solution, fixed_terms, watch, thorough=thorough, goal=goal)
     predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, **how)
     fitted = assemble(
         predictor,

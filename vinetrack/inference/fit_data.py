@@ -122,12 +122,6 @@ class FitTrial:
             return self.imprecise_rest.origin_m
         return float(np.mean(self.lead_position_m[: self.n_rest]))
 
-    @property
-    def growth_m(self) -> float:
-        """Largest observed growth, m, from the rest before the motion or from the first point."""
-        start_m = self.rest_origin_m if self.shows_rest else self.lead_position_m[0]
-        return float(np.max(self.lead_position_m) - start_m)
-
     @cached_property
     def pressurised_in_recording(self) -> bool:
         """Whether the tube was pressurised during the recording; the trace then shows when the growth was started.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -42,13 +42,6 @@ if TYPE_CHECKING:
 YIELD_PRESSURE = "yield_pressure.P_y"
 DAMPING = "eversion_damping.B"
 EXPONENT = "eversion_damping.n"
-
-# Smooth errors of position that all trials of a camera share, as further parameters of a fit: what a lens does that
-# nobody calibrated. Neither replicates nor the scatter of trials reveal them, and an effect that resembles them would
-# absorb them. The displacement of the edge is a sum of Legendre polynomials of these orders over the growth, each minus
-# its value where the edge rests; the prior of each size is normal, `position_systematic_mm` its standard deviation.
-SMOOTH_ORDERS = (1, 2, 3, 4)
-SMOOTH_ERRORS = tuple(f"position_error.{order}" for order in SMOOTH_ORDERS)
 
 
 @dataclass(frozen=True)
@@ -119,12 +112,6 @@ class ParameterMap:
     index: NDArray[np.int_]
     base: Floats
     between: tuple[BetweenTerm, ...] = ()
-    reach_m: float = 0.0  #: largest growth of all trials, over which errors of position are smooth
-
-    @cached_property
-    def numbers(self) -> tuple[FreeParameter, ...]:
-        """The free parameters that a fit reports: all but the smooth errors of position, which come after them."""
-        return tuple(number for number in self.free if number.key not in SMOOTH_ERRORS)
 
     @property
     def start(self) -> Floats:
@@ -247,14 +234,7 @@ def make_layout(
             for group in members
         ]
         keys, index = [*keys, term.key], np.column_stack([index, [place[group] for group in term.groups]])
-    reach_m = max((each.growth_m for each in data), default=0.0)
-    if reach_m > 0 and any(trial_data.position_systematic_m > 0 for trial_data in data):
-        index = np.column_stack([index, np.tile(len(numbers) + np.arange(len(SMOOTH_ERRORS)), (len(data), 1))])
-        keys += SMOOTH_ERRORS
-        numbers += [
-            FreeParameter(key, "", "s", "", 0.0, -math.inf, math.inf, 1.0, prior_sd=1.0) for key in SMOOTH_ERRORS
-        ]
-    return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base, tuple(between), reach_m)
+    return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base, tuple(between))
 
 
 def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
@@ -505,11 +485,18 @@ class Fit(NumberTable):
     options: Mapping[str, Any]
     pairs: tuple[tuple[Trial, Track], ...] = ()
     between: Floats | None = None
+    smooth: FitState | None = None
 
     @property
     def state(self) -> FitState:
-        """The state of its solution."""
-        return self.solution.state
+        """State of the solution, with the variance components of the fit that includes smooth errors of position. The
+        iterations are without smooth errors, so that the displacement by a lens is taken for deviations of single
+        trials and enlarges noise and standard deviations.
+        """
+        state, smooth = self.solution.state, self.smooth
+        if smooth is None:
+            return state
+        return replace(state, spread=smooth.spread, rho=smooth.rho, variance=smooth.variance)
 
     def trial(self, name: str) -> TrialFit:
         """The trial of that name; KeyError where there is none."""

@@ -23,7 +23,7 @@ from vinetrack.inference.whitening import at_correlation
 #
 # Point j of trial i, of vine v(i), is measured at time t_ij and lies at
 #
-#     y_ij = o_i + f(t_ij − r_i; θ, ln B_v(i) + b_i + z_iᵀγ, P_i (1 + p_i + z_iᵀγ)) + Σ_k s_k φ_k(f) + e_ij
+#     y_ij = o_i + f(t_ij − r_i; θ, ln B_v(i) + b_i + z_iᵀγ, P_i (1 + p_i + z_iᵀγ)) + e_ij
 #
 # About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + Z_i Δu_i + e_i, with the sensitivities of
 # `vinetrack.inference.sensitivity`. Variances of this linear model and steps of θ and u_i are computed in turn until
@@ -472,6 +472,14 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
     return Marginal(eliminated(white, precision)[0], constant)
 
 
+def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, float]:
+    """Whitened cross products of the keys and residual of each trial, all trial effects integrated out; and the sum
+    over trials of ln det(I + S Z S) of the deviations, of standard deviations S. Shape (n_trials, n_keys + 1, n_keys +
+    1); the last row and column belong to the residual.
+    """
+    return without_deviations(part.blocks, trial_deviation_sd(problem, spread) * problem.has_deviation)
+
+
 def normal_equations(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, Floats, float, float]:
@@ -479,7 +487,7 @@ def normal_equations(
     (half the negative gradient of the sum of squares), square (penalised sum of squares at the current parameters),
     log_det (sum over trials of ln det(I + S Z S)). Shape (n_free, n_free).
     """
-    blocks, log_det = without_deviations(part.blocks, trial_deviation_sd(problem, spread) * problem.has_deviation)
+    blocks, log_det = deviations_eliminated(part, problem, spread)
     prior, deviation = problem.prior_precision, state.theta - problem.prior_mean
     information = sum_matrix_blocks(blocks[:, :-1, :-1], problem) + np.diag(prior)
     slope = sum_vector_blocks(blocks[:, :-1, -1], problem) - prior * deviation
@@ -492,9 +500,19 @@ def deviance(
 ) -> float:
     """−2 ln of the (restricted) likelihood at given between-trial standard deviations, profiled over the parameters."""
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
+    constant = square + log_det + part.log_constant
+    return profiled_deviance(information, slope, constant, problem, state, restricted=restricted)
+
+
+def profiled_deviance(
+    information: Floats, slope: Floats, constant: float, problem: MixedProblem, state: FitState, *, restricted: bool
+) -> float:
+    """−2 ln L minimised over the free parameters, from their normal equations. Shapes: information (n_free, n_free);
+    slope (n_free,).
+    """
     # A parameter at its bound must not be credited with the decrease beyond the bound.
     step, moving = bounded_solve(information, slope, problem, state.theta)
-    total = square + log_det + part.log_constant - float(step @ (2 * slope - information @ step))
+    total = constant - float(step @ (2 * slope - information @ step))
     if restricted:
         return total + float(np.linalg.slogdet(information[np.ix_(moving, moving)])[1])
     k = np.flatnonzero(moving & problem.random)

@@ -143,7 +143,7 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), variance_floor(data))
     residual_squares = at_correlation(solution.cross_products, rho)[:, -1, -1]
     fitted_degrees = (
-        len(predictor.layout.numbers) / residual_squares.size + 2 + solution.problem.has_deviation.any(axis=1)
+        np.count_nonzero(solution.problem.free) / residual_squares.size + 2 + solution.problem.has_deviation.any(axis=1)
     )
     return float(np.sum(residual_squares / noise) / np.sum(np.maximum(solution.problem.points - fitted_degrees, 1.0)))
 
@@ -172,6 +172,12 @@ CONVERGED_DECREASE = 1e-2  # Predicted decrease of −2 ln L per step below whic
 
 # Relative change of noise and between-trial standard deviations that counts as converged (chosen)
 CONVERGED_VARIANCES = 0.02
+
+
+PROGRESS_STEPS = 4  # Steps over which progress is measured before a fit is stopped early (chosen)
+
+# Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped (derived)
+STAGNATION_DECREASE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -211,7 +217,10 @@ class Solution:
 
 @dataclass(frozen=True)
 class Step:
-    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts."""
+    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts. Smooth
+    errors of position (`vinetrack.inference.position_errors`) are fitted after the last step and change the reported
+    values slightly.
+    """
 
     iteration: int
     values: Mapping[str, float]
@@ -232,10 +241,13 @@ def solve(
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
     least_decrease: float = CONVERGED_DECREASE,
+    search: bool = False,
+    goal: float = -math.inf,
 ) -> Solution:
     """Iterate the mixed-effects fit to convergence. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
     steps for the parameters alternate with estimates of noise and between-trial standard deviations;
-    Levenberg–Marquardt damping where a full step fails. Shapes: columns (n_points, 4 + n_keys + 1).
+    Levenberg–Marquardt damping where a full step fails. A fit that can no longer reach the ln L of a `goal` is
+    abandoned. Shapes: columns (n_points, 4 + n_keys + 1).
     """
     # Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
     first_iterations, most_first_iterations, far_from_optimum = 3, 9, 1e3
@@ -251,7 +263,7 @@ def solve(
     # step falls below the first number, or after this many steps (along the valley between two releases
     # Gauss–Newton steps become tiny); and how many of these searches may move a release (chosen)
     searches_left, last_search, searched_in_vain = 8, 0, False
-    smooth = np.arange(problem.free.size) >= len(predictor.layout.numbers)
+    deviances: list[float] = []
     releases, at_corner = ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
         close = predicted_decrease < far_from_optimum or iteration > most_first_iterations
@@ -263,20 +275,12 @@ def solve(
         )
         variances_moved = variance_change(before, state)
         damping_before = damping
-        moving = problem
-        (step, effect_step, predicted_decrease), damping_of_step = _next_step(
+        (step, effect_step, predicted_decrease), damping = _next_step(
             cross_products, problem, state, damping, least_decrease
         )
-        if predicted_decrease > far_from_optimum and smooth.any():
-            # Smooth errors of position would take up what the other parameters have yet to explain.
-            moving = replace(problem, free=problem.free & ~smooth)
-            (step, effect_step, predicted_decrease), damping_of_step = _next_step(
-                cross_products, moving, state, damping, least_decrease
-            )
-        damping = damping_of_step
         is_full_instead = damping_before > damping
         if watch is not None:
-            values = zip(predictor.layout.numbers, predictor.layout.values(state.theta).tolist(), strict=False)
+            values = zip(predictor.layout.free, predictor.layout.values(state.theta).tolist(), strict=True)
             watch(Step(iteration, {number.name: value for number, value in values}, predicted_decrease))
         small_step = predicted_decrease < least_decrease or at_corner
         at_corner = False
@@ -294,10 +298,22 @@ def solve(
         if small_step and variances_moved < CONVERGED_VARIANCES and not first_phase:
             converged = True
             break
+        # A fit that is one of many candidates is stopped early where it cannot succeed.
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
+        deviances.append(_deviance_of(problem, state, penalised_squares, fixed_terms))
+        if search and _stagnates(deviances, STAGNATION_DECREASE * float(np.sum(problem.points))):
+            reached = Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
+            if is_poor_fit(predictor, reached):
+                break
+        if math.isfinite(goal) and iteration > first_iterations:
+            part = marginal(cross_products, problem, state)
+            shortfall = deviance(part, problem, state, state.spread, restricted=False) + 2 * goal
+            expected_later = (most_iterations - iteration) * _decrease_per_step(deviances)
+            if shortfall > _largest_decrease(problem, penalised_squares, predicted_decrease) + expected_later:
+                break
         # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
         accepted, damping = _accepted_step(
-            predictor, moving, cross_products, state, step, effect_step, damping, penalised_squares
+            predictor, problem, cross_products, state, step, effect_step, damping, penalised_squares
         )
         if accepted is None:
             # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth. Where a
@@ -341,6 +357,36 @@ def _with_fixed_terms(state: FitState, fixed_terms: FixedTerms) -> FitState:
     return state
 
 
+def _deviance_of(problem: MixedProblem, state: FitState, penalised_squares: float, fixed_terms: FixedTerms) -> float:
+    """−2 ln L up to a constant; where the noise is fixed, with the variance profiled out instead."""
+    if fixed_terms.noise is not None:
+        return float(np.sum(problem.points)) * math.log(max(penalised_squares, 1e-300))
+    return penalised_squares + float(np.sum(problem.points * np.log(state.variance)))
+
+
+def _largest_decrease(problem: MixedProblem, penalised_squares: float, predicted_decrease: float) -> float:
+    """Largest decrease of −2 ln L by this step: the predicted decrease, followed by a new estimate of the noise. With n
+    points and noise s, −2 ln L is n ln s²; near the optimum a step predicts nearly the whole sum of squares except the
+    noise itself.
+    """
+    remaining = 1 - predicted_decrease / max(penalised_squares, 1e-300)
+    return -float(np.sum(problem.points)) * math.log(remaining) if remaining > 0 else math.inf
+
+
+def _decrease_per_step(deviances: Sequence[float]) -> float:
+    """Mean decrease of the lowest −2 ln L over the last PROGRESS_STEPS steps; infinite if there are too few steps.
+    Single values may go up and down, as noise and parameters are estimated in turn.
+    """
+    before = deviances[:-PROGRESS_STEPS]
+    return (min(before) - min(deviances)) / PROGRESS_STEPS if before else math.inf
+
+
+def _stagnates(deviances: Sequence[float], least: float) -> bool:
+    """Whether the last steps lowered −2 ln L by less than `least`; never right after a jump that raised it."""
+    before, last = deviances[:-PROGRESS_STEPS], deviances[-PROGRESS_STEPS:]
+    return bool(before) and last[-1] == min(last) > min(before) - least
+
+
 def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
     """Sensitivities and residuals at a state, and their cross products."""
     columns = predictor.linearise(state.theta, state.trial_effects)
@@ -356,11 +402,16 @@ def update_variances(
     fixed_terms: FixedTerms,
     *,
     first_phase: bool = False,
+    largest_rho: float = math.inf,
 ) -> FitState:
-    """Estimate noise and between-trial standard deviations; in the first phase only the size of the noise."""
+    """Estimate noise, up to a largest correlation, and between-trial standard deviations; in the first phase only the
+    size of the noise.
+    """
     if fixed_terms.noise is None:
         fixed_rho = state.rho if first_phase or fixed_terms.correlation is not None else None
         rho, variance = estimate_noise(cross_products, problem, state, fixed_rho)
+        if rho > largest_rho:
+            rho, variance = estimate_noise(cross_products, problem, state, largest_rho)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
     if not first_phase and any(estimable_sd):
         spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)

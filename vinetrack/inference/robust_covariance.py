@@ -20,7 +20,7 @@ from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.marginal_likelihood import MixedProblem, by_parameter, inverse_of_block, matrix_root
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.precision import Pooled, Precision, trial_information, with_shapes
+from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information, with_shapes
 from vinetrack.inference.sensitivity import PRESSURE, Predictor, position_change
 
 # ------------------------------------------------------------------------------
@@ -94,9 +94,10 @@ def systematics_of(
     solution: Solution,
     trials: Sequence[TrialFit],
     *,
+    positions: bool = True,
     film: bool = False,
 ) -> Systematics:
-    """All systematic errors of a fit but the smooth errors of position, which are among its parameters."""
+    """All systematic errors of a fit."""
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     recorded = recorded_pressures(predictor, solution)
     named = {
@@ -105,6 +106,7 @@ def systematics_of(
         "gauge": recorded,
         **({"film": film_errors(predictor, solution, trials)} if film else {}),
         "tracking": _of_every_trial(_tracker_errors(predictor, grown)),
+        **({LENS: _of_every_trial(position_shapes(predictor, grown))} if positions else {}),
     }
     parts = list(named.values())
     *begins, total = np.cumsum([0, *(part.count for part in parts)]).tolist()
@@ -273,10 +275,10 @@ def cluster_variance(single: Floats, fitted: int, groups: Sequence[str]) -> Floa
     return np.asarray(np.maximum(by_trial, np.diag(group_scatter(single, groups, fitted))))
 
 
-def too_few_clusters(predictor: Predictor) -> bool:
+def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
     """Whether there are too few trials for a sandwich covariance."""
-    trials = len(predictor.data)
-    return trials < FEWEST_CLUSTERS or trials - len(predictor.layout.numbers) < FEWEST_DEGREES
+    spare = len(predictor.data) - np.count_nonzero(solution.problem.free)
+    return len(predictor.data) < FEWEST_CLUSTERS or bool(spare < FEWEST_DEGREES)
 
 
 def widened_covariance(
@@ -284,14 +286,14 @@ def widened_covariance(
     solution: Solution,
     trials: Sequence[TrialFit],
     model_precision: Precision,
+    extended: Solution | None = None,
     pooled: Pooled | None = None,
 ) -> Precision:
     """Covariance and degrees of freedom at the end of a fit, widened by the scatter of trials and by
     systematic errors.
     """
-    systematics = systematics_of(predictor, solution, trials)
-    at = solution if pooled is None else pooled.solution
-    plain, robust, moved = sandwich(predictor, at, systematics)
+    systematics = systematics_of(predictor, solution, trials, positions=extended is None)
+    plain, robust, moved = sandwich(predictor, extended or solution, systematics)
     at_most = model_precision.degrees
     spare = len(trials) - int(np.count_nonzero(np.diag(plain) > 0))
     if pooled is None and len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
@@ -299,10 +301,10 @@ def widened_covariance(
         clusters = len(set(coarsest_groups([trial_data.trial for trial_data in predictor.data])))
         few = np.full(variance.size, float(min(spare, clusters - 1)))
     elif pooled is None:
-        variance, few = _few_trial_variances(*trial_information(solution), solution, plain)
+        variance, few = _few_trial_variances(*trial_information(extended or solution), extended or solution, plain)
     else:
         plain = pooled.covariance
-        variance, few = _few_trial_variances(pooled.information, pooled.scores, at, plain)
+        variance, few = _few_trial_variances(pooled.information, pooled.scores, extended or solution, plain)
         at_most = np.where(np.diag(pooled.between) > 0, np.minimum(at_most, few), at_most)
     diagonal = np.diag(plain)
     ratio = np.sqrt(np.maximum(np.divide(variance, diagonal, out=np.ones_like(diagonal), where=diagonal > 0), 1.0))
@@ -315,13 +317,20 @@ def widened_covariance(
     covariance[unknown, unknown] = np.inf
     sources = np.array(systematics.sources)
     shared = {name: np.sum(moved[:, sources == name] ** 2, axis=1) for name in dict.fromkeys(systematics.sources)}
-    first = len(predictor.layout.numbers)
-    if first < len(plain):
+    if extended is not None:
         # What the parameters would be known better by if the errors of the lens, the last unknowns, were known.
+        first = solution.problem.prior_mean.size
         across = plain[:first, first:] @ np.linalg.pinv(plain[first:, first:], hermitian=True)
         lens = np.sum(across * plain[:first, first:], axis=1) * ratio[:first] ** 2
         shared[LENS] = np.append(lens, np.zeros(len(plain) - first))
     return replace(model_precision, covariance=covariance, degrees=degrees, shared=shared)
+
+
+def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
+    """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials. Returns
+    plain, robust : arrays, shape (n_free, n_free).
+    """
+    return sandwich(predictor, solution, _one_per_group(predictor, {}, {}))[:2]
 
 
 def _few_trial_variances(
@@ -364,16 +373,14 @@ def _few_trial_variances(
     return variance, degrees
 
 
-def sandwich(
-    predictor: Predictor, solution: Solution, systematics: Systematics | None = None
-) -> tuple[Floats, Floats, Floats]:
+def sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
     """Model-based and cluster-robust covariance, shape (n_free, n_free) each, and the change of each free parameter by
     one standard deviation of each systematic error, to first order, shape (n_free, count). Parameters at a bound are
     fixed there.
     """
     problem, theta = solution.problem, solution.state.theta
     information, scores = trial_information(solution)
-    size = len(theta)
+    size, trials = len(theta), len(scores)
     square = information.sum(axis=0) + np.diag(problem.prior_precision)
     inside = (theta > problem.lower) & (theta < problem.upper)
     estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
@@ -383,13 +390,13 @@ def sandwich(
     scores -= depend * (scores.sum(axis=0) / np.maximum(depend.sum(axis=0), 1))
     # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
     prior = np.diag(problem.prior_precision)
-    single = [str(i) for i in range(len(scores))]
-    robust, by_group = (
-        plain @ (group_scatter(scores, groups, estimated.size) + prior) @ plain
-        for groups in (single, coarsest_groups([trial_data.trial for trial_data in predictor.data]))
-    )
-    np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
-    if systematics is None or not systematics.n_columns:
+    meat = scores.T @ scores * trials / max(trials - estimated.size, 1) + prior
+    robust = plain @ meat @ plain
+    groups = coarsest_groups([trial_data.trial for trial_data in predictor.data])
+    if len(set(groups)) < trials:
+        by_group = plain @ (group_scatter(scores, groups, estimated.size) + prior) @ plain
+        np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
+    if not systematics.n_columns:
         return plain, robust, np.zeros((size, 0))
     columns, widened = systematics.added_to(solution.columns, problem)
     both = replace(solution, problem=widened, cross_products=predictor.products(columns))

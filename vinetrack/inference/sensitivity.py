@@ -25,11 +25,12 @@ from vinetrack.dynamics.simulate import (
     Trajectory,
     bends_of,
     check_completed,
+    simulate_many,
     trajectories,
 )
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_result import DAMPING, EXPONENT, SMOOTH_ERRORS, SMOOTH_ORDERS, ParameterMap
+from vinetrack.inference.fit_result import DAMPING, EXPONENT, ParameterMap
 from vinetrack.inference.whitening import all_products
 
 # ------------------------------------------------------------------------------
@@ -239,8 +240,6 @@ class Predictor:
         self.relative_sd = np.concatenate([trial_data.point_sd for trial_data in data]) if unequal_noise else None
         self.frames_s = np.array([trial_data.frame_s for trial_data in data])
         self.with_trace = np.array([trial_data.trace is not None for trial_data in data], dtype=bool)
-        self.smooth_columns = [k for k, key in enumerate(layout.keys) if key in SMOOTH_ERRORS]
-        self.smooth_sd_m = np.array([trial_data.position_systematic_m for trial_data in data])
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
@@ -303,22 +302,6 @@ class Predictor:
         """Trajectories at given parameters and trial effects. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
         return self.run_as(self.layout.model, self.job_arrays(theta, trial_effects))
 
-    def smooth_shapes(self, grown_m: Floats, sd_m: Floats | float) -> Floats:
-        """Displacement at places of the growth by one standard deviation of each smooth error of position, m. Shapes:
-        grown_m (n,); sd_m (n,) or one for all → (n, n_errors), no columns where the fit has none.
-        """
-        if not self.smooth_columns:
-            return np.zeros((grown_m.size, 0))
-        select = np.eye(max(SMOOTH_ORDERS) + 1)[list(SMOOTH_ORDERS)].T
-        grown = np.clip(grown_m / self.layout.reach_m, 0, 1.5)  # 1.5: where nothing is recorded (chosen)
-        # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
-        shapes = np.polynomial.legendre.legval(2 * grown - 1, select) - (-1.0) ** np.array(SMOOTH_ORDERS)[:, None]
-        return np.asarray((sd_m * shapes).T)
-
-    def smooth_sizes(self, theta: Floats) -> Floats:
-        """Sizes of the smooth errors of position among the free parameters, which they share. Shape (n_errors,)."""
-        return theta[self.layout.index[0, self.smooth_columns]]
-
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted positions of every trial. Shapes: theta (n_free,); trial_effects (n_trials, 4) →
         (n_points,).
@@ -335,16 +318,13 @@ class Predictor:
         )
         observed_m = [motions.rows(k * count, (k + 1) * count)[:, OBSERVED] for k in range(len(effect_sets))]
         return [
-            self.by_trial(self._residuals(theta, observed_of_set, effects)[0])
+            self.by_trial(self._residuals(observed_of_set, effects))
             for observed_of_set, effects in zip(observed_m, effect_sets, strict=True)
         ]
 
-    def _residuals(self, theta: Floats, observed_m: Floats, trial_effects: Floats) -> tuple[Floats, Floats]:
-        """Measured minus predicted positions of all trials, and the shapes of their smooth errors, concatenated."""
-        counts = np.diff(self.starts)
-        shapes = self.smooth_shapes(observed_m, np.repeat(self.smooth_sd_m, counts))
-        origin_m = np.repeat(trial_effects[:, ORIGIN], counts)
-        return self.lead_position_m - origin_m - observed_m - shapes @ self.smooth_sizes(theta), shapes
+    def _residuals(self, observed_m: Floats, trial_effects: Floats) -> Floats:
+        """Measured minus predicted positions of all trials, concatenated."""
+        return self.lead_position_m - np.repeat(trial_effects[:, ORIGIN], np.diff(self.starts)) - observed_m
 
     def by_trial(self, values: Floats) -> list[Floats]:
         """Split an array over the points of all trials into one per trial. Shapes: values (n_points_of_all, …) →
@@ -353,7 +333,9 @@ class Predictor:
         edges = self.starts.tolist()
         return [values[a:b] for a, b in itertools.pairwise(edges)]
 
-    def linearise(self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
+    def linearise(
+        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
+    ) -> list[Floats]:
         """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
         (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1).
         """
@@ -367,13 +349,20 @@ class Predictor:
         table = np.zeros((rows.shape[0], N_TRIAL_EFFECTS + len(self.layout.keys) + 1))
         table[:, ORIGIN] = 1.0
         table[:, RELEASE] = -(rows[:, 1] / np.repeat(self.ratios, np.diff(self.starts)))
-        table[:, -1], shapes = self._residuals(theta, rows[:, OBSERVED], trial_effects)
+        table[:, -1] = self._residuals(rows[:, OBSERVED], trial_effects)
+        trajectories = motions.trajectories() if past_end else []
         first = count
         for place, steps, perturbed in perturbations:
             jobs, first = slice(first, first + len(perturbed)), first + len(perturbed)
             points = self._points_of(perturbed.trial)
-            change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
-            self._clip_after_end(change, motions, perturbed.trial, jobs)
+            if past_end:
+                pairs = zip(perturbed.trial, trajectories[jobs], strict=True)
+                change = np.concatenate(
+                    [position_change(trajectories[i], perturbed_trajectory) for i, perturbed_trajectory in pairs]
+                )
+            else:
+                change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
+                self._clip_after_end(change, motions, perturbed.trial, jobs)
             table[points, place] = change / np.repeat(steps, np.diff(self.starts)[perturbed.trial])
         if DAMPING in self.layout.keys:
             # The sensitivity to ln B of the vine is also that to the deviation of ln B.
@@ -389,14 +378,7 @@ class Predictor:
                     np.repeat(term.regressor[trials], np.diff(self.starts)[trials]),
                 )
                 table[points, N_TRIAL_EFFECTS + column] = term.scale * regressor * table[points, source]
-        if self.smooth_columns:
-            # What the smooth errors displace moves along with the motion.
-            step_m, sd_m = 1e-4 * self.layout.reach_m, np.repeat(self.smooth_sd_m, np.diff(self.starts))
-            ahead = self.smooth_shapes(rows[:, OBSERVED] + step_m, sd_m)
-            stretch = 1 + (ahead - shapes) @ self.smooth_sizes(theta) / step_m
-            table[:, np.delete(np.arange(table.shape[1] - 1), ORIGIN)] *= stretch[:, None]
-            table[:, [N_TRIAL_EFFECTS + k for k in self.smooth_columns]] = 0.0 if trial_effects_only else shapes
-        if not trial_effects_only:
+        if not (trial_effects_only or past_end):
             # Steps for the next call, by how far these moved the trajectories.
             responses = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
             self.steps = _adapted_steps(np.max(responses[:, N_TRIAL_EFFECTS:-1], axis=0, initial=0.0), self.steps)
@@ -426,7 +408,11 @@ class Predictor:
         """Cross products of the columns of every trial under its noise, see `whitening`. Shapes: columns (n_points, k)
         → (n_trials, 3, k, k).
         """
-        return all_products(columns, self.data)
+        return all_products(
+            columns,
+            [trial_data.first for trial_data in self.data],
+            [trial_data.relative_sd for trial_data in self.data],
+        )
 
     def _perturbations(
         self, unperturbed: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool
@@ -447,8 +433,6 @@ class Predictor:
         for column, key in enumerate(self.layout.keys):
             trials_of_key = np.flatnonzero(self.layout.index[:, column] >= 0)
             if not trials_of_key.size or (trial_effects_only and key != DAMPING) or self.layout.term(key) is not None:
-                continue
-            if key in SMOOTH_ERRORS:
                 continue
             places = self.layout.index[trials_of_key, column]
             step = float(self.steps[column])
@@ -494,17 +478,24 @@ def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
     return trial_effects
 
 
-def candidates(predictor: Predictor) -> list[tuple[float, Floats, Floats]]:
-    """Starting values, best first: misfit, scaled parameters and trial effects, for each exponent and each further
-    starting value. The release of each trial is scanned at the same time.
+def candidates(
+    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor
+) -> list[tuple[float, Floats, Floats]]:
+    """Starting values, best first: misfit, scaled parameters and trial effects. For each exponent and each further
+    starting value, every vine takes the B with the least misfit of its trials; the release of each trial is scanned at
+    the same time.
     """
-    layout, data = predictor.layout, predictor.data
     trial_effects = initial_trial_effects(data)
-    start_values = [sorted({number.start, *number.further_starts}) for number in layout.free]
+    start_values = [
+        sorted({number.start, *number.further_starts}) if number.further_starts else [number.start]
+        for number in layout.free
+    ]
+    combined = list(itertools.islice(itertools.product(*start_values), 12))
     scored = []
-    for values in itertools.islice(itertools.product(*start_values), 12):
+    for values in combined:
         theta = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
-        for start in _damping_starts(predictor, theta) if DAMPING in layout.keys else [theta]:
+        starts = _scan_damping(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
+        for start in starts:
             try:
                 releases, misfit = align(data, predictor, start, trial_effects)
             except SimulationError:
@@ -523,28 +514,45 @@ def one_trial_per_condition(data: Sequence[FitTrial]) -> list[int]:
     return sorted(best.values())
 
 
-def _damping_starts(predictor: Predictor, theta: Floats) -> Iterator[Floats]:
-    """For each exponent of a grid, and each factor, the B of every vine that balances that part of the drive at the
-    observed speed.
-    """
-    layout, data = predictor.layout, predictor.data
+def _scan_damping(
+    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
+) -> list[Floats]:
+    """For each exponent the best B of every vine."""
     speed = np.array([middle_speed(trial_data) for trial_data in data])
     drive = np.array([_driving_force_N(trial_data) for trial_data in data])
     free_n = [k for k, number in enumerate(layout.free) if number.key == EXPONENT]
-    damping_index = layout.index[:, layout.keys.index(DAMPING)]
+    key = layout.keys.index(DAMPING)
+    damping_index = layout.index[:, key]
+    starts = []
     names = layout.model.parameter_names
     fixed_n = float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
-    # Exponents, and parts of the drive (chosen)
-    for n, part in itertools.product(
-        (0.15, 0.37, 0.65, 1.0) if free_n else (fixed_n,), (0.2, 0.4, 0.6, 0.8, 0.95, 1.1)
-    ):
+    # (0.15, 0.37, 0.65, 1.0): exponents of the grid (chosen)
+    for n in (0.15, 0.37, 0.65, 1.0) if free_n else (fixed_n,):
         values = theta.copy()
         values[free_n] = [layout.free[k].to_scaled(n) for k in free_n]
-        for k in np.unique(damping_index):
-            free, own = layout.free[k], damping_index == k
-            B = part * float(np.exp(np.mean(np.log(drive[own]) - n * np.log(speed[own]))))
-            values[k] = free.to_scaled(float(np.clip(B, free.lower, free.upper)))
-        yield values
+        guess = {
+            k: float(np.exp(np.mean(np.log(drive[damping_index == k]) - n * np.log(speed[damping_index == k]))))
+            for k in np.unique(damping_index)
+        }
+        best: dict[int, tuple[float, float]] = {}
+        # Factors of the grid, relative to the B that would balance the drive at the observed speed (chosen)
+        for factor in (0.2, 0.4, 0.6, 0.8, 0.95, 1.1):
+            for k, B in guess.items():
+                free = layout.free[k]
+                values[k] = free.to_scaled(float(np.clip(factor * B, free.lower, free.upper)))
+            try:
+                _, misfit = align(data, predictor, values, trial_effects)
+            except SimulationError:
+                continue
+            for k in guess:
+                score = float(np.sum(misfit[damping_index == k]))
+                if k not in best or score < best[k][0]:
+                    best[k] = (score, float(values[k]))
+        values = values.copy()
+        for k, (_, B) in best.items():
+            values[k] = B
+        starts.append(values)
+    return starts
 
 
 def middle_speed(trial_data: FitTrial) -> float:
@@ -574,14 +582,23 @@ def align(
     (n_trials, 4) → (n_trials, 4).
     """
     subsets = [_thinned(trial_data) for trial_data in data]
-    jobs = predictor.job_arrays(theta, trial_effects)
+    jobs = predictor.jobs(theta, trial_effects)
     durations = [
         trial_data.time_s[-1] - min(trial_data.time_s[0], begin) + 25 * trial_data.frame_s
         for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
     ]
     grids = [np.linspace(0.0, duration, 4 * POINTS_USED) for duration in durations]
-    times_s = [release_s + grid for release_s, grid in zip(jobs.release_s, grids, strict=True)]
-    trajectories = predictor.run_as(predictor.layout.model, jobs, times_s)
+    trajectories = simulate_many(
+        predictor.layout.model,
+        [trial_data.trial for trial_data in data],
+        grids,
+        traces=[
+            None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
+            for trial_data, job in zip(data, jobs, strict=True)
+        ],
+        parameters=np.array([job.row for job in jobs]).reshape(len(jobs), -1),
+        host=predictor.host,
+    )
     best, misfit = trial_effects.copy(), np.zeros(len(data))
     for i, (trial_data, (time_s, y)) in enumerate(zip(data, subsets, strict=True)):
         if trial_data.pressurised_in_recording:

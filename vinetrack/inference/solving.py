@@ -30,9 +30,15 @@ from vinetrack.inference.fit_result import (
     TrialFit,
 )
 from vinetrack.inference.marginal_likelihood import (
-    levenberg_marquardt_step,
+    FitState,
+    MixedProblem,
+    bounded_solve,
+    eliminated,
     solve_per_trial,
+    sum_matrix_blocks,
+    sum_vector_blocks,
     trial_effect_prior,
+    trial_effects_eliminated,
     whitened_products,
     with_diagonal,
 )
@@ -49,13 +55,15 @@ from vinetrack.inference.optimiser import (
     solve,
     track_correlation,
 )
-from vinetrack.inference.precision import (
+from vinetrack.inference.position_errors import (
     Pooled,
     Precision,
+    SmoothErrors,
     near_bound,
     pool,
     precision,
     profile_interval,
+    smooth_errors,
     student,
 )
 from vinetrack.inference.robust_covariance import recorded_pressures, too_few_clusters, widened_covariance
@@ -70,7 +78,7 @@ from vinetrack.inference.sensitivity import (
     candidates,
     initial_trial_effects,
 )
-from vinetrack.inference.trial_effects import trial_costs
+from vinetrack.inference.trial_effects import LARGEST_DEVIATION, trial_costs
 from vinetrack.inference.whitening import whiten
 
 # Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks (chosen)
@@ -88,7 +96,7 @@ def solve_from_scratch(
     """
     reason = "no trajectory could be simulated"
     # 3: maximum number of starting values (chosen)
-    starts = candidates(predictor)[:3]
+    starts = candidates(predictor.layout, predictor.data, predictor)[:3]
     most_iterations = MOST_ITERATIONS if thorough else CONTINUATION_ITERATIONS
     for _, theta, trial_effects in starts:
         try:
@@ -126,6 +134,7 @@ def _solve_at_track_correlation(
     watch: Watch | None,
     *,
     then_free: bool = True,
+    goal: float = -math.inf,
 ) -> Solution | None:
     """Solve with the noise correlation fixed at that of the tracks, then, with `then_free`, from there with free noise.
     Between-trial standard deviations are fixed near zero: a misfit far above the noise would otherwise distort the
@@ -147,6 +156,8 @@ def _solve_at_track_correlation(
             warm=True,
             most_iterations=TRACK_CORRELATION_ITERATIONS,
             watch=watch,
+            search=not then_free,
+            goal=goal,
         )
         if not then_free:
             return first
@@ -179,7 +190,7 @@ def solve_from(
 
 
 def solve_onward(
-    predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, **how: Any
+    predictor: Predictor, before: Solution, theta: Floats, fixed_terms: FixedTerms, *, search: bool = False, **how: Any
 ) -> Solution:
     """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution; `how`
     are options of `solve`. Shapes: theta (n_free,).
@@ -187,19 +198,8 @@ def solve_onward(
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
     )
-    state = replace(before.state, theta=theta)
-    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
-    if fixed_terms.noise is None and cost(predictor, problem, state) > 1.5 * float(np.sum(problem.points)):
-        # Free noise would absorb the misfit of bad starting values and stall the optimiser: it is fixed at first. An
-        # apparently late release may be the action of the new effect: each trial starts at the one that fits best.
-        aligned, _ = align(predictor.data, predictor, state.theta, state.trial_effects)
-        options = [state, replace(state, trial_effects=aligned)]
-        best = np.argmin([trial_costs(predictor, problem, option) for option in options], axis=0)
-        effects = np.array([options[option].trial_effects[i] for i, option in enumerate(best)])
-        noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
-        state, most = replace(state, trial_effects=effects), TRACK_CORRELATION_ITERATIONS
-        state = solve(predictor, problem, state, noise, warm=True, most_iterations=most).state
-    return solve(predictor, problem, state, fixed_terms, warm=True, **how)
+    state = start_at_fixed_noise(predictor, problem, replace(before.state, theta=theta), fixed_terms, search=search)
+    return solve(predictor, problem, state, fixed_terms, warm=True, search=search, **how)
 
 
 def solve_again(
@@ -209,6 +209,7 @@ def solve_again(
     watch: Watch | None,
     *,
     thorough: bool,
+    goal: float = -math.inf,
 ) -> Solution:
     """The solution, or, if it is poor, one found from its parameters with the noise correlation of the tracks."""
     if not is_poor_fit(predictor, solution):
@@ -218,8 +219,30 @@ def solve_again(
         trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
     except SimulationError:
         return solution
-    again = _solve_at_track_correlation(predictor, theta, trial_effects, fixed_terms, watch, then_free=thorough)
+    again = _solve_at_track_correlation(
+        predictor, theta, trial_effects, fixed_terms, watch, then_free=thorough, goal=goal
+    )
     return solution if again is None else _best_unabsorbed(predictor, solution, [again])
+
+
+def start_at_fixed_noise(
+    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, *, search: bool
+) -> FitState:
+    """Starting values of a warm fit; where they are bad, the result of a descent with the noise fixed. With free noise,
+    the misfit of bad starting values would be absorbed as noise and stall the optimiser.
+    """
+    # 1.5: χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
+    if fixed_terms.noise is not None or cost(predictor, problem, state) < 1.5 * float(np.sum(problem.points)):
+        return state
+    # An apparently late release may be the action of the new effect: each trial starts at the release that fits best.
+    aligned, _ = align(predictor.data, predictor, state.theta, state.trial_effects)
+    options = [state, replace(state, trial_effects=aligned)]
+    best = np.argmin([trial_costs(predictor, problem, option) for option in options], axis=0)
+    state = replace(state, trial_effects=np.array([options[option].trial_effects[i] for i, option in enumerate(best)]))
+    noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
+    return solve(
+        predictor, problem, state, noise, warm=True, most_iterations=TRACK_CORRELATION_ITERATIONS, search=search
+    ).state
 
 
 # ------------------------------------------------------------------------------
@@ -248,11 +271,11 @@ def with_fitted_trace_errors(
     for _ in range(MOST_ROUNDS):
         if is_poor_fit(predictor, solution):
             break
-        sizes = list(zip(predictor.data, fitted_trace_errors(predictor, solution), strict=True))
+        step = trace_error_step(predictor, solution)
         # 0.1: standard deviations of a step of the errors at which they have converged (chosen)
-        if not any(np.any(np.abs(each - _present_sizes(trial_data, each)) > 0.1) for trial_data, each in sizes):
+        if not np.max(np.abs(step), initial=0.0) > 0.1:
             break
-        corrected = [_corrected(trial_data, each) for trial_data, each in sizes]
+        corrected = [_corrected(trial_data, more) for trial_data, more in zip(predictor.data, step, strict=True)]
         corrected_predictor = Predictor(predictor.layout, corrected, predictor.host)
         try:
             solution = solve_onward(corrected_predictor, solution, solution.state.theta, held, **how)
@@ -273,8 +296,9 @@ def trace_error_penalty(data: Sequence[FitTrial]) -> float:
 
 def as_recorded(trial_data: FitTrial) -> FitTrial:
     """A trial with its pressure as recorded, without the correction by a fit."""
-    present = trial_data.trace_error_sizes
-    return trial_data if present is None else replace(_corrected(trial_data, 0.0 * present), trace_error_sizes=None)
+    if trial_data.trace_error_sizes is None:
+        return trial_data
+    return replace(_corrected(trial_data, -trial_data.trace_error_sizes), trace_error_sizes=None)
 
 
 def _has_errors(trial_data: FitTrial) -> bool:
@@ -282,30 +306,47 @@ def _has_errors(trial_data: FitTrial) -> bool:
     return trial_data.trace is not None and trial_data.trace_errors_Pa is not None and trial_data.trace_is_curve
 
 
-def _corrected(trial_data: FitTrial, sizes: Floats) -> FitTrial:
-    """A trial with each error of its recorded pressure of this size, in its standard deviations. Shape (n_errors,)."""
+def _corrected(trial_data: FitTrial, step: Floats) -> FitTrial:
+    """A trial with its recorded pressure changed by so many standard deviations of each of its errors."""
     if not _has_errors(trial_data):
         return trial_data
     assert trial_data.trace is not None
     assert trial_data.trace_errors_Pa is not None
     clock_s, pressure_Pa = trial_data.trace
-    pressure_Pa = pressure_Pa + trial_data.trace_errors_Pa @ (sizes - _present_sizes(trial_data, sizes))
-    return replace(trial_data, trace=(clock_s, pressure_Pa), trace_error_sizes=sizes)
+    errors_Pa = trial_data.trace_errors_Pa
+    step = step[: errors_Pa.shape[1]]
+    sizes = step if trial_data.trace_error_sizes is None else trial_data.trace_error_sizes + step
+    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa @ step), trace_error_sizes=sizes)
 
 
-def _present_sizes(trial_data: FitTrial, sizes: Floats) -> Floats:
-    return np.zeros_like(sizes) if trial_data.trace_error_sizes is None else trial_data.trace_error_sizes
-
-
-def fitted_trace_errors(predictor: Predictor, solution: Solution) -> list[Floats]:
-    """Sizes of the errors of each trial in standard deviations, by one Gauss–Newton step with all other unknowns. Empty
-    where a trial has none, and everywhere if a trial cannot be simulated with one of them. Shape (n_errors,) each.
+def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
+    """Gauss–Newton step of the errors, in standard deviations, from their current estimates. Returns 0 for errors that
+    a trial does not have, and everywhere if a trial cannot be simulated with one of them. Shape (n_trials, n_errors).
     """
     errors = recorded_pressures(predictor, solution, curves_only=True)
-    columns, problem = errors.added_to(solution.columns, solution.problem)
-    state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(errors.count)))
-    step = levenberg_marquardt_step(predictor.products(columns), problem, state, 0.0)[0][solution.state.theta.size :]
-    return [step[places[places < errors.count]] for places in errors.places]
+    if not errors.n_columns:
+        return np.zeros((len(predictor.data), 0))
+    sizes = np.zeros((len(predictor.data), errors.n_columns))
+    for row, trial_data in zip(sizes, predictor.data, strict=True):
+        if trial_data.trace_error_sizes is not None:
+            row[: trial_data.trace_error_sizes.size] = trial_data.trace_error_sizes
+    problem, state = solution.problem, solution.state
+    cross_products = predictor.products(
+        [np.column_stack(both) for both in zip(solution.columns, errors.columns, strict=True)]
+    )
+    p = solution.cross_products.shape[-1] - N_TRIAL_EFFECTS - 1
+    blocks = trial_effects_eliminated(cross_products, p, problem, state)
+    # The errors come first; they are eliminated as well, each with a standard normal prior.
+    order = [*range(p + 1, blocks.shape[-1]), *range(p + 1)]
+    blocks = blocks[:, order][:, :, order]
+    blocks[:, : errors.n_columns, -1] -= sizes
+    reduced, response = eliminated(blocks, np.ones_like(sizes))
+    information = sum_matrix_blocks(reduced[:, :-1, :-1], problem) + np.diag(problem.prior_precision)
+    gradient = sum_vector_blocks(reduced[:, :-1, -1], problem)
+    gradient -= problem.prior_precision * (state.theta - problem.prior_mean)
+    step, _ = bounded_solve(information, gradient, problem, state.theta)
+    spread_out = np.append(step, 0.0)[problem.index]
+    return np.asarray(response[:, :, -1] - np.einsum("nek,nk->ne", response[:, :, :-1], spread_out))
 
 
 # ------------------------------------------------------------------------------
@@ -328,7 +369,7 @@ def fit_messages(
     """
     told = [] if solution.converged else [remark("not_converged", iterations=solution.iterations)]
     for k, number in enumerate(numbers):
-        named, free = {"title": number.title, "key": number.key}, predictor.layout.numbers[k]
+        named, free = {"title": number.title, "key": number.key}, predictor.layout.free[k]
         if precision.insensitive[k]:
             told.append(remark("no_influence", **named, value=number.value))
         elif math.isfinite(number.bound):
@@ -407,21 +448,30 @@ def assemble(
 ) -> Fit:
     """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
     layout, state = predictor.layout, solution.state
-    by_noise = precision(solution)
-    trials = _trial_fits(predictor, solution, by_noise)
+    plain = solution.log_likelihood() - 0.5 * trace_error_penalty(predictor.data)
+    smooth = smooth_errors(predictor, solution, options.get("held"))
+    extended = smooth.solution if smooth else solution
+    by_noise = precision(extended)
+    trials = _trial_fits(predictor, solution, by_noise.first(len(layout.free)))
     pooled = _pooled_if_few(predictor, solution, options)
     if pooled is not None:
         unknown = np.diag(~np.isfinite(np.diag(by_noise.covariance)))
-        by_noise = replace(by_noise, covariance=np.where(unknown, math.inf, pooled.covariance))
-    precision_of_fit = widened_covariance(predictor, solution, trials, by_noise, pooled).first(len(layout.numbers))
-    theta = state.theta if pooled is None else pooled.solution.state.theta
-    numbers = _numbers(predictor, solution, theta, precision_of_fit, profile=profile)
+        extended, by_noise = (
+            pooled.solution,
+            replace(by_noise, covariance=np.where(unknown, math.inf, pooled.covariance)),
+        )
+    if smooth is not None:
+        trials = _with_smooth_errors_removed(trials, smooth)
+    precision_of_fit = widened_covariance(predictor, solution, trials, by_noise, extended if smooth else None, pooled)
+    precision_of_fit = precision_of_fit.first(len(layout.free))
+    numbers = _numbers(predictor, solution, extended.state.theta, precision_of_fit, profile=profile)
     count = len(numbers)
     between = np.zeros((count, count)) if pooled is None else pooled.between[:count, :count]
     between = _in_SI_units(layout, numbers, between)
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
-    variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
+    variance_state = smooth.solution.state if smooth else state
+    variance = float(np.average(variance_state.variance, weights=weights)) / (1 - variance_state.rho**2)
     has_deviations = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
     # Yield pressures belong to the trials and stay in the numbers.
     values = [
@@ -434,14 +484,14 @@ def assemble(
         numbers=numbers,
         covariance=_in_SI_units(layout, numbers, precision_of_fit.covariance),
         spreads={
-            name: BetweenTrialSpread(state.spread[k], solution.estimable[k])
+            name: BetweenTrialSpread(variance_state.spread[k], solution.estimable[k])
             for k, name in enumerate(SPREAD_NAMES)
             if has_deviations[k]
         },
         noise_m=math.sqrt(variance),
-        noise_correlation=state.rho,
+        noise_correlation=variance_state.rho,
         chi2_per_dof=chi2,
-        log_likelihood=solution.log_likelihood() - 0.5 * trace_error_penalty(predictor.data),
+        log_likelihood=plain + smooth.gain if smooth else plain,
         trials=trials,
         messages=fit_messages(predictor, solution, numbers, precision_of_fit, between, chi2),
         left_out=dict(left_out),
@@ -451,6 +501,24 @@ def assemble(
         solution=solution,
         options=options,
         between=between,
+        smooth=smooth.solution.state if smooth else None,
+    )
+
+
+def _with_smooth_errors_removed(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
+    """Trials with the deviations and residuals of the fit that includes smooth errors of position. The deviations come
+    from one linear step, which is unbounded for a poor fit, so they are limited as those of a fit are
+    (LARGEST_DEVIATION). The residuals are those of the step itself.
+    """
+    effects = np.clip(smooth.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    return tuple(
+        replace(
+            trial,
+            whitened=white,
+            pressure_deviation=float(values[PRESSURE]),
+            damping_deviation=math.expm1(values[DAMPING_DEVIATION]),
+        )
+        for trial, white, values in zip(trials, smooth.whitened, effects, strict=True)
     )
 
 
@@ -461,8 +529,8 @@ def _pooled_if_few(predictor: Predictor, solution: Solution, options: Mapping[st
     held = options.get("held")
     if held is not None and held.noise is not None:
         return None
-    if too_few_clusters(predictor) or not solution.problem.has_deviation.any():
-        return pool(predictor, solution)
+    if too_few_clusters(predictor, solution) or not solution.problem.has_deviation.any():
+        return pool(predictor, solution, len(predictor.layout.free))
     return None
 
 
@@ -474,20 +542,20 @@ def _numbers(
     *,
     profile: bool,
 ) -> tuple[Number, ...]:
-    """The numbers of a fit, the first entries of `theta`, with their errors and intervals."""
+    """The free parameters, the first entries of `theta`, with their errors and intervals."""
     layout, problem = predictor.layout, solution.problem
     sigma = np.sqrt(np.diag(precision_of_fit.covariance))
     dof = precision_of_fit.degrees
     reach = student(dof)
     doubtful = near_bound(solution, sigma)
     numbers = []
-    for k, number in enumerate(layout.numbers):
+    for k, number in enumerate(layout.free):
         low, high, method = theta[k] - reach[k] * sigma[k], theta[k] + reach[k] * sigma[k], "linear"
         if not math.isfinite(sigma[k]):
             low, high, method = problem.lower[k], problem.upper[k], "none"
         elif doubtful[k] and profile:
-            # The likelihood accounts for the noise alone, without the scatter of trials or pooling: the interval is
-            # widened by the ratio of the errors, and lies about the value that is stated.
+            # The likelihood accounts for the noise alone, without the lens or pooling: the interval is widened by the
+            # ratio of the errors, and lies about the value that is stated.
             narrow = math.sqrt(precision(solution).covariance[k, k])
             ends = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
             low, high = (end + theta[k] - solution.state.theta[k] for end in ends)
@@ -519,7 +587,7 @@ def _bound_in_SI_units(number: FreeParameter, theta: float) -> float:
 
 
 def _in_SI_units(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
-    slopes = np.array([free.derivative(number.value) for free, number in zip(layout.numbers, numbers, strict=True)])
+    slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
     return np.asarray(covariance * slopes[:, None] * slopes)
 
 
@@ -546,7 +614,7 @@ def _trial_fits(predictor: Predictor, solution: Solution, precision_of_fit: Prec
     return tuple(
         trial_fit(trial_data, state.trial_effects[i], sigma[i], trajectories[i].observed_position_m,
                   trajectories[i].lead_velocity_m_s, state.rho,
-                  float(state.variance[i]), solution.columns[i][:, -1])
+                  float(state.variance[i]))
         for i, trial_data in enumerate(predictor.data)
     )  # fmt: skip
 
@@ -559,14 +627,12 @@ def trial_fit(
     velocity_m_s: Floats,
     rho: float,
     variance: float,
-    unexplained_m: Floats | None = None,
 ) -> TrialFit:
-    """One trial with its trial effects and the predictions of the model; `unexplained_m` is what smooth errors of
-    position leave of the residual. Shapes: trial_effects, sigma (4,); others (n_points,).
+    """One trial with its trial effects and the predictions of the model. Shapes: trial_effects, sigma (4,); position_m,
+    velocity_m_s (n_points,).
     """
     predicted_m = position_m + trial_effects[ORIGIN]
     residual_m = trial_data.lead_position_m - predicted_m
-    left_m = residual_m if unexplained_m is None else unexplained_m
     return TrialFit(
         trial=trial_data.trial,
         time_s=trial_data.time_s,
@@ -574,7 +640,7 @@ def trial_fit(
         predicted_position_m=predicted_m,
         predicted_velocity_m_s=velocity_m_s,
         residual_m=residual_m,
-        whitened=whiten(left_m, trial_data.first, rho, trial_data.relative_sd) / math.sqrt(variance),
+        whitened=whiten(residual_m, trial_data.first, rho, trial_data.relative_sd) / math.sqrt(variance),
         release_s=float(trial_effects[RELEASE]),
         release_sigma_s=float(sigma[RELEASE]),
         origin_m=float(trial_effects[ORIGIN]),

@@ -204,41 +204,48 @@ LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release ju
 
 
 class ReleaseSearch:
-    """Global search for the releases during a fit. A release jumps where the trial's likelihood, its effects integrated
-    out, is higher. The steps of the fit minimise the misfit instead, and return to the old release where the jump only
-    gained volume of the likelihood: a trial jumps four times at most.
+    """Global search for the releases during a fit, with a safeguard against cycling. A release jumps where the trial's
+    likelihood, its effects integrated out, is higher. The steps of the fit minimise the misfit instead, and return to
+    the old release where the jump only gained volume of the likelihood.
     """
 
     def __init__(self, predictor: Predictor, problem: MixedProblem) -> None:
         self.predictor, self.problem = predictor, problem
-        self.jumps = np.zeros(len(predictor.data), dtype=int)
+        self.returned = np.zeros(len(predictor.data), dtype=bool)
+        self.jumped_from = self.jumped_to = np.zeros(len(predictor.data))
+        self.theta_at_jump = np.full((len(predictor.data), problem.prior_mean.size), np.nan)
 
     def likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
         """The state with likelier releases; None if there are none. The search leaves out trials pressurised during the
         recording, whose release the trace shows, and trials recorded at rest with a misfit far above noise, which
         another release would only compensate. Shapes: residuals (n_points,).
         """
+        release_s = state.trial_effects[:, RELEASE]
+        # 0.25: part of a jump within which a release counts as returned to where the jump began (chosen)
+        came_back = np.abs(release_s - self.jumped_from) < 0.25 * np.abs(self.jumped_to - self.jumped_from)
+        # Only if the shared parameters have not changed since the jump; otherwise they explain the return.
+        # 1e-3: largest change of a shared parameter, scaled, that counts as no change (chosen)
+        self.returned |= came_back & (np.max(np.abs(state.theta - self.theta_at_jump), axis=1, initial=0.0) < 1e-3)
         proposed = self._by_linear_model(state, residuals)
-        if proposed is None:
-            return None
-        accepted = self._confirmed(state, proposed)
-        jumped = accepted.trial_effects[:, RELEASE] != state.trial_effects[:, RELEASE]
-        self.jumps += jumped
-        return accepted if jumped.any() else None
+        accepted = state if proposed is None else self._confirmed(state, proposed)
+        jumped_s = accepted.trial_effects[:, RELEASE]
+        jumps = jumped_s != release_s
+        self.jumped_from = np.where(jumps, release_s, self.jumped_from)
+        self.jumped_to = np.where(jumps, jumped_s, self.jumped_to)
+        self.theta_at_jump[jumps] = state.theta
+        return None if np.array_equal(accepted.trial_effects, state.trial_effects) else accepted
 
     def _by_linear_model(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
         """The state with each trial at its likeliest release by the linear model; None if no trial moves."""
         predictor, problem = self.predictor, self.problem
         misfit = trial_costs(predictor, problem, state, residuals) * state.variance
         misfit /= (1 - state.rho**2) * problem.points
-        # 4: jumps of a release, at most (chosen)
         # 30.0: mean squared residual of a trial, in variances of its noise, up to which its release is
         # searched (chosen)
         places = [
             i
             for i, trial_data in enumerate(predictor.data)
-            if self.jumps[i] < 4
-            and not trial_data.pressurised_in_recording
+            if not trial_data.pressurised_in_recording
             and (not trial_data.shows_rest or misfit[i] < 30.0 * trial_data.noise_m**2)
         ]
         if not places:
@@ -248,12 +255,11 @@ class ReleaseSearch:
         sensitivities = _release_sensitivities(predictor, jobs, releases)
         trial_effects = state.trial_effects.copy()
         centre, precision = trial_effect_prior(problem, state)
-        sizes, any_moved = predictor.smooth_sizes(state.theta), False
-        for i, candidates_s, (times_s, plain_m, sensitivity) in zip(places, releases, sensitivities, strict=True):
-            noise, prior = (state.rho, float(state.variance[i])), (centre[i], precision[i])
-            seen_m = plain_m + predictor.smooth_shapes(plain_m, predictor.smooth_sd_m[i]) @ sizes
+        any_moved = False
+        for i, candidates_s, sensitivity in zip(places, releases, sensitivities, strict=True):
+            noise = state.rho, float(state.variance[i])
             effects, gain = _best_release(
-                predictor.data[i], trial_effects[i], prior, noise, candidates_s, times_s, seen_m, sensitivity
+                predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, candidates_s, *sensitivity
             )
             if gain > LEAST_DECREASE:
                 trial_effects[i], any_moved = effects, True
@@ -276,6 +282,9 @@ class ReleaseSearch:
             _trial_deviances(predictor, problem, proposed)
             < _trial_deviances(predictor, problem, current) - LEAST_DECREASE
         )
+        if self.returned[rows].any():
+            lower = trial_costs(predictor, problem, proposed) < trial_costs(predictor, problem, current)
+            better &= lower | ~self.returned[rows]
         trial_effects = state.trial_effects.copy()
         trial_effects[rows[better]] = proposed.trial_effects[better]
         return replace(state, trial_effects=trial_effects)

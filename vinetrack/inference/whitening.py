@@ -12,15 +12,11 @@ first divided by the relative standard deviation of each point, which leaves AR(
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-
-if TYPE_CHECKING:
-    from vinetrack.inference.fit_data import FitTrial
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -46,9 +42,14 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     return matrices
 
 
-def all_products(columns: Sequence[Floats], data: Sequence[FitTrial]) -> Floats:
+def all_products(
+    columns: Sequence[Floats],
+    first: Sequence[NDArray[np.bool_]],
+    relative_sd: Sequence[Floats | None] | None = None,
+) -> Floats:
     """`products` of every trial. Shapes: columns (n_points, k) → (n_trials, 3, k, k)."""
-    return np.stack([products(block, each.first, each.relative_sd) for block, each in zip(columns, data, strict=True)])
+    relative = [None] * len(columns) if relative_sd is None else relative_sd
+    return np.stack([products(c, f, sd) for c, f, sd in zip(columns, first, relative, strict=True)])
 
 
 @np.errstate(over="ignore", invalid="ignore")

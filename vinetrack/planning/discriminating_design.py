@@ -40,6 +40,7 @@ from vinetrack.inference.marginal_likelihood import (
     step_within_bounds,
 )
 from vinetrack.inference.optimiser import FixedTerms, make_problem, solve
+from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.sensitivity import (
     N_TRIAL_EFFECTS,
     ORIGIN,
@@ -337,9 +338,7 @@ class Hypothesis:
             constant = (np.array([-1e3, 1e3]), np.full(2, trial.pressure_Pa))
             first, n_rest = np.arange(time_s.size) == 0, int(np.count_nonzero(time_s <= 0))
             trace = None if like.trace is None else constant
-            known = (like.noise_m, like.correlation, trace)
-            systematic_m = like.position_systematic_m
-            items.append(FitTrial(trial, time_s, time_s, first, n_rest, *known, position_systematic_m=systematic_m))
+            items.append(FitTrial(trial, time_s, time_s, first, n_rest, like.noise_m, like.correlation, trace))
         rows = list(places)
         layout = replace(self.layout, index=self.layout.index[rows], base=self.layout.base[rows])
         return _stepped_as(self.fit, layout, items)
@@ -375,7 +374,7 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
                 row[column] = places[key, trial.vine]
         index.append(row)
         base.append(values)
-    layout = replace(old, free=tuple(numbers), index=np.array(index), base=np.array(base))
+    layout = ParameterMap(old.model, tuple(numbers), old.keys, np.array(index), np.array(base))
     everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
     moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
     return Hypothesis(
@@ -653,13 +652,15 @@ class PartlyLinear(Predictor):
         of_new = replace(layout, index=layout.index[self.n_old :], base=layout.base[self.n_old :])
         self.new = _stepped_as(fit, of_new, new)
 
-    def linearise(self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
+    def linearise(
+        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
+    ) -> list[Floats]:
         """Sensitivities and residuals, as `Predictor.linearise`; the sensitivities of the old trials are constant.
         Shapes: theta (n_free,); trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points, n_columns + 1).
         """
         of_old = zip(self.fitted.columns, self._residuals_of_old(theta, trial_effects), strict=True)
         return [np.column_stack([columns[:, :-1], residual]) for columns, residual in of_old] + self.new.linearise(
-            theta, trial_effects[self.n_old :], trial_effects_only=trial_effects_only
+            theta, trial_effects[self.n_old :], trial_effects_only=trial_effects_only, past_end=past_end
         )
 
     def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
@@ -733,6 +734,8 @@ def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]]) -> fl
         fixed = FixedTerms(state.spread, (state.rho, state.variance))
         solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
         solution = solve(predictor, problem, solution.state, warm=True, most_iterations=most)
+        # These absorb part of what is wrong in a hypothesis, as in every fit.
+        smooth = smooth_errors(predictor, solution)
     except SimulationError:
         return math.nan
-    return -2 * solution.log_likelihood()
+    return -2 * (solution.log_likelihood() + (smooth.gain if smooth else 0.0))

@@ -1,12 +1,24 @@
-"""Errors of the parameters of a fit by the model of its noise, and the pooling of few trials that disagree."""
+"""Smooth errors of position that all trials of a camera share, as nuisance parameters of a fit.
+
+An uncalibrated lens displaces the leading edge by a smooth function of its position. That function is the same in every
+trial, so neither replicates nor the scatter of trials reveal it, and an effect that resembles it would absorb it. It is
+modelled by Legendre polynomials of order 1 to 4 over the growth, each minus its value where the edge rests and with a
+normal prior of standard deviation σ_s (`position_systematic_mm`).
+
+About a fit, r_i = X_i Δθ + Z_i u_i + D_i s + e_i with s ~ N(0, 1) and D_i the shapes times σ_s. With s among the free
+parameters this is the linear mixed model of `vinetrack.inference.marginal_likelihood` with four more columns and
+priors. Its likelihood compares hypotheses without crediting any of them with what a lens could explain.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from vinetrack.core.records import Floats
@@ -21,6 +33,8 @@ from vinetrack.inference.marginal_likelihood import (
     deviance,
     estimate_noise,
     inverse_of_block,
+    levenberg_marquardt_step,
+    log_likelihood,
     marginal,
     matrix_root,
     normal_equations,
@@ -28,12 +42,20 @@ from vinetrack.inference.marginal_likelihood import (
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import (
+    CONVERGED_VARIANCES,
     FixedTerms,
     Solution,
     solve,
+    update_variances,
+    variance_change,
     variance_floor,
 )
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
+from vinetrack.inference.whitening import whiten
+
+if TYPE_CHECKING:
+    from vinetrack.inference.fit_result import Fit
+
 
 # ------------------------------------------------------------------------------
 # Uncertainty of the parameters of a fit: covariance, degrees of freedom, intervals, profile likelihood.
@@ -169,7 +191,7 @@ def student(dof: Floats) -> Floats:
 def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
     """Parameters with a bound within `NEAR_BOUND_SIGMAS` standard errors. Shapes: sigma (n_free,) → (n_free,)."""
     problem, theta = solution.problem, solution.state.theta
-    room = np.minimum(theta - problem.lower, problem.upper - theta)[: sigma.size]
+    room = np.minimum(theta - problem.lower, problem.upper - theta)
     return np.isfinite(sigma) & (room < NEAR_BOUND_SIGMAS * sigma)
 
 
@@ -235,6 +257,125 @@ def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
     return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])
 
 
+@dataclass(frozen=True)
+class SmoothErrors:
+    """A fit with smooth errors of position included. `solution` holds the free parameters of the fit and after them the
+    sizes of the errors in prior standard deviations.
+    """
+
+    solution: Solution
+    gain: float
+    whitened: tuple[Floats, ...]
+
+
+def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
+    """Displacement by one standard deviation of each shape, m, for every trial. The polynomials span the growth of all
+    trials, since one camera records them. Shapes: grown_m (n_points,) → (n_points, n_shapes).
+    """
+    orders = (1, 2, 3, 4)  # Legendre orders of the shapes
+    sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
+    if not (sigma_m > 0).any():
+        return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
+    # Without any growth the shapes are zero, since their value at rest is subtracted.
+    # 1e-9: growth that counts as none (derived)
+    reach = max(1e-9, *(float(np.max(growth_m)) for growth_m in grown_m))
+    select = np.eye(max(orders) + 1)[list(orders)].T
+    # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
+    at_rest = (-1.0) ** np.array(orders)
+    return [
+        sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - at_rest)
+        for growth_m, sigma in zip(grown_m, sigma_m.tolist(), strict=True)
+    ]
+
+
+def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> SmoothErrors | None:
+    """Fit the smooth errors of position along with the parameters of a fit, to first order; None where
+    there are none.
+    """
+    shapes = _shapes(predictor, solution)
+    count = shapes[0].shape[1]
+    if not count:
+        return None
+    extended = _with_shapes(solution.columns, shapes, np.zeros(count))
+    held = held or FixedTerms()
+    fixed_insensitive = replace(solution.problem, free=solution.problem.free & _sensitive(solution))
+    problem = with_shapes(fixed_insensitive, count)
+    start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
+    state, cross_products, moved, level = _newton_on_fixed_columns(predictor, solution, extended, problem, start, held)
+    # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
+    # shapes, so it is subtracted.
+    without_shapes = _newton_on_fixed_columns(
+        predictor, solution, solution.columns, fixed_insensitive, solution.state, held
+    )[3]
+    residuals = [values[:, -1] - values[:, :-1] @ change for values, change in zip(extended, moved, strict=True)]
+    return SmoothErrors(
+        solution=replace(
+            solution,
+            state=state,
+            problem=with_shapes(solution.problem, count),
+            cross_products=cross_products,
+            columns=tuple(
+                np.column_stack([block[:, :-1], left]) for block, left in zip(extended, residuals, strict=True)
+            ),
+        ),
+        gain=max(level - without_shapes, 0.0),
+        whitened=tuple(
+            whiten(values, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
+            for values, trial_data, variance in zip(residuals, predictor.data, state.variance, strict=True)
+        ),
+    )
+
+
+def _sensitive(solution: Solution) -> NDArray[np.bool_]:
+    """Free parameters that influence some trajectory. The column of a parameter without influence is rounding error.
+    With fixed columns, a step along it would be millions of scales long and predict a likelihood that no trajectory
+    confirms.
+    """
+    part = marginal(solution.cross_products, solution.problem, solution.state)
+    information = normal_equations(part, solution.problem, solution.state, solution.state.spread)[0]
+    return np.asarray(np.diag(information) > LEAST_INFORMATION)
+
+
+def _newton_on_fixed_columns(
+    predictor: Predictor,
+    solution: Solution,
+    columns: Sequence[Floats],
+    problem: MixedProblem,
+    state: FitState,
+    held: FixedTerms,
+) -> tuple[FitState, Floats, Floats, float]:
+    """Newton steps at fixed sensitivities: state, cross products there, total change of each trial's unknowns, ln L.
+    Steps are taken as long as they raise ln L. Two parameters that only rounding separates may get a step of any length
+    along the direction in which they cancel; no trajectory is simulated here that would reject it.
+    """
+    # Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
+    # comparison, where differences count from 1; and the maximum number of steps (measured)
+    converged_decrease_smooth, most_steps = 1e-2, 15
+    cross_products = predictor.products(columns)
+    total_change = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
+
+    def with_variances(products: Floats, state: FitState) -> FitState:
+        # Noise of correlation near 1 would make anything likely.
+        largest_rho = solution.state.rho
+        return update_variances(predictor, problem, products, state, solution.estimable, held, largest_rho=largest_rho)
+
+    state = with_variances(cross_products, state)
+    level = log_likelihood(cross_products, problem, state, solution.estimable)
+    for _ in range(most_steps):
+        step, own_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, 0.0)
+        change = np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
+        products = _products_after_step(cross_products, change)
+        before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
+        after = with_variances(products, before)
+        new_level = log_likelihood(products, problem, after, solution.estimable)
+        if new_level < level - converged_decrease_smooth:
+            break
+        cross_products, total_change, state, level = products, total_change + change, after, new_level
+        if predicted_decrease < converged_decrease_smooth and variance_change(before, state) < CONVERGED_VARIANCES:
+            break
+    return state, cross_products, total_change, level
+
+
 def with_shapes(problem: MixedProblem, count: int, prior_precision: float | Floats = 1.0) -> MixedProblem:
     """The problem with the sizes of the shapes as further free parameters, each with a normal prior of mean 0."""
     places = problem.prior_mean.size + np.arange(count)
@@ -252,6 +393,23 @@ def with_shapes(problem: MixedProblem, count: int, prior_precision: float | Floa
     )
 
 
+def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
+    """Cross products after a change of the unknowns of each trial, shape (n_trials, n_columns − 1). The residual
+    becomes r − C·change, the other columns stay.
+    """
+    transformation = np.broadcast_to(
+        np.eye(cross_products.shape[-1]), (len(cross_products), *cross_products.shape[-2:])
+    ).copy()
+    transformation[:, :-1, -1] = -change
+    return np.asarray(np.swapaxes(transformation, 1, 2)[:, None] @ cross_products @ transformation[:, None])
+
+
+def with_smooth_errors(fit: Fit) -> Solution:
+    """The solution of a fit, with the smooth errors of position among its parameters where there are any."""
+    smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
+    return smooth.solution if smooth else fit.solution
+
+
 # ------------------------------------------------------------------------------
 # Pooling of few trials that disagree: a between-trial variance of the shared parameters sets the weights of trials.
 #
@@ -267,7 +425,9 @@ def with_shapes(problem: MixedProblem, count: int, prior_precision: float | Floa
 
 @dataclass(frozen=True)
 class Pooled:
-    """Shared parameters with trials weighted by noise and disagreement, scaled; `solution` is at these parameters."""
+    """Shared parameters with trials weighted by noise and disagreement, scaled. `solution` is the state at these
+    parameters, with the smooth errors of position as further ones.
+    """
 
     solution: Solution
     information: Floats
@@ -276,20 +436,25 @@ class Pooled:
     between: Floats
 
 
-def pool(predictor: Predictor, solution: Solution) -> Pooled | None:
+def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
     """Estimate the shared parameters with trials weighted by noise and disagreement."""
     if len(predictor.data) < 2:
         return None
-    problem, state, columns = solution.problem, solution.state, solution.columns
+    shapes = _shapes(predictor, solution)
+    count = shapes[0].shape[1]
+    problem = with_shapes(solution.problem, count) if count else solution.problem
+    state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
+    columns: Sequence[Floats] = solution.columns
     # 12, 0.05: maximum number of steps, and the length of a step in standard errors at which they have converged
     # (chosen)
     for _ in range(12):
-        cross_products = predictor.products(columns)
+        extended = _with_shapes(columns, shapes, state.theta[shared:])
+        cross_products = predictor.products(extended)
         rho, variance = estimate_noise(cross_products, problem, state, within=True)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
         pooled = _with_weights(
-            replace(solution, state=state, cross_products=cross_products, columns=columns),
-            len(predictor.layout.numbers),
+            replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(extended)),
+            shared,
         )
         pull = problem.prior_precision * (state.theta - problem.prior_mean)
         step = pooled.covariance @ (pooled.scores.sum(axis=0) - pull)
@@ -306,10 +471,27 @@ def pool(predictor: Predictor, solution: Solution) -> Pooled | None:
         if np.max(np.abs(state.trial_effects[:, DEVIATION_COLUMNS])) > 3.0:
             return None
         try:
-            columns = tuple(predictor.linearise(state.theta, state.trial_effects))
+            columns = predictor.linearise(state.theta[:shared], state.trial_effects)
         except SimulationError:
             return None
     return None
+
+
+def _shapes(predictor: Predictor, solution: Solution) -> list[Floats]:
+    grown = [
+        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
+        for trial_data, trial_effects, columns in zip(
+            predictor.data, solution.state.trial_effects, solution.columns, strict=True
+        )
+    ]
+    return position_shapes(predictor, grown)
+
+
+def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Floats) -> list[Floats]:
+    return [
+        np.column_stack([block[:, :-1], shape, block[:, -1] - shape @ sizes])
+        for block, shape in zip(columns, shapes, strict=True)
+    ]
 
 
 def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitState:
