@@ -27,7 +27,7 @@ FLOORS = {name: level for level, floor in enumerate(ROOMS.split()) for name in f
 BUDGETS = {
     "cli": (617, 4, 5),
     "core": (1310, 8, 58),
-    "diagnosis": (8900, 21, 112),
+    "diagnosis": (8902, 21, 112),
     "dynamics": (2335, 8, 26),
     "effects": (765, 3, 8),
     "experiment": (1689, 5, 17),

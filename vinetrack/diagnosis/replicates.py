@@ -494,14 +494,16 @@ def expected_error(courses: Sequence[ResidualCourse], scatter: Scatter) -> dict[
 
     if not scatter.dof:
         return dict.fromkeys(EXPECTED, math.nan)
-    mean_m2 = variance_m4 = 0.0
-    for course in courses:
+    moments = np.zeros((len(courses), 2))  # mean and variance of the mean square of each trial
+    for k, course in enumerate(courses):
         response_m = course.values_m[:, 1:]
         shared = response_m.T @ response_m / len(response_m) * (scatter.pressure**2, scatter.damping**2)
         residual_m2 = scatter.residual**2 * float(np.trace(shared))
-        mean_m2 += float(np.trace(shared)) + residual_m2 + course.position_m2
+        mean_m2 = float(np.trace(shared)) + residual_m2 + course.position_m2
         independent_m4 = residual_m2**2 / MAX_STRETCHES + course.position_m2**2 / len(response_m)
-        variance_m4 += 2 * (float(np.trace(shared @ shared)) + independent_m4)
-    count, degrees = len(courses), 2 * mean_m2**2 / variance_m4
-    ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * degrees / count)
-    return dict(zip(EXPECTED, (math.sqrt(mean_m2 / count * part) for part in (1.0, *ends)), strict=True))
+        moments[k] = mean_m2, 2 * (float(np.trace(shared @ shared)) + independent_m4)
+    mean_m2, variance_m4 = moments.mean(axis=0)
+    of_trials = 2 * moments[:, 0] ** 2 / moments[:, 1]
+    degrees = 2 * len(courses) * mean_m2**2 / variance_m4
+    ends = fisher.ppf((0.025, 0.975), degrees, scatter.dof * of_trials.mean())
+    return dict(zip(EXPECTED, (math.sqrt(mean_m2 * part) for part in (1.0, *ends)), strict=True))

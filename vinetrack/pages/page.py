@@ -75,7 +75,7 @@ def headline(
         now=_in_mm(now),
         before=_in_mm(before),
         expected=expected_text(*campaign.expected_m),
-        as_expected=now <= campaign.expected_m[-1],
+        exceeds=now > campaign.expected_m[-1],
         refused=campaign.stored.refused,
         named=model_text(campaign.experiment.settings.model),
         in_use=model_text(campaign.in_use),
