@@ -93,7 +93,7 @@ def test_replicates_that_differ_by_their_noise_alone_have_a_floor_of_that_size_h
 
 
 def test_an_adequate_model_is_off_by_as_much_as_the_scatter_of_trials_makes_expect():
-    """The error of all trials, 600 mm of growth away from any noise, is that of their pressures and B."""
+    """Pressures and B scatter by far more than the noise, as they were drawn."""
     ratios, inside = [], []
     for seed in range(5):
         virtual = grown(sheet((2,), replicates=3), 7200 + seed, damping_scatter=0.04, pressure_scatter=0.01)

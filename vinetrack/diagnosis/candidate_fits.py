@@ -62,7 +62,7 @@ def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
     return {f"{effect.name}.{p.name}": value for p, value in zip(effect.parameters, values, strict=True)}
 
 
-def full_fit(before: Fit, shape: CandidateShape, size: float, best: float = -math.inf) -> Fit | None:
+def full_fit(before: Fit, shape: CandidateShape, size: float, best: float) -> Fit | None:
     """Fit a model with an effect added, from a shape at its predicted size; None where the fit fails. `best` is the
     largest ln L of the others: a fit that stays far behind it is given up.
     """
@@ -154,7 +154,6 @@ class CandidateFits:
     report: Report
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     failed: set[str] = field(default_factory=set)
-    nested_labels: set[str] = field(default_factory=set)
     nested_tried: set[NestedForm] = field(default_factory=set)
     tests_by_fit: list[tuple[Fit, bool, MisfitTests]] = field(default_factory=list)
 
@@ -175,11 +174,11 @@ class CandidateFits:
         self.tests_by_fit.append((fit, film, tests))
         return tests
 
-    def fit(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
-        """Fit candidates of large predicted gain, or all: a model whose parameters have adapted to the lack of an
-        effect may predict no gain for it, not even the right sign.
+    def fit(self, most: int | None = None, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
+        """Fit candidates of large predicted gain, at `most` so many, or all: a model whose parameters have adapted to
+        the lack of an effect may predict no gain for it, not even the right sign.
         """
-        for name in self.names if all_of_them else self._promising:
+        for name in self.names if all_of_them else self._promising[:most]:
             if name not in self.fitted and name not in self.failed:
                 self._fit_from_prediction(name)
         self._fit_simpler_forms()
@@ -196,14 +195,13 @@ class CandidateFits:
                 continue
             for effects, fit in simpler_forms(before, hypothesis, self.tests.effects, self.nested_tried):
                 simpler = likelihood_ratio(before, effects, fit)
-                self.nested_labels.add(simpler.label)
                 known = self.fitted.get(simpler.label)
                 if known is None or simpler.delta_chi2 > max(known.delta_chi2, FAILED_FIT_DELTA_CHI2):
                     self.fitted[simpler.label] = simpler
 
     @property
     def _promising(self) -> list[str]:
-        """Effects of a large part of the largest predicted gain."""
+        """Effects of a large part of the largest predicted gain, the largest first."""
         gains = {name: self.tests.predicted_gain(name) for name in self.names}
         return [name for name in gains if gains[name] > MIN_SHARE_OF_BEST_PREDICTION * max(gains.values())]
 

@@ -36,7 +36,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, RankedLaw, missing_force
 from vinetrack.dynamics.model import Model, check_needs, make_model, probe
-from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
@@ -84,11 +83,7 @@ def fit_with(before: Fit, effect: Effect, report: Callable[[str], None]) -> Fit:
     tests = misfit_tests(before, (effect,), FALSE_ALARM_LEVEL_FIRST_ROUND)
     fits = [ratio.fit for ratio in CandidateFits(tests, report).fit(all_of_them=True)]
     if not fits or fits[0].log_likelihood < before.log_likelihood:
-        try:
-            fits.append(refit(before, before.model + effect))
-        except SimulationError as error:
-            if not fits:
-                raise FitError(f"The model with {effect.name} cannot be simulated from any start.") from error
+        fits.append(refit(before, before.model + effect))
     return max(fits, key=lambda fit: fit.log_likelihood)
 
 

@@ -672,7 +672,7 @@ class FamilyTest:
 
 
 def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> FamilyTest:
-    """Thresholds that any candidate exceeds with probability `level`, or less where candidates resemble each other.
+    """Thresholds that any candidate exceeds with a probability of about `level`, less where candidates are alike.
     Shapes: cosines (n_shapes, n_shapes).
     """
     informative = np.diag(cosines) > 0

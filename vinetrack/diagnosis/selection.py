@@ -106,13 +106,9 @@ class EffectSets:
                 continue
             self.extended.add(names)
             search = CandidateFits(self.search.tests_after(base.fit), self.report)
-            search.fit()
+            partners = search.fit(n_partners)
             for name, log_likelihood, larger, simpler in search.nested_tried:
                 self.nested_tried.add(("+".join(sorted((*base.names, name))), log_likelihood, larger, simpler))
-            ranked = sorted(search.fitted.values(), key=lambda partner: -partner.fit.log_likelihood)
-            partners = [
-                partner for k, partner in enumerate(ranked) if k < n_partners or partner.label in search.nested_labels
-            ]
             for partner in partners:
                 self._keep_best(likelihood_ratio(self.before, (*base.effects, *partner.effects), partner.fit))
         for hypothesis in self.of_size(size)[:n_partners]:

@@ -504,16 +504,6 @@ def candidates(
     return sorted(scored, key=lambda scored_start: scored_start[0])
 
 
-def one_trial_per_condition(data: Sequence[FitTrial]) -> list[int]:
-    """Indices of one trial of every condition, the one with the most points."""
-    best: dict[str, int] = {}
-    for i, trial_data in enumerate(data):
-        condition = trial_data.trial.condition
-        if condition not in best or trial_data.time_s.size > data[best[condition]].time_s.size:
-            best[condition] = i
-    return sorted(best.values())
-
-
 def _scan_damping(
     layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
 ) -> list[Floats]:
