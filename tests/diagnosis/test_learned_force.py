@@ -20,6 +20,7 @@ from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
+from vinetrack.inference import smooth_functions as smooth
 from vinetrack.inference.sensitivity import PRESSURE, RELEASE
 
 GROWTH = learned_force.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
@@ -29,19 +30,22 @@ ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 
 
 def test_the_process_has_the_matern_covariance_and_may_be_conditioned_on_its_first_value():
-    root = inversion.root_of_covariance(12, 0.4)
+    root = smooth.root_of_covariance(12, 0.4)
     covariance = root @ root.T
     assert np.diag(covariance) == pytest.approx(np.ones(12))
     # The second and the last but one lie at the ends: one whole apart.
     assert covariance[1, -2] == pytest.approx(ALIKE)
-    root, ends = inversion.root_of_covariance(12, 0.4, zero_at_start=True), inversion.splines(np.array([0.0, 1.0]), 12)
+    root, ends = (
+        smooth.root_of_covariance(12, 0.4, zero_at_start=True),
+        smooth.splines(np.array([0.0, 1.0]), 12),
+    )
     assert ends @ root @ root.T @ ends[0] == pytest.approx(np.zeros(2), abs=1e-12)
 
 
 def test_splines_equal_those_of_scipy():
     at = np.random.default_rng(6).uniform(-0.2, 1.2, 300)
     expected = BSpline.design_matrix(np.clip(at, 0, 1), (np.arange(16) - 3) / 9, 3).toarray()
-    assert inversion.splines(at, 12) == pytest.approx(expected, abs=1e-14)
+    assert smooth.splines(at, 12) == pytest.approx(expected, abs=1e-14)
 
 
 @pytest.mark.slow
@@ -67,12 +71,12 @@ def test_a_force_without_a_formula_is_learned_and_proposed_as_a_table_that_expla
 def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters():
     """Each length scale and amplitude by the normal distribution of the positions, weighted by its density."""
     draw = np.random.default_rng(3)
-    design = inversion.splines(draw.uniform(0, 1, 60), 12)
+    design = smooth.splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
     sizes, hypotheses = np.geomspace(0.1, 3.0, 4), GROWTH.hypotheses
     assert {start for start, _ in hypotheses} == {learned_force.ZERO_AT_START, learned_force.CONSTANT_AT_START}
     modes = [GROWTH.modes(*each) for each in hypotheses]
-    found = inversion.posterior(design.T @ design, design.T @ positions, modes, sizes)
+    found = smooth.posterior(design.T @ design, design.T @ positions, modes, sizes)
     logs, means, covariances = [], [], []
     for each in modes:
         for prior in (each @ each.T) * sizes[:, None, None] ** 2:
@@ -85,14 +89,14 @@ def test_evidence_mean_and_covariance_are_those_of_the_mixture_over_hyperparamet
     assert found.log_evidence == pytest.approx(np.log(np.mean(np.exp(logs))) - without, abs=1e-6)
     assert (found.hypothesis, found.amplitude) == (np.argmax(logs) // 4, sizes[np.argmax(logs) % 4])
     density = np.exp(np.array(logs) - max(logs))
-    weights = density * (density > math.exp(-inversion.NEGLIGIBLE_LOG_RATIO))
+    weights = density * (density > math.exp(-smooth.NEGLIGIBLE_LOG_RATIO))
     weights /= weights.sum()
     mean = weights @ means
     spread = np.tensordot(weights, covariances, 1) + ((means - mean).T * weights) @ (means - mean)
     assert found.mean == pytest.approx(mean, abs=1e-9)
     assert found.covariance == pytest.approx(spread, abs=1e-9)
     # Several sets of coefficients share the hyperparameters: of twice the same, the evidence is that of both.
-    both = inversion.posterior(np.array([design.T @ design] * 2), np.array([design.T @ positions] * 2), modes, sizes)
+    both = smooth.posterior(np.array([design.T @ design] * 2), np.array([design.T @ positions] * 2), modes, sizes)
     assert both.log_evidence == pytest.approx(np.log(np.mean(np.exp(2 * (np.array(logs) - without)))), abs=1e-6)
 
 
@@ -120,7 +124,7 @@ def test_the_response_to_a_pressure_deviation_includes_a_force_that_depends_on_p
     tracks, theta = slowed.tracks, slowed.tracks.theta
     domains = learned_force.candidate_domains(tracks.motions)
     domain = next(each for each in domains if each.variables == ("growth", "pressure"))
-    growth, pressure = (inversion.splines(np.linspace(0, 1, 40), count) for count in domain.counts)
+    growth, pressure = (smooth.splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
     force = -0.5 * np.outer(*steep).ravel()
 
@@ -224,7 +228,7 @@ def learned(domain: learned_force.Domain, seed: int) -> learned_force.LearnedFor
     where = {"lead_position_m": 0.1, "tail_velocity_m_s": 2.0, "time_s": 0.1, "pressure_Pa": 2e4, "is_visited": True}
     motion = SimpleNamespace(**{name: np.array([value]) for name, value in where.items()})
     motion.trial = SimpleNamespace(condition="one")
-    found, lengths = inversion.Posterior(*known, 50.0, 0, 0.1), (1.0,) * len(domain.variables)
+    found, lengths = smooth.Posterior(*known, 50.0, 0, 0.1), (1.0,) * len(domain.variables)
     weights = {domain.name: 1.0}
     return learned_force.LearnedForce(
         domain, found, learned_force.ZERO_AT_START, lengths, [motion], weights, (), 50.0, 0.99, 0.0, True

@@ -23,21 +23,23 @@ import numpy as np
 from vinetrack.core.problems import Remark, remark
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import (
-    LENGTH_SCALES,
     FittedMotion,
     ForceEquations,
     ForceEstimate,
     ForcePoint,
     ForceProblem,
+    settled,
+)
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
+from vinetrack.inference.smooth_functions import (
+    LENGTH_SCALES,
     Posterior,
     posterior,
     product_of_modes,
     root_of_covariance,
-    settled,
     splines,
     standard_error,
 )
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -24,16 +24,12 @@ from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import (
-    LENGTH_SCALES,
     FittedMotion,
     ForceEquations,
     ForceEstimate,
     ForcePoint,
     ForceProblem,
-    posterior,
-    root_of_covariance,
     settled,
-    standard_error,
 )
 from vinetrack.diagnosis.force_laws import Law, laws_near, laws_on_grid
 from vinetrack.diagnosis.learned_force import (
@@ -48,6 +44,12 @@ from vinetrack.diagnosis.replicates import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.smooth_functions import (
+    LENGTH_SCALES,
+    posterior,
+    root_of_covariance,
+    standard_error,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

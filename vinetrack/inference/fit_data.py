@@ -74,7 +74,6 @@ class FitTrial:
     trace: tuple[Floats, Floats] | None = None
     gauge_error: float = 0.0
     trace_errors_Pa: Floats | None = None
-    trace_is_curve: bool = False
     trace_error_sizes: Floats | None = None
     imprecise_rest: ImpreciseRest | None = None
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
@@ -203,7 +202,6 @@ def prepare_trial(
         trace=None if extended is None else (extended.time_s, extended.pressure_Pa),
         gauge_error=0.0 if denoised is None else _gauge_error(denoised, time_s[max(n_rest - 1, 0) :]),
         trace_errors_Pa=None if extended is None or not extended.errors_Pa.size else extended.errors_Pa,
-        trace_is_curve=extended is not None and extended.is_curve,
         imprecise_rest=imprecise_rest,
         position_systematic_m=trial.position_systematic_m
         if math.isfinite(trial.position_systematic_m)

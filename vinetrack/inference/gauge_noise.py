@@ -1,15 +1,14 @@
-"""Denoising of a recorded pressure that preserves its corners, with the errors that remain.
+"""Denoising of a recorded pressure, with the errors that remain.
 
 The speed of a light vine follows the pressure immediately: 0.1 kPa of noise would move it by millimetres that it never
 moved, and a noisy pressure crosses a threshold early, at a different time in every trial.
 
-Where a few parameters explain a trace, a curve is fitted: a polynomial in time; or, since the pressure falls as the
-tube fills and has its corner where growth begins, a polynomial in time and in the observed growth, shifted by the clock
-offset of gauge and camera, on the scale on which the pressure of an expanding gas is linear in the growth. Of the
-curves that leave only noise, that of least BIC is taken (Schwarz, Ann. Stat. 6, 461, 1978): a superfluous term bends
-the speed through the whole trial, at 0.1 kPa of noise by more than its position errors. The frequency of each kind of
-curve in the campaign is estimated too and used as a prior (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp. 1, 157,
-1956). Any other trace is smoothed by a spline.
+A trace is a constant and smooth functions of time and of the observed growth, since the pressure falls as the tube
+fills and has its corner where growth begins: Gaussian processes (`vinetrack.inference.smooth_functions`) on the scale
+on which the pressure of an expanding gas is linear in the growth. Their size, how smooth they are, and what they depend
+on are averaged over by the evidence of all traces of a campaign together: where all other pressures are constant, a
+bend that one shows by chance counts as noise. The growth is shifted by the clock offset of gauge and camera. A trace
+that such functions do not explain is smoothed by a spline.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cache
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.units import AMBIENT_PRESSURE_PA
+from vinetrack.inference.smooth_functions import posterior, product_of_modes, root_of_covariance, splines
 from vinetrack.inference.whitening import whiten
 from vinetrack.tracks.position_noise import rough_noise
 
@@ -349,145 +348,17 @@ def whitened(values: Floats, rho: float) -> Floats:
 
 
 # ------------------------------------------------------------------------------
-# Clock offset between pressure gauge and camera, estimated from the growth that empties the chamber.
-#
-# A pressure that falls as the tube fills has its corner where growth begins. So the growth is shifted in time to
-# where it explains the readings of each trace best. All trials share gauge and camera, so that the same offset is
-# likely: the distribution of offsets in the other trials is the prior of each (empirical Bayes: Robbins, Proc. 3rd
-# Berkeley Symp. 1, 157, 1956), since a short trace determines its own offset to a few samples at best.
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Clock offset, samples: delay from a reading to the growth that belongs to it; and its standard deviation. `cost`
-    is −2 ln of the prior probability of this offset.
-    """
-
-    offset: float
-    sigma: float
-    cost: float
-
-
-@dataclass(frozen=True)
-class Growth:
-    """Growth of a trial at all samples of its trace, m, shape (n,), and their spacing, s."""
-
-    grown_m: Floats
-    frame_s: float
-
-    def at(self, places: Floats) -> Floats:
-        """Growth at places among the samples, m; constant beyond both ends."""
-        return np.interp(places, np.arange(self.grown_m.size), self.grown_m)
-
-
-def polynomial_along(t: Floats, growth_m: Floats, time_degree: int, growth_degree: int) -> Floats:
-    """Powers of time and of growth. The first column is 1. Shapes: t, growth_m (n,) → (n, bent + along + 1)."""
-    return np.column_stack(
-        [*(t**k for k in range(time_degree + 1)), *(growth_m**k for k in range(1, growth_degree + 1))]
-    )
-
-
-def frequencies_in_other_trials(likelihoods: Floats) -> Floats:
-    """Frequencies of several kinds in the other trials of a campaign, as a prior for each trial. Estimated by
-    expectation–maximisation. One pseudo-trial that is of every kind alike is added, so that none is ruled out. A trial
-    does not contribute to its own prior, since a chance result would then make itself likely (collapsed variational
-    rule: Asuncion et al., Proc. 25th UAI, 27, 2009). Shapes: likelihoods (n_trials, n_kinds).
-    """
-    informative = likelihoods.any(axis=1)
-    n_kinds = likelihoods.shape[1]
-    shares: Floats = np.full(likelihoods.shape, 1 / n_kinds)
-    # 30: iterations of the expectation–maximisation of frequencies (measured)
-    for _ in range(30 if np.count_nonzero(informative) > 1 else 0):
-        responsibilities = likelihoods * shares
-        responsibilities = responsibilities / np.where(informative, responsibilities.sum(axis=1), 1.0)[:, None]
-        counts_of_others = responsibilities.sum(axis=0) - responsibilities
-        shares = (counts_of_others + 1 / n_kinds) / (counts_of_others.sum(axis=1, keepdims=True) + 1)
-    return shares
-
-
-def gauge_clocks(
-    read: Sequence[Readings], growths: Sequence[Growth | None], noises: Sequence[GaugeNoise]
-) -> list[Clock | None]:
-    """Clock offset of every trace of a campaign."""
-    largest_offset_frames = 60  # Largest clock offset, samples (chosen)
-    frames_s = [growth.frame_s for growth in growths if growth is not None]
-    if not frames_s:
-        return [None] * len(read)
-    step_s = float(np.median(frames_s))
-    offsets_s: Floats = step_s * np.arange(-largest_offset_frames, largest_offset_frames + 1.0)
-    logs: dict[int, Floats] = {}
-    for i, (readings, growth, noise) in enumerate(zip(read, growths, noises, strict=True)):
-        if growth is not None and noise.sigma_Pa > 0:
-            log_likelihood = _offset_log_likelihood(readings, growth, noise, offsets_s / growth.frame_s)
-            if log_likelihood is not None:
-                logs[i] = log_likelihood
-    if not logs:
-        return [None] * len(read)
-    shares = frequencies_in_other_trials(np.exp(np.array(list(logs.values()))))
-    clocks: list[Clock | None] = [None] * len(read)
-    for (i, log_likelihood), share in zip(logs.items(), shares, strict=True):
-        posterior = log_likelihood + np.log(share)
-        best = int(np.argmax(posterior))
-        # 4.5: log posterior below the maximum down to which an offset belongs to its peak (derived)
-        in_peak = posterior > posterior[best] - 4.5
-        # The peak is the contiguous range around the likeliest offset.
-        gaps = np.flatnonzero(~in_peak)
-        begin = int(max(gaps[gaps < best], default=-1)) + 1
-        end = int(min(gaps[gaps > best], default=in_peak.size))
-        weights = np.exp(posterior[begin:end] - posterior[best])
-        peak_offsets_s = offsets_s[begin:end]
-        mean_s = float(np.average(peak_offsets_s, weights=weights))
-        sigma_s = math.sqrt(float(np.average((peak_offsets_s - mean_s) ** 2, weights=weights)))
-        growth = growths[i]
-        assert growth is not None
-        cost = -2 * math.log(float(np.sum(share[begin:end])))
-        clocks[i] = Clock(mean_s / growth.frame_s, sigma_s / growth.frame_s, cost)
-    return clocks
-
-
-def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise, offsets: Floats) -> Floats | None:
-    """Log likelihood of offsets, samples, relative to the likeliest; None if there is no information. Where no curve
-    explains the readings to their noise, the residual counts as noise.
-    """
-    # Degrees in time and in growth of the curve by which the offset is estimated (chosen)
-    time_degree, growth_degree = 1, 2
-    size, columns = readings.places.size, time_degree + growth_degree + 1
-    if size <= columns:
-        return None
-    means = readings.edges is not None
-    at = np.arange(growth.grown_m.size) if means else readings.places
-    t, y = np.linspace(-1, 1, at.size), whitened(readings.values_Pa - np.mean(readings.values_Pa), noise.rho)
-    # 400: readings used to estimate an offset (chosen)
-    stride = max(size // 400, 1)
-    y = y[::stride]
-    residual_squares = np.full(offsets.size, np.inf)
-    for k in np.flatnonzero(np.abs(offsets) <= growth.grown_m.size // 4):
-        shifted_m = growth.at(at + offsets[k])
-        range_m = np.ptp(shifted_m)
-        if range_m == 0:
-            continue
-        curves = polynomial_along(t, (shifted_m - shifted_m[0]) / range_m, time_degree, growth_degree)
-        white = whitened(readings.means_of(curves) if means else curves, noise.rho)
-        q = np.linalg.qr(white[::stride])[0]
-        residual_squares[k] = y @ y - np.sum((q.T @ y) ** 2)
-    least = float(np.min(residual_squares))
-    if not math.isfinite(least):
-        return None
-    variance = max(noise.sigma_Pa**2, least / max(y.size - columns - 1, 1))
-    return np.asarray(-0.5 * (residual_squares - least) / variance)
-
-
-# Half widths of the windows in which a residual may not show a local part, samples (chosen)
-HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135, 200, 300, 450, 680, 1000)
-
-
-LARGEST_DEGREE = 6  # Largest degree of a polynomial in time (chosen)
-
+# Curves through the readings: a constant and smooth functions of time and of growth.
 
 GAMMA = 1.2  # Exponent with which a chamber empties into the tube, between isothermal and adiabatic (derived)
 
-# Degrees in time and in growth of the other kinds of curves (chosen)
-GROWTH_DEGREES = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
+TIME_SPLINES, GROWTH_SPLINES = 24, 12  # Splines over the time of a trace and over its growth (chosen)
+
+AMPLITUDES = tuple(np.geomspace(1e-6, 0.3, 16))  # Of the smooth functions, parts of the absolute pressure (chosen)
+
+TIME_LENGTHS = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8)  # Length scales in time, parts of a trace (chosen)
+
+LARGEST_OFFSET_FRAMES = 60  # Largest clock offset, samples (chosen)
 
 
 @dataclass(frozen=True)
@@ -501,7 +372,6 @@ class DenoisedTrace:
     pressure_Pa: Floats
     mean_error_Pa: float
     errors_Pa: Floats
-    is_curve: bool = False
 
     def extended(self) -> DenoisedTrace:
         """The trace with one more sample beyond its end, along the line through its last part. If the clock of the
@@ -528,136 +398,132 @@ class DenoisedTrace:
 
 
 @dataclass(frozen=True)
-class _Recorded:
-    """A trace to be denoised: readings, number of samples, noise; growth and clock offset, None where unknown."""
+class Growth:
+    """Growth of a trial at all samples of its trace, m, shape (n,), and their spacing, s."""
+
+    grown_m: Floats
+    frame_s: float
+
+    def at(self, places: Floats) -> Floats:
+        """Growth at places among the samples, m; constant before them, and beyond them at the speed of the last."""
+        last = self.grown_m.size - 1
+        late = max(last // 10, 1)
+        per_sample_m = max(float(self.grown_m[last] - self.grown_m[last - late]) / late, 0.0)
+        inside = np.interp(places, np.arange(last + 1), self.grown_m)
+        return np.asarray(inside + per_sample_m * np.maximum(places - last, 0.0))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A trace to be denoised: readings, number of samples, noise; growth, None where unknown."""
 
     readings: Readings
     count: int
     noise: GaugeNoise
     growth: Growth | None
-    clock: Clock | None
 
     @property
     def typical_Pa(self) -> float:
-        """Absolute pressure at which the scale of `_linearised` has unit slope."""
+        """Absolute pressure at which the scale of `linearised` has unit slope."""
         return max(float(np.median(self.readings.values_Pa)), -0.5 * AMBIENT_PRESSURE_PA) + AMBIENT_PRESSURE_PA
 
-    def basis(self, kind: int, offset_sigmas: float = 0.0) -> tuple[Floats, Floats]:
-        """Basis functions of a kind of curve at the readings, orthonormal, and at all samples; the first is the mean.
-        `offset_sigmas` shifts the clock by so many of its standard deviations.
-        """
-        at_samples = self._columns(kind, np.arange(float(self.count)), offset_sigmas)
-        means = self.readings.edges is not None
-        at_readings = (
-            self.readings.means_of(at_samples) if means else self._columns(kind, self.readings.places, offset_sigmas)
-        )
-        q, r = np.linalg.qr(at_readings)
-        return q, np.linalg.solve(r.T, at_samples.T).T
+    @property
+    def linearised(self) -> Floats:
+        """Readings on the scale on which those of a chamber emptying into the tube are linear in the growth."""
+        absolute = np.maximum(self.readings.values_Pa + AMBIENT_PRESSURE_PA, 0.1 * AMBIENT_PRESSURE_PA)
+        return np.asarray(-GAMMA * (absolute / self.typical_Pa) ** (-1 / GAMMA))
 
-    def _columns(self, kind: int, where: Floats, offset_sigmas: float) -> Floats:
-        """Powers of time, or of time and growth, at places among the samples."""
+    def at_samples(self, clock_s: float) -> Floats:
+        """Splines in time and in growth at all samples, shape (n_samples, n_splines)."""
+        return self._splines(np.arange(float(self.count)), clock_s)
+
+    def at_readings(self, clock_s: float) -> Floats:
+        """The same at the readings, shape (n_readings, n_splines)."""
+        if self.readings.edges is not None:
+            return self.readings.means_of(self.at_samples(clock_s))
+        return self._splines(self.readings.places, clock_s)
+
+    def _splines(self, where: Floats, clock_s: float) -> Floats:
         places = self.readings.places
-        t = 2 * (where - places[0]) / (places[-1] - places[0]) - 1
-        if kind <= LARGEST_DEGREE:
-            return legvander(t, kind)
-        assert self.growth is not None
-        assert self.clock is not None
-        offset = self.clock.offset + offset_sigmas * self.clock.sigma
-        seen_m = self.growth.at(places + offset)
-        grown = (self.growth.at(where + offset) - seen_m[0]) / np.ptp(seen_m)
-        return polynomial_along(t, grown, *GROWTH_DEGREES[kind - LARGEST_DEGREE - 1])
+        in_time = splines((where - places[0]) / (places[-1] - places[0]), TIME_SPLINES)
+        in_growth = np.zeros((where.size, GROWTH_SPLINES))
+        if self.growth is not None:
+            offset = clock_s / self.growth.frame_s
+            seen_m = self.growth.at(places + offset)
+            if np.ptp(seen_m) > 0:
+                in_growth = splines((self.growth.at(where + offset) - seen_m[0]) / np.ptp(seen_m), GROWTH_SPLINES)
+        return np.hstack([in_time, in_growth])
 
-    def criteria(self) -> Floats:
-        """BIC of every kind of curve, infinite where its residual is more than noise. Shape (n_kinds,)."""
-        y = whitened(_linearised(self.readings.values_Pa, self.typical_Pa), self.noise.rho)
-        size, degrees = len(y), self.noise.degrees
-        # 12: further degrees that a residual may not show (chosen)
-        polynomials = _polynomials(size, min(LARGEST_DEGREE + 12, size // 3))
-        time_only = [kind + 1 < polynomials.shape[1] for kind in range(LARGEST_DEGREE + 1)]
-        with_growth = [self.clock is not None and sum(of) <= size // 3 - 2 for of in GROWTH_DEGREES]
-        values = np.full(len(time_only) + len(with_growth), math.inf)
-        for kind in np.flatnonzero(time_only + with_growth):
-            basis = np.linalg.qr(whitened(self.basis(int(kind))[0], self.noise.rho))[0]
-            numbers, clock_cost = basis.shape[1], 0.0
-            if kind > LARGEST_DEGREE:
-                assert self.clock is not None
-                numbers, clock_cost = numbers + 1, self.clock.cost - math.log(size)
-            residual = y - basis @ (basis.T @ y)
-            if _is_noise(residual, self.noise, numbers, polynomials):
-                # A noise estimated from few differences makes the likelihood a Student t.
-                relative_squares = float(residual @ residual) / (degrees * self.noise.sigma_Pa**2)
-                values[kind] = (degrees + size) * math.log1p(relative_squares) + math.log(size) * numbers + clock_cost
-        return values
-
-    def averaged(self, weights: Floats) -> tuple[Floats, float, Floats]:
-        """As `curve`, averaged over kinds with these weights; the differences between kinds are errors of the average.
-        The errors within a kind are those of the kind of largest weight. Bayesian model averaging (Hoeting et al.,
-        Stat. Sci. 14, 382, 1999).
-        """
-        kinds = np.flatnonzero(weights)
-        if not kinds.size:
-            return self.curve(None)
-        _, of_mean_Pa, errors_Pa = self.curve(int(np.argmax(weights)))
-        all_errors_Pa = [errors_Pa, *self._clock_errors(int(np.argmax(weights)))]
-        shares = weights[kinds] / weights[kinds].sum()
-        curves_Pa = np.column_stack([self.curve(int(kind))[0] for kind in kinds])
-        mean_Pa = curves_Pa @ shares
-        between_Pa = (curves_Pa - mean_Pa[:, None]) * np.sqrt(shares)
-        all_errors_Pa.append(between_Pa - np.mean(between_Pa, axis=0))
-        return mean_Pa, of_mean_Pa, _principal_errors(np.column_stack(all_errors_Pa))
-
-    def _clock_errors(self, kind: int) -> list[Floats]:
-        """Error of a curve in growth due to one standard deviation of the clock offset, Pa."""
-        if kind <= LARGEST_DEGREE:
-            return []
-        change_Pa = 0.5 * (self.curve(kind, offset_sigmas=1.0)[0] - self.curve(kind, offset_sigmas=-1.0)[0])
-        return [change_Pa - np.mean(change_Pa)] if np.ptp(change_Pa) > 0 else []
-
-    def curve(self, kind: int | None, offset_sigmas: float = 0.0) -> tuple[Floats, float, Floats]:
-        """The curve of a kind at all samples, Pa, the error of its mean, Pa, and one column per other error. Without a
-        kind it is a smoothing spline. Errors are one standard deviation each.
-        """
-        noise, values_Pa = self.noise, self.readings.values_Pa
-        if kind is None:
-            # White noise is assumed: a changing pressure can mimic a correlation of the noise.
-            white_Pa = white_noise_sd(values_Pa) if values_Pa.size >= FEWEST_SAMPLES else 0.0
-            noise = replace(noise, sigma_Pa=white_Pa or noise.sigma_Pa, rho=0.0)
-        # A spline has slow errors: their size is taken as that of a polynomial of the largest degree.
-        basis, basis_at_samples = self.basis(
-            min(LARGEST_DEGREE, values_Pa.size - 2) if kind is None else kind, offset_sigmas
-        )
-        q, r = np.linalg.qr(whitened(basis, noise.rho))
-        per_error = noise.sigma_Pa * np.linalg.solve(r.T, basis_at_samples.T).T
-        if kind is None:
-            smooth = _spline(self.readings.places, values_Pa, noise.sigma_Pa, self.count)
-        else:
-            white = whitened(_linearised(values_Pa, self.typical_Pa), noise.rho)
-            part = np.maximum(-basis_at_samples @ np.linalg.solve(r, q.T @ white) / (GAMMA * self.typical_Pa), 0.01)
-            smooth = self.typical_Pa * part**-GAMMA - AMBIENT_PRESSURE_PA
-            per_error = per_error * part[:, None] ** (-GAMMA - 1)
-        means = np.mean(per_error, axis=0)
-        return smooth, float(np.linalg.norm(means)), (per_error - means)[:, 1:]
+    def equations(self, clock_s: float) -> Floats:
+        """Triangular factor of the whitened columns constant, splines, linearised readings, in units of the noise."""
+        columns = np.column_stack([np.ones(self.linearised.size), self.at_readings(clock_s), self.linearised])
+        white = whitened(columns, self.noise.rho) * (self.typical_Pa / self.noise.sigma_Pa)
+        return np.asarray(np.linalg.qr(np.vstack([white, np.zeros((columns.shape[1], columns.shape[1]))]), mode="r"))
 
 
-def _linearised(pressure_Pa: Floats, typical_Pa: float) -> Floats:
-    """Pressure on the scale on which that of a chamber emptying into the tube is linear in the growth, Pa."""
-    whole = np.maximum(pressure_Pa + AMBIENT_PRESSURE_PA, 0.1 * AMBIENT_PRESSURE_PA) / typical_Pa
-    return np.asarray(-GAMMA * typical_Pa * whole ** (-1 / GAMMA))
+@cache
+def kinds_of_curves() -> tuple[list[Floats], list[float]]:
+    """Modes of the coefficients of the splines, in time, in growth, or in both, for every way in which a pressure may
+    change, and the logarithms of their odds. A chamber that empties gives a line in the growth, bent a little.
+    """
+    line, over_time = ((np.arange(count)[:, None] - 1.0) / (count - 3) for count in (GROWTH_SPLINES, TIME_SPLINES))
+    bent, smooth = (
+        product_of_modes([root_of_covariance(GROWTH_SPLINES, length, zero_at_start=True)]) for length in (0.25, 0.8)
+    )
+    in_time = [over_time, *(product_of_modes([root_of_covariance(TIME_SPLINES, length)]) for length in TIME_LENGTHS)]
+    # 0.1: by how much a chamber's pressure departs from the line, as a part of its fall (chosen)
+    in_growth = [line, np.hstack([line, 0.1 * smooth]), smooth, bent]
+    time = [np.vstack([modes, np.zeros((GROWTH_SPLINES, modes.shape[1]))]) for modes in in_time]
+    growth = [np.vstack([np.zeros((TIME_SPLINES, modes.shape[1])), modes]) for modes in in_growth]
+    both = [np.hstack([modes, growth[1]]) for modes in (time[0], *time[-3:])]
+    kinds = (time, growth, both)
+    return [modes for of_kind in kinds for modes in of_kind], [-math.log(len(of)) for of in kinds for _ in of]
 
 
-def _principal_errors(errors_Pa: Floats) -> Floats:
-    """The same error covariance in as few columns as possible, by principal components."""
-    directions, sizes_Pa, _ = np.linalg.svd(errors_Pa, full_matrices=False)
-    # 1e-3: part of the total error variance of a curve below which a principal direction is dropped (chosen)
-    kept = sizes_Pa**2 > 1e-3 * np.sum(sizes_Pa**2)
-    return np.asarray((directions * sizes_Pa)[:, kept])
+def gauge_clock(traces: Sequence[Recorded]) -> tuple[float, float]:
+    """Clock offset between gauge and camera, s: delay from a reading to the growth that belongs to it, the same in all
+    traces; and its standard deviation. The growth that empties the chamber is shifted to where a line in time and a
+    parabola in growth leave least. Where no curve explains the readings to their noise, the residual counts as noise.
+    """
+    frames_s = [trace.growth.frame_s for trace in traces if trace.growth is not None]
+    if not frames_s:
+        return 0.0, 0.0
+    step_s = float(np.median(frames_s))
+    offsets_s: Floats = step_s * np.arange(-LARGEST_OFFSET_FRAMES, LARGEST_OFFSET_FRAMES + 1.0)
+    log_likelihood = np.zeros(offsets_s.size)
+    for trace in traces:
+        # 5: readings from which the curve, of four coefficients, leaves anything
+        if trace.growth is not None and trace.readings.places.size >= 5:
+            log_likelihood += _offset_log_likelihood(trace, trace.growth, offsets_s / trace.growth.frame_s)
+    best = int(np.clip(np.argmax(log_likelihood), 1, offsets_s.size - 2))
+    before, at, after = log_likelihood[best - 1 : best + 2]
+    bend = 2 * at - before - after
+    if not bend > LARGEST_OFFSET_FRAMES**-2:
+        return 0.0, 0.0
+    return float(offsets_s[best] + 0.5 * step_s * (after - before) / bend), step_s / math.sqrt(bend)
+
+
+def _offset_log_likelihood(trace: Recorded, growth: Growth, offsets: Floats) -> Floats:
+    """Log likelihood of offsets, samples."""
+    readings, rho = trace.readings, trace.noise.rho
+    at = np.arange(float(trace.count)) if readings.edges is not None else readings.places
+    # 400: readings used to estimate an offset (chosen)
+    stride = max(readings.places.size // 400, 1)
+    y = whitened(readings.values_Pa - np.mean(readings.values_Pa), rho)[::stride]
+    line = np.column_stack([np.ones(at.size), np.linspace(-1, 1, at.size)])
+    squares = np.empty(offsets.size)
+    for k, offset in enumerate(offsets):
+        shifted_m = growth.at(at + offset) - growth.at(at[:1] + offset)
+        bends = shifted_m[:, None] ** [1, 2] if np.ptp(shifted_m) > 0 else np.zeros((at.size, 0))
+        curves = np.hstack([line, bends / np.maximum(np.max(np.abs(bends), axis=0), 1e-300)])
+        white = whitened(readings.means_of(curves) if readings.edges is not None else curves, rho)[::stride]
+        squares[k] = y @ y - np.sum((np.linalg.qr(white)[0].T @ y) ** 2)
+    variance = max(trace.noise.sigma_Pa**2, float(np.min(squares)) / max(y.size - 5, 1))
+    return np.asarray(-0.5 * squares / variance)
 
 
 def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
-    """Recorded pressures of the trials of a campaign without gauge noise; None for trials without a trace. The
-    frequency of each kind of curve in the campaign enters as a prior: where all other pressures are constant, a bend
-    that a single trace shows by chance counts as noise.
-    """
+    """Recorded pressures of the trials of a campaign without gauge noise; None for trials without a trace."""
     denoised: list[DenoisedTrace | None] = [None] * len(tracks)
     growths: dict[int, Growth | None] = {}
     for i, track in enumerate(tracks):
@@ -675,75 +541,96 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
             growths[i] = Growth(grown_m, float(np.median(np.diff(time_s))))
     raw = {i: trace for i, trace in enumerate(denoised) if trace is not None}
     read = gauge_readings([trace.pressure_Pa for trace in raw.values()])
-    rho = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
-    noises = noise_of_traces(read, rho)
-    clocks = gauge_clocks(read, list(growths.values()), noises)
-    noisy = {
-        i: _Recorded(readings, raw[i].time_s.size, noise, growths[i], clock)
-        for i, readings, noise, clock in zip(raw, read, noises, clocks, strict=True)
-        if noise.sigma_Pa > 0
-    }
-    if noisy:
-        weights = _weights(np.array([recorded.criteria() for recorded in noisy.values()]))
-        for (i, recorded), weight in zip(noisy.items(), weights, strict=True):
-            denoised[i] = DenoisedTrace(raw[i].time_s, *recorded.averaged(weight), bool(np.any(weight)))
+    found = []
+    # A pressure that changes between readings can pass for a correlation of their noise: the evidence decides.
+    for rho in {0.0, noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])}:
+        noisy = {
+            i: Recorded(readings, raw[i].time_s.size, noise, growths[i])
+            for i, readings, noise in zip(raw, read, noise_of_traces(read, rho), strict=True)
+            if noise.sigma_Pa > 0
+        }
+        if noisy:
+            found.append((noisy, Curves(list(noisy.values()))))
+    if found:
+        noisy, curves = max(found, key=lambda each: each[1].log_likelihood)
+        for k, i in enumerate(noisy):
+            denoised[i] = DenoisedTrace(raw[i].time_s, *curves.of_trace(k))
     return denoised
 
 
-def _spline(places: Floats, values_Pa: Floats, sigma_Pa: float, count: int) -> Floats:
-    """Smoothing spline through readings at all samples, with knots where the pressure bends (Dierckx, IMA J. Numer.
+class Curves:
+    """The curves through the readings of traces, given their noise; `log_likelihood` is that of the readings, with the
+    curves integrated out.
+    """
+
+    def __init__(self, traces: Sequence[Recorded]) -> None:
+        self.traces = traces
+        self.clock_s, self.clock_sigma_s = gauge_clock(traces)
+        self.factors = np.array([trace.equations(self.clock_s) for trace in traces])
+        # The constant is eliminated: what is left are the rows below its own.
+        rows = self.factors[:, 1:, 1:]
+        products = np.swapaxes(rows, 1, 2) @ rows
+        information, score, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
+        modes, log_odds = kinds_of_curves()
+        self.found = posterior(information, score, modes, np.array(AMPLITUDES), log_odds)
+        explained = 2 * score - np.einsum("nkl,nl->nk", information, self.found.mean)
+        self.residual_squares = squares - np.sum(self.found.mean * explained, axis=1)
+        scales = np.array([math.log(trace.noise.sigma_Pa) * trace.readings.places.size for trace in traces])
+        correlated = 0.5 * np.log1p([-(trace.noise.rho**2) for trace in traces])
+        of_constants = np.log(np.abs(self.factors[:, 0, 0]))
+        self.log_likelihood = (
+            float(np.sum(correlated - scales - of_constants - 0.5 * squares)) + self.found.log_evidence
+        )
+
+    def of_trace(self, k: int) -> tuple[Floats, float, Floats]:
+        """The pressure of a trace at all samples, Pa, the error of its mean, Pa, and one column per other error, one
+        standard deviation each.
+        """
+        trace, factor, mean = self.traces[k], self.factors[k], self.found.mean[k]
+        constant = factor[0, -1] / factor[0, 0]
+        at_samples = trace.at_samples(self.clock_s) - factor[0, 1:-1] / factor[0, 0]
+        part = np.maximum(-(constant + at_samples @ mean) / GAMMA, 0.01)
+        variances, vectors = np.linalg.eigh(self.found.covariance[k])
+        earlier, later = (trace.at_samples(self.clock_s + sign * self.clock_sigma_s) for sign in (-1, 1))
+        errors = [at_samples @ (vectors * np.sqrt(np.maximum(variances, 0.0))), 0.5 * (later - earlier) @ mean]
+        errors_Pa = (trace.typical_Pa * part ** (-GAMMA - 1))[:, None] * np.column_stack(errors)
+        means_Pa = errors_Pa.mean(axis=0)
+        mean_error_Pa = math.hypot(trace.typical_Pa / abs(factor[0, 0]), *means_Pa)
+        pressure_Pa = trace.typical_Pa * part**-GAMMA - AMBIENT_PRESSURE_PA
+        if self.residual_squares[k] > _largest_residual_squares(trace):
+            pressure_Pa = _spline(trace)
+        least_Pa = NEGLIGIBLE_NOISE * abs(float(np.median(trace.readings.values_Pa)))
+        return pressure_Pa, mean_error_Pa, _principal_errors(errors_Pa - means_Pa, least_Pa)
+
+
+def _principal_errors(errors_Pa: Floats, least_Pa: float) -> Floats:
+    """The same error covariance in as few columns as possible, by principal components; none of less than so much."""
+    directions, sizes_Pa, _ = np.linalg.svd(errors_Pa, full_matrices=False)
+    # 1e-2: part of the total error variance of a curve below which a principal direction is dropped (chosen)
+    kept = sizes_Pa**2 > max(1e-2 * float(np.sum(sizes_Pa**2)), least_Pa**2 * len(errors_Pa))
+    return np.asarray((directions * sizes_Pa)[:, kept])
+
+
+def _largest_residual_squares(trace: Recorded) -> float:
+    """Largest residual sum of squares, in units of the noise, of a curve that explains a trace (F test)."""
+    from scipy.special import fdtri
+
+    degrees = trace.readings.values_Pa.size - 1
+    # 1e-5: probability with which pure noise leaves more than is accepted (chosen)
+    return float(degrees * fdtri(degrees, trace.noise.degrees, 1 - 1e-5))
+
+
+def _spline(trace: Recorded) -> Floats:
+    """Smoothing spline through readings at all samples, Pa, with knots where the pressure bends (Dierckx, IMA J. Numer.
     Anal. 1, 267, 1981); of fewer than five readings lines.
     """
     from scipy.interpolate import UnivariateSpline
 
+    places, values_Pa = trace.readings.places, trace.readings.values_Pa
+    # White noise is assumed: a changing pressure can mimic a correlation of the noise.
+    white_Pa = white_noise_sd(values_Pa) if values_Pa.size >= FEWEST_SAMPLES else 0.0
     # 0.85: part of the squares of the noise that the spline leaves, the rest for its knots (measured)
     few = places.size < 5
-    weights = np.full(places.size, 1 / sigma_Pa)
+    weights = np.full(places.size, 1 / (white_Pa or trace.noise.sigma_Pa))
     spline = UnivariateSpline(places, values_Pa, weights, k=1 if few else 3, s=0.0 if few else 0.85 * places.size)
-    return np.asarray(spline(np.arange(float(count))))
-
-
-def _weights(criteria: Floats) -> Floats:
-    """Probabilities of kinds of curves relative to the most probable; 0 if negligible or if none explains a trace."""
-    possible = np.asarray(np.isfinite(criteria).any(axis=1))
-    lowest = np.where(possible, criteria.min(axis=1), 0.0)
-    totals = criteria - 2 * np.log(frequencies_in_other_trials(np.exp(-0.5 * (criteria - lowest[:, None]))))
-    least = np.where(possible, totals.min(axis=1), 0.0)
-    weights = np.where(possible[:, None], np.exp(-0.5 * (totals - least[:, None])), 0.0)
-    # 0.01: probability, relative to the most probable kind of curve, from which a kind enters the average (chosen)
-    return np.where(weights >= 0.01, weights, 0.0)
-
-
-def _polynomials(count: int, degree: int) -> Floats:
-    """Orthonormal polynomials in time, shape (count, degree + 1)."""
-    return np.asarray(np.linalg.qr(legvander(np.linspace(-1, 1, count), degree))[0])
-
-
-def _is_noise(residual_Pa: Floats, noise: GaugeNoise, fitted: int, slow: Floats) -> bool:
-    """Whether a curve with so many parameters leaves no slow or local part and no more than the noise."""
-    # 4.0: standard deviations from which a slow residual is more than noise (chosen)
-    if np.any(np.abs(slow.T @ residual_Pa) > _quantile_Pa(4.0, noise)):
-        return False
-    # A corner that is cut leaves residuals only in the samples around it.
-    total = np.concatenate([[0.0], np.cumsum(residual_Pa)])
-    # 5.0: standard deviations from which a sum of neighbouring residuals is more than noise
-    local = _quantile_Pa(5.0, noise)
-    for width in (2 * half + 1 for half in HALF_WIDTHS if 2 * half < residual_Pa.size):
-        if np.max(np.abs(total[width:] - total[:-width])) > local * np.sqrt(width):
-            return False
-    return bool(residual_Pa @ residual_Pa <= _largest_residual_squares(noise, residual_Pa.size - fitted))
-
-
-def _quantile_Pa(sigmas: float, noise: GaugeNoise) -> float:
-    """Bound, Pa, at the false-alarm rate of so many normal standard deviations, by Student's t."""
-    from scipy.special import ndtr, stdtrit
-
-    return -noise.sigma_Pa * float(stdtrit(noise.degrees, ndtr(-sigmas)))
-
-
-def _largest_residual_squares(noise: GaugeNoise, degrees: Floats | int) -> Any:
-    """Largest accepted residual sum of squares with so many degrees of freedom, Pa² (F test)."""
-    from scipy.special import fdtri
-
-    # 1e-5: probability with which pure noise leaves a larger residual sum of squares than is accepted (chosen)
-    return noise.sigma_Pa**2 * degrees * fdtri(degrees, noise.degrees, 1 - 1e-5)
+    return np.asarray(spline(np.arange(float(trace.count))))

@@ -190,15 +190,10 @@ def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Systematic
     return _one_per_group(predictor, moved_m, {i: trial.condition for i, trial in trials.items()})
 
 
-def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only: bool = False) -> Systematics:
+def recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
     """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
     data = predictor.data
-    errors_Pa = [
-        np.zeros((0, 0))
-        if each.trace_errors_Pa is None or (curves_only and not each.trace_is_curve)
-        else each.trace_errors_Pa
-        for each in data
-    ]
+    errors_Pa = [np.zeros((0, 0)) if each.trace_errors_Pa is None else each.trace_errors_Pa for each in data]
     counts = [errors.shape[1] for errors in errors_Pa]
     n_columns = max(counts)
     no_errors = Systematics.none([trial_data.time_s.size for trial_data in data])

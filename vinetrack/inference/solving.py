@@ -263,8 +263,7 @@ def with_fitted_trace_errors(
     predictor: Predictor, solution: Solution, held: FixedTerms, **how: Any
 ) -> tuple[Predictor, Solution]:
     """A solution with the errors of the recorded pressures estimated, and the predictor of the corrected pressures. A
-    poor model would distort the pressures: its trials keep the recorded ones. So do trials whose trace is no curve: the
-    errors of local lines are not known in detail. `how` are options of `solve`.
+    poor model would distort the pressures: its trials keep the recorded ones. `how` are options of `solve`.
     """
     if not any(_has_errors(trial_data) for trial_data in predictor.data):
         return predictor, solution
@@ -303,7 +302,7 @@ def as_recorded(trial_data: FitTrial) -> FitTrial:
 
 def _has_errors(trial_data: FitTrial) -> bool:
     """Whether the trial has a recorded pressure whose errors can be estimated."""
-    return trial_data.trace is not None and trial_data.trace_errors_Pa is not None and trial_data.trace_is_curve
+    return trial_data.trace is not None and trial_data.trace_errors_Pa is not None
 
 
 def _corrected(trial_data: FitTrial, step: Floats) -> FitTrial:
@@ -323,7 +322,7 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     """Gauss–Newton step of the errors, in standard deviations, from their current estimates. Returns 0 for errors that
     a trial does not have, and everywhere if a trial cannot be simulated with one of them. Shape (n_trials, n_errors).
     """
-    errors = recorded_pressures(predictor, solution, curves_only=True)
+    errors = recorded_pressures(predictor, solution)
     if not errors.n_columns:
         return np.zeros((len(predictor.data), 0))
     sizes = np.zeros((len(predictor.data), errors.n_columns))
