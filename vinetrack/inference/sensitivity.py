@@ -202,8 +202,6 @@ class Predictor:
     `has_damping_deviation` tells which have a B.
     """
 
-    separable = True
-
     def __init__(self, layout: ParameterMap, data: Sequence[FitTrial], host: Model | None = None) -> None:
         self.layout, self.data, self.host = layout, data, host
         model = layout.model

@@ -271,7 +271,7 @@ class ReleaseSearch:
         """
         rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
         predictor, problem, current = self.predictor, self.problem, state
-        if rows.size < len(predictor.data) and predictor.separable:
+        if rows.size < len(predictor.data):
             predictor, problem, (current, proposed) = subset(predictor, problem, rows, state, proposed)
         else:
             rows = np.arange(len(predictor.data))

@@ -47,7 +47,6 @@ from vinetrack.inference.sensitivity import (
     RELEASE,
     Job,
     Predictor,
-    align,
     initial_trial_effects,
 )
 from vinetrack.planning.predictive_inputs import hoop_stress_Pa, prior_ratio
@@ -635,49 +634,9 @@ def worth(between: Floats) -> Floats:
 # Separation by further trials, found by simulating them and refitting the hypotheses to old and new trials.
 #
 # Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
-# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials, the
-# old ones as linear in the parameters; between-trial standard deviations and noise are estimated anew as in a
-# diagnosis, so a wrong hypothesis can explain part of its misfit as scatter. The squared separation is the increase in
-# the difference of −2 ln L.
-
-
-class PartlyLinear(Predictor):
-    """Predictor that simulates new trials and treats the old ones as linear, with the sensitivities of their fit."""
-
-    separable = False
-
-    def __init__(self, layout: ParameterMap, fit: Fit, new: Sequence[FitTrial]) -> None:
-        super().__init__(layout, [*fit.predictor.data, *new], fit.predictor.host)
-        self.n_old, self.fitted = len(fit.predictor.data), fit.solution
-        of_new = replace(layout, index=layout.index[self.n_old :], base=layout.base[self.n_old :])
-        self.new = _stepped_as(fit, of_new, new)
-
-    def linearise(
-        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
-    ) -> list[Floats]:
-        """Sensitivities and residuals, as `Predictor.linearise`; the sensitivities of the old trials are constant.
-        Shapes: theta (n_free,); trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points, n_columns + 1).
-        """
-        of_old = zip(self.fitted.columns, self._residuals_of_old(theta, trial_effects), strict=True)
-        return [np.column_stack([columns[:, :-1], residual]) for columns, residual in of_old] + self.new.linearise(
-            theta, trial_effects[self.n_old :], trial_effects_only=trial_effects_only, past_end=past_end
-        )
-
-    def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
-        """Measured minus predicted positions of all trials, m, for several sets of trial effects. Shapes: theta
-        (n_free,); effect_sets (n_trials, N_TRIAL_EFFECTS) → (n_points,).
-        """
-        return [
-            self._residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
-            for trial_effects in effect_sets
-        ]
-
-    def _residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted positions of the old trials, m, to first order."""
-        at, columns = self.fitted.state, self.fitted.columns
-        change = np.append(theta[: at.theta.size] - at.theta, np.zeros(theta.size - at.theta.size + 1))
-        steps = np.hstack([trial_effects[: self.n_old] - at.trial_effects, change[self.layout.index[: self.n_old]]])
-        return [of_fit[:, -1] - of_fit[:, :-1] @ step for of_fit, step in zip(columns, steps, strict=True)]
+# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials, old
+# and new; between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can
+# explain part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
 
 
 def simulated_rises(hypotheses: Sequence[Hypothesis], design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
@@ -717,19 +676,18 @@ def _refitted(hypothesis: Hypothesis, new: Sequence[tuple[int, FitTrial]]) -> fl
         index=np.concatenate([before.index, index]),
         base=np.concatenate([before.base, wide.base[rows]]),
     )
-    theta, data = hypothesis.theta[used], [trial_data for _, trial_data in new]
-    predictor = PartlyLinear(layout, fit, data)
+    data = [trial_data for _, trial_data in new]
+    predictor = _stepped_as(fit, layout, [*fit.predictor.data, *data])
     try:
-        # New releases are aligned, and the noise of the new trials is that of the old.
-        aligned, _ = align(data, predictor.new, theta, initial_trial_effects(data))
+        # The noise of the new trials is that of the old.
         state = replace(
             old.state,
-            theta=theta,
-            trial_effects=np.concatenate([old.state.trial_effects, aligned]),
+            theta=hypothesis.theta[used],
+            trial_effects=np.concatenate([old.state.trial_effects, initial_trial_effects(data)]),
             variance=np.concatenate([old.state.variance, np.full(len(data), hypothesis.variance)]),
         )
         problem = make_problem(predictor, state.trial_effects)
-        problem.release_origin_mean[: predictor.n_old] = old.problem.release_origin_mean
+        problem.release_origin_mean[: len(fit.trials)] = old.problem.release_origin_mean
         # Scatter and noise are fixed at first, lest misfit that the parameters have yet to remove be taken as scatter.
         fixed = FixedTerms(state.spread, (state.rho, state.variance))
         solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=most)
