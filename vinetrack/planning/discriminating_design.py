@@ -1,13 +1,13 @@
-"""The further trials that separate hypotheses best: expected rise of −2 ln L of the wrong one, to first order.
+"""The further trials that separate hypotheses best, by the expected rise of −2 ln L of the wrong one.
 
 If a is true, new trials show what a predicts. Hypothesis b, refitted to old and new trials, keeps a misfit of
 
-    D² = min over δ, s of  Σ_new |W (y_a − y_b − X δ − Z u)|² + |u/s|² + δᵀ I_s δ − 2 g_sᵀ δ + (rise with s)
+    D² = min over δ, u of  Σ_new |W (y_a − y_b − X δ − Z u)|² + |u/s|² + δᵀ I δ
 
-with X and Z its sensitivities to the free parameters and to the trial effects u, W the whitening of the noise, I_s the
-information of the trials so far and g_s their gradient (not zero where b is at a bound). The between-trial standard
-deviations s of pressure and B are estimated too, so that a wrong hypothesis may explain part of its misfit as scatter.
-√D² is a separation in standard deviations; of a against b and b against a the smaller counts (T-optimality).
+with X and Z its sensitivities to the free parameters and to the trial effects u of standard deviations s, W the
+whitening of the noise, and I the information of the trials so far. √D² is a separation in standard deviations; of a
+against b and b against a the smaller counts (T-optimality). It chooses the trials. What they promise is found by
+simulating and refitting them, with s estimated anew: a wrong hypothesis may explain part of its misfit as scatter.
 """
 
 from __future__ import annotations
@@ -30,14 +30,12 @@ from vinetrack.inference.fit_data import FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, YIELD_PRESSURE, Fit, ParameterMap
 from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
-    LARGEST_SPREAD,
     LEAST_BETWEEN_TRIAL_SD,
     at_unknowns,
     eliminated,
     marginal,
     normal_equations,
     solve_per_trial,
-    step_within_bounds,
 )
 from vinetrack.inference.optimiser import FixedTerms, make_problem, solve
 from vinetrack.inference.position_errors import smooth_errors
@@ -80,10 +78,11 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
     used = [trial for trial in trials if trial.travel_ratio != 1]
     if not used:
         return []
-    typical = _typical_trials(trials)
-    vines = [(trials[k], k, SAME_RIG) for k in typical if _allowed(trials[k], limits)]
+    first = {trial.vine: k for k, trial in reversed(list(enumerate(trials))) if trial.travel_ratio != 1}
+    models = [(trials[k], k) for k in sorted(first.values())]
+    vines = [(trial, k, SAME_RIG) for trial, k in models if _allowed(trial, limits)]
     if limits.new_vines:
-        vines += [(vine, like, NEW_VINE) for vine, like in _new_vines([(trials[k], k) for k in typical], limits)]
+        vines += [(vine, like, NEW_VINE) for vine, like in _new_vines(models, limits)]
     conditions: list[Condition] = []
     for vine, like, effort_of_vine in vines:
         rigs = _rigs(vine, used, limits)
@@ -133,17 +132,6 @@ def exchanged(
         if best <= before:
             break
     return design, best
-
-
-def _typical_trials(trials: Sequence[Trial]) -> list[int]:
-    """Index of a typical trial of each everting vine: the first with its commonest rig and yield pressure."""
-    shown = ("yield_pressure_Pa", "bends", *RIG.values())
-    rigs_of: dict[str, dict[str, list[int]]] = {}
-    for k, trial in enumerate(trials):
-        if trial.travel_ratio != 1:
-            rig = repr([getattr(trial, name) for name in shown])
-            rigs_of.setdefault(trial.vine, {}).setdefault(rig, []).append(k)
-    return [max(places.values(), key=len)[0] for places in rigs_of.values()]
 
 
 def _of(trial: Trial, column: str) -> float:
@@ -264,16 +252,10 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
             sized = replace(near, video=None, track=None, pressure_trace=None, **size)
             if not any(_alike(sized, vine) for vine in vines):
                 new_vines.append((with_names([sized])[0], like))
-    most = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
+    most = 10  # New vines considered, at most (chosen)
     if len(new_vines) <= most:
         return new_vines
-    # Farthest-point sampling
-    sizes = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in new_vines])
-    chosen = [int(np.argmax(np.linalg.norm(sizes - sizes.mean(axis=0), axis=1)))]
-    while len(chosen) < most:
-        distance = np.linalg.norm(sizes[:, None] - sizes[chosen], axis=2).min(axis=1)
-        chosen.append(int(np.argmax(distance)))
-    return [new_vines[k] for k in sorted(chosen)]
+    return [new_vines[k] for k in np.linspace(0, len(new_vines) - 1, most).round().astype(int)]
 
 
 def _sizes(vines: Sequence[Trial], limits: Limits, column: str, factors: Sequence[float]) -> list[float]:
@@ -296,8 +278,8 @@ def _sizes(vines: Sequence[Trial], limits: Limits, column: str, factors: Sequenc
 class Hypothesis:
     """One of the tied fits, extended to further conditions. `layout` maps the free parameters to the trials of the
     conditions: those of the fit first, then those of new vines. All are scaled as in the fit; `theta`, shape (n_free,),
-    are their best values. The experiment films `rest_frames` before release, `frames_behind_end` of the growth, and
-    `longest_s` of motion. For `so_far` and `each` see `refit_terms`.
+    are their best values. The experiment films `rest_frames` before release and `longest_s` of motion. For `so_far` and
+    `each` see `refit_terms`.
     """
 
     name: str
@@ -307,7 +289,6 @@ class Hypothesis:
     theta: Floats
     variance: float
     rest_frames: int
-    frames_behind_end: int
     longest_s: float
     so_far: Floats = field(default_factory=lambda: np.empty(0))
     each: Floats = field(default_factory=lambda: np.empty(0))
@@ -316,12 +297,6 @@ class Hypothesis:
     def n_old(self) -> int:
         """Number of free parameters of the fit."""
         return self.fit.solution.state.theta.size
-
-    @property
-    def room(self) -> tuple[Floats, Floats]:
-        """Distance of each parameter to its lower and upper bound, shape (n_free,) each."""
-        lower, upper = self.layout.bounds
-        return np.maximum(self.theta - lower, 0.0), np.maximum(upper - self.theta, 0.0)
 
     def frame_s(self, place: int) -> float:
         """Frame interval of a condition: that of the trial it is modelled on."""
@@ -384,29 +359,17 @@ def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
         theta=np.concatenate([state.theta, layout.start[state.theta.size :]]),
         variance=float(np.exp(np.mean(np.log(state.variance)))),
         rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), 3),
-        frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
         longest_s=1.5 * float(max(moving_s)),  # a longer film than any so far
     )
-
-
-def _behind_end(trial_data: FitTrial) -> int:
-    """Number of points of a track that show the vine after the end of its growth."""
-    last = int(np.flatnonzero(trial_data.first)[-1])
-    y = trial_data.lead_position_m
-    if last == 0 or not math.isfinite(trial_data.trial.length_m):
-        return 0
-    left_out = y[last] - y[last - 1] > 0.25 * (1 - END_FRACTION) * trial_data.trial.length_m
-    still = float(np.ptp(y[last:])) < 10 * max(trial_data.noise_m, 1e-6)
-    return y.size - last if left_out and still else 0
 
 
 # ------------------------------------------------------------------------------
 # Simulated tracks of candidate trials, sampled as the camera of the experiment would.
 
 
-def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float] | None]:
-    """Return when the first hypothesis nears the end of the growth, and when the last has ended it (infinite where one
-    does not in time), for every condition; None where it is not worth filming or the model is in doubt.
+def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[float | None]:
+    """Return when the first hypothesis nears the end of the growth, s, for every condition; None where it is not worth
+    filming or the model is in doubt.
     """
     last = hypotheses[-1]
     every, longest_s, fit = range(len(last.conditions)), last.longest_s, last.fit
@@ -425,7 +388,7 @@ def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float]
     ]
     # 1.05: the ratio above which the model predicts compression in the tail (chosen)
     largest_ratio = max(1.05, *filter(math.isfinite, seen))
-    growth: list[tuple[float, float] | None] = [None] * len(every)
+    growth: list[float | None] = [None] * len(every)
     for i, condition in enumerate(last.conditions):
         trial, moving = condition.trial, [course for run in runs if (course := run[i]) is not None]
         if len(moving) < len(runs):
@@ -433,13 +396,12 @@ def growth_courses(hypotheses: Sequence[Hypothesis]) -> list[tuple[float, float]
         near_m = np.nan_to_num(END_FRACTION * trial.length_m, nan=math.inf)
         near_s = min(float(np.interp(near_m, m.lead_position_m, m.time_s, right=longest_s)) for m in moving)
         grown_m = min(float(np.interp(near_s, m.time_s, m.lead_position_m)) for m in moving)
-        ends_s = max(m.end_time_s if m.status == "ended" else math.inf for m in moving)
         ratio = _speed_ratio(fit, trial, jobs[i], moving[-1].tail_velocity_m_s)
         # 0.3: fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
         grows_enough = grown_m > 0.3 * np.nan_to_num(trial.length_m) and near_s > 8 * last.frame_s(i)
         is_compressed = trial.tail_slack != "free" and ratio > largest_ratio
         if grows_enough and not is_compressed:
-            growth[i] = near_s, ends_s
+            growth[i] = near_s
     return growth
 
 
@@ -479,14 +441,14 @@ def film_trials(
     trial_effects = np.zeros((len(places), N_TRIAL_EFFECTS))
     trial_effects[:, RELEASE] = [(truth.rest_frames - 1 + rng.uniform()) * frame_s for frame_s in frames_s]
     trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(places))
-    trial_effects[:, DEVIATION_COLUMNS] = np.where(_may_deviate(predictor), deviations, 0.0)
+    may_deviate = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
+    trial_effects[:, DEVIATION_COLUMNS] = np.where(may_deviate, deviations, 0.0)
     moved = predictor.run(predictor.jobs(truth.theta, trial_effects))
     filmed: list[tuple[int, FitTrial]] = []
     for place, blank, trajectory, effects in zip(places, predictor.data, moved, trial_effects, strict=True):
         stop = blank.time_s.size
         if trajectory.status == "ended":
-            last = int(np.searchsorted(blank.time_s, effects[RELEASE] + trajectory.end_time_s))
-            stop = min(stop, last + truth.frames_behind_end)
+            stop = int(np.searchsorted(blank.time_s, effects[RELEASE] + trajectory.end_time_s))
         noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - rho**2)), rho, rng)
         position_m = effects[ORIGIN] + trajectory.observed_position_m[:stop] + noise
         pressure_Pa = None if blank.trace is None else np.full(stop, blank.trial.pressure_Pa)
@@ -494,11 +456,6 @@ def film_trials(
             track = plain_track(blank.time_s[:stop], position_m, pressure_Pa=pressure_Pa)
             filmed.append((place, prepare_trial(blank.trial, track)))
     return filmed
-
-
-def _may_deviate(predictor: Predictor) -> NDArray[np.bool_]:
-    """Whether pressure and B of each trial may deviate, shape (n_trials, 2)."""
-    return np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
 
 
 # ------------------------------------------------------------------------------
@@ -509,115 +466,54 @@ def _may_deviate(predictor: Predictor) -> NDArray[np.bool_]:
 # moves as it says: minimised over the first, the diagonal of the others is what the refit does not explain.
 
 
-def refit_terms(hypotheses: Sequence[Hypothesis], courses: Sequence[tuple[float, float]]) -> list[Hypothesis]:
-    """The hypotheses with −2 ln L of each when refitted, at several assumed pairs of between-trial standard deviations
-    (levels), as quadratic forms in its free parameters and in the motion by each hypothesis. `so_far`, shape (n_levels,
-    n, n), is that of the trials so far near the best values, with its rise from level to level on the diagonal of the
-    motions; `each`, (n_levels, n_conditions, n, n), that of one trial of each condition.
+def refit_terms(hypotheses: Sequence[Hypothesis], near_ends_s: Sequence[float]) -> list[Hypothesis]:
+    """The hypotheses with the cross products of a refit: `so_far`, shape (n, n), of the trials so far near the best
+    values; `each`, shape (n_conditions, n, n), of one trial of each condition, filmed until it nears its end.
     """
-    times, weights = zip(*(_times(hypotheses[0], k, *course) for k, course in enumerate(courses)), strict=True)
-    trial_effects, root_weights = np.zeros((len(courses), N_TRIAL_EFFECTS)), np.sqrt(np.stack(weights))[:, :, None]
-    predictors = [hypothesis.predictor(range(len(courses)), times) for hypothesis in hypotheses]
+    points = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
+    every, steps_s = range(len(near_ends_s)), np.array(near_ends_s) / points
+    frames_s = np.array([hypotheses[0].frame_s(place) for place in every])
+    # The first time represents the frames at rest.
+    times_s = np.insert(np.outer(steps_s, np.arange(points) + 0.5), 0, -frames_s, axis=1)
+    frames = np.insert(np.outer(steps_s / frames_s, np.ones(points)), 0, hypotheses[0].rest_frames, axis=1)
+    trial_effects = np.zeros((len(every), N_TRIAL_EFFECTS))
     columns = [
-        np.stack(p.linearise(hypothesis.theta, trial_effects))
-        for p, hypothesis in zip(predictors, hypotheses, strict=True)
+        np.stack(hypothesis.predictor(every, list(times_s)).linearise(hypothesis.theta, trial_effects))
+        for hypothesis in hypotheses
     ]
     # The last column is placeholder − motion; the placeholder cancels in the difference of two hypotheses.
     motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
     terms = []
-    for k, (hypothesis, sensitivities, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
+    for k, (hypothesis, sensitivities) in enumerate(zip(hypotheses, columns, strict=True)):
+        solution, old, size = hypothesis.fit.solution, hypothesis.n_old, hypothesis.theta.size
+        state, total = solution.state, size + len(hypotheses)
         # For smooth curves AR(1) noise is equivalent to white noise of variance σ²_innovation/(1 − ρ)².
-        scale = (1 - hypothesis.fit.solution.state.rho) / np.sqrt(hypothesis.variance)
-        differences = motions - motions[:, :, [k]]
-        both = scale * root_weights * np.concatenate([sensitivities[:, :, :-1], differences], axis=2)
-        products = np.swapaxes(both, 1, 2) @ both
-        spreads, factors, so_far = _so_far(hypothesis, len(hypotheses))
-        true, total = np.arange(hypothesis.theta.size, so_far.shape[1]), so_far.shape[1]
-        index = np.concatenate([hypothesis.layout.index, np.tile(true, (len(courses), 1))], axis=1)
-        each = []
-        for spread, factor in zip(spreads, factors, strict=True):
-            precision = np.full((len(courses), N_TRIAL_EFFECTS), 1e-9)
-            precision[:, DEVIATION_COLUMNS] = 1 / spread**2
-            each.append(at_unknowns(eliminated(products, precision)[0], index, total))
-            scatter_rise = _may_deviate(predictor) @ (2 * np.log(factor) + 1 / factor**2 - 1)
-            each[-1][:, true, true] += scatter_rise[:, None]
-        terms.append(replace(hypothesis, so_far=so_far, each=np.stack(each)))
+        scale = (1 - state.rho) / np.sqrt(hypothesis.variance) * np.sqrt(frames)[:, :, None]
+        both = scale * np.concatenate([sensitivities[:, :, :-1], motions - motions[:, :, [k]]], axis=2)
+        precision = np.full(trial_effects.shape, 1e-9)
+        precision[:, DEVIATION_COLUMNS] = 1 / np.maximum(state.spread, LEAST_BETWEEN_TRIAL_SD) ** 2
+        index = np.hstack([hypothesis.layout.index, np.tile(np.arange(size, total), (len(every), 1))])
+        each = at_unknowns(eliminated(np.swapaxes(both, 1, 2) @ both, precision)[0], index, total)
+        so_far, new = np.zeros((total, total)), np.arange(old, size)
+        reduced = marginal(solution.cross_products, solution.problem, state)
+        so_far[:old, :old] = normal_equations(reduced, solution.problem, state, state.spread)[0]
+        # 1.0: prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
+        so_far[new, new] = 1 / 1.0**2 + hypothesis.layout.prior_precision[old:]
+        terms.append(replace(hypothesis, so_far=so_far, each=each))
     return terms
-
-
-def _so_far(hypothesis: Hypothesis, n_true: int) -> tuple[Floats, Floats, Floats]:
-    """Pairs of between-trial standard deviations that a refit may estimate, the fitted ones first, their factors on
-    those, shape (n_levels, 2) each, and the quadratic form of the trials so far at each, see `refit_terms`.
-    """
-    solution, old, size = hypothesis.fit.solution, hypothesis.n_old, hypothesis.theta.size
-    spread = np.array(solution.state.spread)
-    fitted = np.maximum(spread, LEAST_BETWEEN_TRIAL_SD)
-    may_grow = np.array(solution.estimable) & (spread > LEAST_BETWEEN_TRIAL_SD)
-    # Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
-    factors = np.array([(1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0)])
-    spreads = np.where(may_grow, np.minimum(fitted * factors, LARGEST_SPREAD), fitted)
-    pairs: list[tuple[float, float]] = list(dict.fromkeys(map(tuple, spreads.tolist())))
-    reduced = marginal(solution.cross_products, solution.problem, solution.state)
-    so_far, level = np.zeros((len(pairs), size + n_true, size + n_true)), np.zeros(len(pairs))
-    for k, pair in enumerate(pairs):
-        information, slope, square, log_det = normal_equations(reduced, solution.problem, solution.state, pair)
-        so_far[k, :old, :old], so_far[k, :old, size:], level[k] = information, slope[:, None], square + log_det
-    # 1.0: prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
-    new, true = np.arange(old, size), np.arange(size, size + n_true)
-    so_far[:, new, new] = 1 / 1.0**2 + hypothesis.layout.prior_precision[old:]
-    so_far[:, true, true] = (level - level[0])[:, None]
-    return np.array(pairs), np.array(pairs) / fitted, so_far
-
-
-def _times(hypothesis: Hypothesis, place: int, near_end_s: float, ends_s: float) -> tuple[Floats, Floats]:
-    """Times since release at which a condition is evaluated, and the number of frames that each represents. The first
-    represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
-    """
-    points = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
-    frame_s, step_s = hypothesis.frame_s(place), near_end_s / points
-    moving = (np.arange(points) + 0.5) * step_s
-    ends_filmed = np.isfinite(ends_s) and hypothesis.frames_behind_end > 0
-    last_s = 1.05 * ends_s if ends_filmed else moving[-1] + step_s  # just past the end
-    weights = np.full(points + 2, step_s / frame_s)
-    weights[0], weights[-1] = hypothesis.rest_frames, hypothesis.frames_behind_end if ends_filmed else 0.0
-    return np.concatenate([[-frame_s], moving, [last_s]]), weights
 
 
 def separations(terms: Sequence[Hypothesis], designs: Sequence[Sequence[int]] | NDArray[np.int_]) -> Floats:
     """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal. Shapes:
     designs (n_designs, n_trials) → (n_designs, n, n).
     """
-    n, designs = len(terms), np.asarray(designs)
-    conditions = np.unique(designs)
-    squares = np.zeros((len(designs), n, n))
-    for b, refitted in enumerate(terms):
+    squares = []
+    for refitted in terms:
         size = refitted.theta.size
-        # Parameters of the fit, and of the new vines among these conditions
-        use = np.union1d(np.arange(refitted.n_old), refitted.layout.index[conditions])
-        use = use[use >= 0]
-        below, above = (room[use] for room in refitted.room)
-        rows = np.append(use, np.arange(size, size + n))
-        least = np.full((len(designs), n), math.inf)
-        for so_far, each in zip(refitted.so_far, refitted.each, strict=True):
-            of_conditions = each[:, rows[:, None], rows]
-            form = sum(of_conditions[designs[:, k]] for k in range(designs.shape[1])) + so_far[rows[:, None], rows]
-            for a in range(n):
-                if a != b:
-                    gain = _largest_gain(
-                        form[:, : use.size, : use.size], form[:, : use.size, use.size + a], below, above
-                    )
-                    least[:, a] = np.minimum(least[:, a], form[:, use.size + a, use.size + a] - gain)
-        squares[:, :, b] = np.where(np.arange(n) == b, 0.0, least)
-    return np.sqrt(np.maximum(squares, 0.0))
-
-
-def _largest_gain(information: Floats, gradient: Floats, below: Floats, above: Floats) -> Floats:
-    """Largest 2 gᵀδ − δᵀIδ with δ from −`below` to `above`, shape (n_designs,)."""
-    step = solve_per_trial(information, gradient[:, :, None])[:, :, 0]
-    free = np.ones(below.size, dtype=bool)
-    for k in np.flatnonzero(np.any((step < -below) | (step > above), axis=1)):
-        step[k], _ = step_within_bounds(information[k].copy(), gradient[k].copy(), below, above, free)
-    return np.asarray(2 * np.sum(gradient * step, axis=1) - np.einsum("ni,nij,nj->n", step, information, step))
+        form = refitted.so_far + sum(refitted.each[conditions] for conditions in np.transpose(designs))
+        explained = form[:, size:, :size] @ solve_per_trial(form[:, :size, :size], form[:, :size, size:])
+        squares.append(np.einsum("naa->na", form[:, size:, size:] - explained))
+    return np.sqrt(np.maximum(np.stack(squares, axis=2), 0.0))
 
 
 def worth(between: Floats) -> Floats:

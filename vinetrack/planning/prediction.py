@@ -32,7 +32,6 @@ from vinetrack.planning.predictive_inputs import (
     FitNumbers,
     PredictiveInputs,
     StatedValues,
-    burst_pressure_Pa,
     hoop_stress_Pa,
     predictive_inputs,
 )
@@ -318,7 +317,7 @@ def _hazards(prediction: VinePrediction) -> Iterator[Remark]:
     inputs, trial = prediction.inputs, prediction.inputs.trial
     stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
     if stress > 0.9 * BURST_STRESS_PA:
-        highest_kPa = burst_pressure_Pa(trial.diameter_m, trial.thickness_m) / 1e3
+        highest_kPa = trial.pressure_Pa / 1e3 * BURST_STRESS_PA / stress
         facts = {"MPa": stress / 1e6, "burst_MPa": BURST_STRESS_PA / 1e6, "burst_kPa": highest_kPa}
         yield remark("bursts" if stress > BURST_STRESS_PA else "nearly_bursts", **facts)
     low, median, high = np.quantile(inputs.draw(2000, 1)[YIELD], BAND) / 1e3
@@ -390,7 +389,7 @@ class Room:
 
     def bearable_Pa(self, diameter_m: float, thickness_m: float) -> float:
         """Return the highest pressure that the wall allows, f · 2tσ/D, Pa."""
-        return self.burst_share * burst_pressure_Pa(diameter_m, thickness_m, self.burst_stress_Pa)
+        return self.burst_share * self.burst_stress_Pa / hoop_stress_Pa(1.0, diameter_m, thickness_m)
 
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
         """Return the trial with a vine of this size at the highest pressure allowed."""

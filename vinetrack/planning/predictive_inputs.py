@@ -98,11 +98,6 @@ def exponent_sigma() -> float:
     return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
-def burst_pressure_Pa(diameter_m: float, thickness_m: float, stress_Pa: float = BURST_STRESS_PA) -> float:
-    """The gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; by default a guess from one vine."""
-    return 2 * thickness_m * stress_Pa / diameter_m
-
-
 def hoop_stress_Pa(pressure_Pa: float, diameter_m: float, thickness_m: float) -> float:
     """The hoop stress PD/2t of the wall, Pa."""
     return pressure_Pa * diameter_m / (2 * thickness_m)
