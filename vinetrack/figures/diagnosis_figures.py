@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -439,27 +438,37 @@ def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list
 CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
-def _nothing() -> pd.DataFrame:
-    return empty_table(())
-
-
-@dataclass(frozen=True)
 class DiagnosisTables:
-    """Data of the figures; a table is empty if there is nothing to draw. `rounds` are (heading, ranking) pairs, `worst`
-    is the label of the condition that `before_after` shows, `added` the added effects in words.
+    """Data of the figures of a diagnosis; a table is empty if there is nothing to draw, all without one. `trials` are
+    the positions that `predicted_trials` returns, `tables` the files of the folder `diagnosis` by name. `rounds` are
+    (heading, ranking) pairs, `worst` is the label of the condition that `before_after` shows, `added` the added effects
+    in words.
     """
 
-    ladder: pd.DataFrame = field(default_factory=_nothing)
-    trials: pd.DataFrame = field(default_factory=_nothing)
-    before_after: pd.DataFrame = field(default_factory=_nothing)
-    where: pd.DataFrame = field(default_factory=_nothing)
-    cosines: pd.DataFrame = field(default_factory=_nothing)
-    drift: pd.DataFrame = field(default_factory=_nothing)
-    missing_force: pd.DataFrame = field(default_factory=_nothing)
-    learned_force: pd.DataFrame = field(default_factory=_nothing)
-    rounds: Sequence[tuple[str, pd.DataFrame]] = ()
-    worst: str = ""
-    added: str = ""
+    def __init__(
+        self, diagnosis: Diagnosis | None = None, conditions: pd.DataFrame | None = None,
+        trials: pd.DataFrame | None = None, tables: Mapping[str, pd.DataFrame] | None = None,
+    ) -> None:  # fmt: skip
+        found, none, rounds = tables or {}, empty_table(()), diagnosis.rounds if diagnosis else ()
+        described = st.rows(conditions) if conditions is not None else ()
+        labels = {str(row.condition): str(row.condition_label) for row in described}
+        self.trials = empty_table(CURVE_COLUMNS) if trials is None else trials
+        worst = worst_condition(self.trials)
+        self.worst = labels.get(worst, worst)
+        self.before_after = self.trials[self.trials["condition"] == worst] if worst else self.trials.iloc[:0]
+        self.where = _where_table(self.trials, labels, found.get("along_position.csv", none))
+        self.ladder = none if diagnosis is None or diagnosis.ladder is None else diagnosis.ladder
+        self.added = listed_names(diagnosis.effects if diagnosis else ())
+        self.drift = found.get("drift_groups.csv", none)
+        self.missing_force = found.get("missing_force.csv", none)
+        self.learned_force = found.get("learned_force.csv", none)
+        self.cosines = cosine_cells(rounds[0]) if rounds else none
+        self.rounds: list[tuple[str, pd.DataFrame]] = []
+        for i, ranked in enumerate(rounds):
+            more = [name for name in ranked.model if name not in rounds[0].model]
+            heading = f"Which is missing with {listed_names(more)} added?"
+            heading = heading if i else "Which effect is missing from the initial model?"
+            self.rounds.append((heading, ranking_table(ranked)))
 
     @property
     def ranking(self) -> pd.DataFrame:
@@ -476,32 +485,7 @@ def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> Diagnos
     if diagnosis is None or not diagnosis.verdict:
         return None
     tables = {path.name: read_result(path) for path in results.diagnosed("moved.csv").parent.glob("*.csv")}
-    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), tables)
-
-
-def assemble_tables(
-    diagnosis: Diagnosis, conditions: pd.DataFrame, trials: pd.DataFrame, tables: Mapping[str, pd.DataFrame]
-) -> DiagnosisTables:
-    """Assemble the data of the figures; `tables` are those of the folder `diagnosis` by file name."""
-    labels = {str(row.condition): str(row.condition_label) for row in st.rows(conditions)}
-    worst, rounds, none = worst_condition(trials), [], empty_table(())
-    for i, ranked in enumerate(diagnosis.rounds):
-        added = [name for name in ranked.model if name not in diagnosis.rounds[0].model]
-        heading = f"Which is missing with {listed_names(added)} added?"
-        rounds.append((heading if i else "Which effect is missing from the initial model?", ranking_table(ranked)))
-    return DiagnosisTables(
-        ladder=none if diagnosis.ladder is None else diagnosis.ladder,
-        trials=trials,
-        before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
-        where=_where_table(trials, labels, tables.get("along_position.csv", none)),
-        cosines=cosine_cells(diagnosis.rounds[0]),
-        drift=tables.get("drift_groups.csv", none),
-        missing_force=tables.get("missing_force.csv", none),
-        learned_force=tables.get("learned_force.csv", none),
-        rounds=rounds,
-        worst=labels.get(worst, worst),
-        added=listed_names(diagnosis.effects),
-    )
+    return DiagnosisTables(diagnosis, conditions, predicted_trials(results, conditions), tables)
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:

@@ -397,7 +397,7 @@ def _described(trials: Sequence[Trial]) -> pd.DataFrame:
 
 def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
     """The tables of a diagnosis as a results folder would hold them."""
-    from vinetrack.figures.diagnosis_figures import CURVE_COLUMNS, assemble_tables
+    from vinetrack.figures.diagnosis_figures import CURVE_COLUMNS, DiagnosisTables
     from vinetrack.pipeline.model_stage import diagnosis_tables, predictions
 
     curves = []
@@ -407,7 +407,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
         curves.append(pd.DataFrame({**of_trial, **positions}))
     trials = pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=list(CURVE_COLUMNS))
     conditions = _described([fitted.trial for fitted in shown.fits[0].trials] if shown.fits else [])
-    return assemble_tables(shown, conditions, trials, diagnosis_tables(shown))
+    return DiagnosisTables(shown, conditions, trials, diagnosis_tables(shown))
 
 
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
