@@ -67,13 +67,10 @@ class _TwoEnds(_Strict):
 
     @model_validator(mode="after")
     def _has_a_length(self) -> _TwoEnds:
-        via_px: tuple[Pixel, ...] = getattr(self, "via_px", None) or ()
-        through = (self.from_px, *via_px, self.to_px)
-        if not via_px and self.from_px == self.to_px:
-            raise CellError("from_px and to_px are the same point", "name two", code="too_close")
-        if via_px and any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
+        through = (self.from_px, *(getattr(self, "via_px", None) or ()), self.to_px)
+        if any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
             message = f"neighbouring points are less than {SMALLEST_POINT_SPACING_PX} pixels apart"
-            raise CellError(message, "leave out the second", code="too_close")
+            raise CellError(message, "name points farther apart", code="too_close")
         return self
 
 
