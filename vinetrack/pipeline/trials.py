@@ -10,6 +10,7 @@ import logging
 import traceback
 from dataclasses import replace
 from functools import lru_cache, partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,14 +62,13 @@ log = logging.getLogger(__name__)
 # One trial: its track, kinematics, contribution to the tables, and pictures.
 
 
-TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
-
-
 def analyse_trials(job: Job) -> list[str]:
     """Analyse all trials in use, or some, and write their files; empty ones of faulty rows. Returns what failed."""
     experiment, only = job.experiment, job.trials
     names = [name for name in experiment.names if name not in experiment.left_out and (only is None or name in only)]
     model_of(experiment)
+    for module in ("matplotlib.backends.backend_svg", "scipy.ndimage", "scipy.optimize", "cv2"):
+        import_module(module)  # once, before processes are forked
     work = partial(_analyse, experiment=experiment, results=Results(job.results), settings=job.settings)
     reasons = {}
     for count, (name, reason, fault) in enumerate(map_unordered(work, names, job.threads), 1):
@@ -100,7 +100,7 @@ def _analyse(name: str, experiment: Experiment, results: Results, settings: RunS
     except Exception as error:
         if is_disk_full(error):
             raise  # a full disk is not a fault of this trial
-        reason, fault = TRIAL_NOT_ANALYSED, traceback.format_exc()
+        reason, fault = f"could not be analysed: {INTERNAL_ERROR}", traceback.format_exc()
     row = _bare_row(name, "failed", reason, trial) if summary is None else dict(summary.row) | columns
     _write(results, name, summary, row, view)
     _draw(name, trial, measurement, reason, results, settings.figures, kept)
