@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from vinetrack.core.records import Bools, Floats, Indices, Kinematics, Track
+from vinetrack.core.threads import njit
 from vinetrack.tracks.position_noise import position_noise
 
 # ------------------------------------------------------------------------------
@@ -122,13 +123,19 @@ def correlated(weights: Floats, rho: float) -> Floats:
     """Multiply weights by the correlation of AR(1) noise, R_ij = ρ^|i − j|, along the last axis. w·(R·w) is the
     variance of Σ w_i e_i for noise e of variance 1. Shapes: weights (…, n) → (…, n).
     """
-    from scipy.signal import lfilter
-
     if rho == 0 or weights.size == 0:
         return weights
-    before = lfilter([1.0], [1.0, -rho], weights, axis=-1)
-    after = lfilter([1.0], [1.0, -rho], weights[..., ::-1], axis=-1)[..., ::-1]
-    return before + after - weights
+    before, after = np.array(weights, order="C"), np.array(weights[..., ::-1], order="C")
+    for sums in (before, after):
+        _add_up(sums.reshape(-1, sums.shape[-1]), rho)
+    return before + after[..., ::-1] - weights
+
+
+@njit(nogil=True)
+def _add_up(rows: Floats, factor: float) -> None:  # scipy.signal.lfilter, which loads scipy.stats in a second
+    for row in rows:
+        for k in range(1, row.size):
+            row[k] += factor * row[k - 1]
 
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)

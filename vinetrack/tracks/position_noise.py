@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -344,11 +345,9 @@ def _whitened_residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
 
 def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
     """Draw stationary first-order autoregressive noise, as simulated tracks have it. Shape (count,)."""
-    from scipy.signal import lfilter
-
     white = draw.standard_normal(count)
     white[1:] *= math.sqrt(1 - correlation**2)
-    return sd * np.asarray(lfilter([1.0], [1.0, -correlation], white))
+    return sd * np.fromiter(accumulate(white, lambda before, new: new + correlation * before), dtype=float)
 
 
 # ------------------------------------------------------------------------------
