@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -459,11 +460,19 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
 
 
 def run_lines(folder: Path) -> list[str]:
-    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last."""
+    """Summarise finished results in at most twelve lines: failed trials, report, first reasons, the verdict last. They
+    are kept, since reading a diagnosis takes most of a second.
+    """
+    results = Results(folder)
+    state = code_hash(), results.report, identity(results.trials), identity(results.diagnosis)
+    lines: list[str] = Kept(folder).made("lines", state, partial(_summary, results))
+    return lines
+
+
+def _summary(results: Results) -> list[str]:
     from vinetrack.narrative.diagnosis_text import table_lines
     from vinetrack.narrative.verdict_text import verdict_line
 
-    results = Results(folder)
     trials, diagnosis = read_result(results.trials), read_diagnosis(results)
     failed = trials[trials["status"] == "failed"]
     lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(3).itertuples()]
