@@ -19,7 +19,6 @@ from vinetrack.core.records import FLAGS, UNUSABLE_FLAGS, Floats, hand_corrected
 from vinetrack.figures import style as st
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
@@ -40,29 +39,15 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     tall_in = min(max(picture.shape[0] / picture.shape[1] for _, picture in pictures), 2.2) * wide_in
     scaled = np.isfinite(m_per_px)
     below_in = tall_in + (1.35 if scaled else 0.8)
-    fig, sheet = st.new_sheet(7.2, below_in + 2.95)
-    panel = _draw_kymograph(sheet, tracking, below_in)
-    if scaled:
-        panel.scale("bottom", "along the growth axis (mm)", 1e3 * m_per_px, grid=False, off_in=0.54)
-    panel.write(panel.x[1], panel.y[1], title, (0, 6), ha="right", fontsize=10, color=st.MUTED)
-    for i, (frame, picture) in enumerate(pictures):
-        height, width = picture.shape
-        px_in = min(wide_in / width, tall_in / height)
-        size_in = width * px_in, height * px_in
-        corner_in = 0.04 + 7.2 * i / len(pictures) + (wide_in - size_in[0]) / 2, 0.05 + (tall_in - size_in[1]) / 2
-        shown = st.Panel(sheet, (*corner_in, *size_in), (-0.5, width - 0.5), (height - 0.5, -0.5))
-        _draw_frame(shown, tracking, frame, picture)
-    return fig
-
-
-def _draw_kymograph(sheet: Axes, tracking: Tracking, below_in: float) -> st.Panel:
+    fig, sheet = st.new_sheet(7.2, below_in + 3.1)
     track, strip = tracking.track, tracking.kymograph
     timed = np.isfinite(track.time_s).all()
     time_ms = 1e3 * track.time_s if timed else np.arange(float(track.time_s.size))  # frames, where they have no time
     half_ms = 0.5 * float(np.median(np.diff(time_ms)))
     shown_ms = time_ms[tracking.strip_rows]
     ends_ms = float(shown_ms[-1]) + half_ms, float(shown_ms[0]) - half_ms
-    panel = st.Panel(sheet, (0.75, below_in, 6.38, 2.6), (-0.5, strip.shape[1] - 0.5), ends_ms)
+    box = (0.75, below_in, 6.38, 2.6)
+    panel = st.Panel(sheet, box, (-0.5, strip.shape[1] - 0.5), ends_ms)
     small = _shrunk(strip, 480, 480)
     dark, light = np.nanpercentile(small, [1, 99])
     panel.picture(small, vmin=dark, vmax=light)
@@ -75,10 +60,24 @@ def _draw_kymograph(sheet: Axes, tracking: Tracking, below_in: float) -> st.Pane
     panel.plot(before[by_hand], time_ms[by_hand], "+", color=st.SKY, ms=5, mew=1.0)
     label = f"corrected by hand, N = {by_hand.sum()}"
     panel.plot(edge[by_hand], time_ms[by_hand], "o", color=st.GREEN, ms=4, fillstyle="none", label=label)
+    if track.pressure_Pa is not None:
+        most_kPa = float(np.max(track.pressure_Pa / 1e3))
+        over, label = st.Panel(sheet, box, (0.0, 1.08 * most_kPa), ends_ms), f"pressure, up to {most_kPa:.3g} kPa"
+        over.plot(track.pressure_Pa / 1e3, time_ms, color=st.VERMILLION, lw=1.2, label=label)
     panel.scale("left", "time (ms)" if timed else "frame", grid=False)
     panel.scale("bottom", "along the growth axis (px)", grid=False)
     st.legend_above(sheet, 2, bbox_to_anchor=(0.75, below_in + 2.63), bbox_transform=sheet.transData)
-    return panel
+    if scaled:
+        panel.scale("bottom", "along the growth axis (mm)", 1e3 * m_per_px, grid=False, off_in=0.54)
+    panel.write(panel.x[1], panel.y[1], title, (0, 6), ha="right", fontsize=10, color=st.MUTED)
+    for i, (frame, picture) in enumerate(pictures):
+        height, width = picture.shape
+        px_in = min(wide_in / width, tall_in / height)
+        size_in = width * px_in, height * px_in
+        corner_in = 0.04 + 7.2 * i / len(pictures) + (wide_in - size_in[0]) / 2, 0.05 + (tall_in - size_in[1]) / 2
+        shown = st.Panel(sheet, (*corner_in, *size_in), (-0.5, width - 0.5), (height - 0.5, -0.5))
+        _draw_frame(shown, tracking, frame, picture)
+    return fig
 
 
 def _shrunk(picture: np.ndarray, height: float, width: float) -> np.ndarray:

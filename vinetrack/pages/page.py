@@ -22,7 +22,7 @@ from vinetrack.core.tables import TableError
 from vinetrack.core.terminal import waiting
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.folder import save_model
-from vinetrack.figures.style import TOKENS, follows_screen, page_frame
+from vinetrack.figures.style import follows_screen, page_frame
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number, number_row, numbers_text
 from vinetrack.inference.optimiser import Step, Watch
@@ -202,7 +202,7 @@ class Page:
         for root in (*texts, *figures, *panels, actions, Column(save, self.saved, name="keep")):
             self.document.add_root(root)
         style, script = ((TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "screen.js"))
-        shown = {"plots": figures, "film": self.film.figure, "tokens": TOKENS}
+        shown = {"plots": figures, "film": self.film.figure}
         self.document.js_on_event("document_ready", CustomJS(args=shown, code=script))
         self.document.title = f"{campaign.folder.name} – vinetrack explorer"
         self.document.theme = theme()

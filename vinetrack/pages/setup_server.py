@@ -13,23 +13,23 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from tornado.ioloop import IOLoop
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError
-from vinetrack.core.records import Correction, Trial
+from vinetrack.core.records import Correction
 from vinetrack.core.tables import parse_yaml, read_table, read_text, safe_join, with_value
 from vinetrack.core.units import UNITS, or_nan, other_units, split_unit
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, check_experiment, read_corrections
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import in_sheet_units, read_experiment_settings
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET, make_trial, read_row
-from vinetrack.figures.style import page_frame
+from vinetrack.figures.overlay import draw_strip
+from vinetrack.figures.style import TOKENS, page_frame, page_tokens, render
 from vinetrack.pages.draft_files import (
     Draft,
     cells_of,
@@ -50,7 +50,7 @@ from vinetrack.pages.draft_files import (
 from vinetrack.pages.local_page import TEMPLATES, THREAD_PREFIX, PageServer, jpeg
 from vinetrack.pipeline.stages import identity
 from vinetrack.pipeline.workflow import check_folder
-from vinetrack.tracks.importers import TrackError, read_pressure_trace
+from vinetrack.tracks.importers import TrackError, attach_pressure, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import find_board
 from vinetrack.video.curved_axis import axis_entry, axis_through
@@ -58,10 +58,11 @@ from vinetrack.video.frames import RecordingError, inspect_recording, iterate_fr
 from vinetrack.video.survey import Keep, measure_recording, proposed_axis, size_problems, tracked_facts
 from vinetrack.video.track import Tracking
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 # ------------------------------------------------------------------------------
 # Views of a recording for the page: frames as JPEG, the proposed axis, and the result of tracking.
-
-STRIP_PX = 1600  # Longest side of a strip; chosen: twice the page's width on a common screen
 
 
 def decoded_clip(path: Path, _changed_ns: int) -> tuple[tuple[bytes, ...], dict[str, Any]]:
@@ -132,9 +133,22 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
     measurement = measure_recording(trial, settings, folder, keep)
     tracking, mm_per_px = measurement.tracking, 1e3 * measurement.m_per_px if scaled else math.nan
     facts = tracked_facts(trial, measurement)
+    notes = [problem.reason for problem in size_problems(trial, facts) if scaled]
     track = tracking.track
+    if timed and trial.pressure_trace is not None:
+        try:
+            track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+        except (TrackError, OSError) as error:
+            notes.append(f"pressure_trace {error}")
+    # Without a rate the figure counts frames.
+    drawn = track if timed else replace(track, time_s=np.full_like(track.time_s, np.nan))
+    fig = draw_strip(trial.name, replace(tracking, track=drawn), mm_per_px / 1e3)
+    _, _, bottom_in, top_in = fig.axes[0].images[0].get_extent()
     return {
-        "strip": _strip_url(tracking),
+        "strip": _strip_url(fig),
+        # Where in the figure its frames are, from above, as shares of its height
+        "frames_at": [1 - top_in / fig.get_figheight(), 1 - bottom_in / fig.get_figheight()],
+        "frames": [int(tracking.strip_rows[0]), int(tracking.strip_rows[-1])],
         "length_px": round(tracking.axis.length_px, 2),
         "axis": axis_json(tracking.axis),
         "time_s": _numbers(track.time_s, 6),
@@ -142,39 +156,21 @@ def track_row(folder: Path, index: int, keep: Keep) -> dict[str, Any]:
         "position_mm": _numbers(1e3 * track.lead_position_m, 3),
         "flag": [str(flag) for flag in track.flag],
         "shake_px": _numbers(tracking.shake_px, 2),
-        "mm_per_px": _rounded(mm_per_px, 6),
         "growth_mm": _rounded(facts.growth_mm, 2),
         "tube_width_mm": _rounded(mm_per_px * tracking.tube_width_px, 2),
         "timed": timed,
         "scaled": scaled,
-        "notes": [*(problem.reason for problem in size_problems(trial, facts) if scaled), *track.notes],
-        "pressure": _pressure_json(trial),
+        "notes": [*notes, *track.notes],
     }
 
 
-def _strip_url(tracking: Tracking) -> str:
-    strip = tracking.kymograph
-    dark, light = np.nanpercentile(strip, [1, 99])
-    # Grey level of the strip where no frame was decoded (chosen)
-    grey = np.full((len(tracking.track.time_s), strip.shape[1]), 128, np.uint8)
-    grey[tracking.strip_rows] = (255 * (strip - dark) / max(float(light - dark), 1.0)).clip(0, 255).astype(np.uint8)
-    # Time to the right, growth upwards.
-    turned = np.ascontiguousarray(np.flipud(grey.T))
-    size = (min(turned.shape[1], STRIP_PX), min(turned.shape[0], STRIP_PX))
-    small = cv2.resize(turned, size, interpolation=cv2.INTER_AREA)
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg(small)).decode()
-
-
-def _pressure_json(trial: Trial) -> dict[str, Any] | None:
-    """The pressure trace of a trial, or the reason why it cannot be read; None if there is none."""
-    if trial.pressure_trace is None:
-        return None
-    try:
-        time_s, pressure_Pa = read_pressure_trace(trial.pressure_trace)
-    except (TrackError, OSError) as error:
-        return {"words": str(error)}
-    every = max(1, len(time_s) // STRIP_PX)
-    return {"time_s": _numbers(time_s[::every], 6), "pressure_kPa": _numbers(pressure_Pa[::every] / 1e3, 4)}
+def _strip_url(fig: Figure) -> str:
+    """A figure with a recording in it, in the colours of the screen: a filter as elsewhere would turn its greys too."""
+    svg = render(fig, ["svg"])["svg"].decode()
+    for colour, token in TOKENS.items():
+        svg = svg.replace(colour, f"var({token})")
+    svg = svg.replace("<defs>", f"<style>{page_tokens()}</style><defs>", 1)
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
 def _numbers(values: NDArray[Any], digits: int) -> list[float | None]:

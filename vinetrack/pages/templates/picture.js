@@ -1,11 +1,13 @@
 // The picture: frames of the chosen recording, the growth axis dragged on it, and its scale.
 import {$, ask, changed, decimals, el, listed, numberOf, round, state, url} from "./state.js";
 
-const view = {source: "", frame: 0, tool: "axis", image: null, width: 1, height: 1, board: "", words: "", edge: null};
+const view = {source: "", frame: 0, image: null, width: 1, height: 1, edge: null};
 const LENS = 7; // Screen pixels per pixel of the picture.
-const MM = {mm: 1, cm: 10, in: 25.4};
-let lengthUnit = "mm";
 let askedFor = "";
+
+// What is placed in the picture, and where the scale comes from.
+const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
+const placingMarks = () => chosen("tool") === "scale" && chosen("scale") === "two_points";
 
 export const row = () => state.sheet.rows[state.chosen];
 export const shownFrame = () => view.frame;
@@ -15,10 +17,9 @@ export async function showRecording() {
   askedFor = recording;
   state.clip = null;
   view.source = "";
-  view.words = "";
+  $("frame").disabled = true;
   Object.assign(curve, {key: "", path_px: null, drawn: curve.asked});
   drawSources();
-  $("three").replaceChildren();
   $("stage").replaceChildren(el("p", {class: "busy tool"}, recording ? `Decoding ${recording} …` : "No recording in this row."));
   if (!recording) return;
   try {
@@ -65,18 +66,10 @@ export function drawPicture() {
   const over = el("svg", {id: "over", preserveAspectRatio: "none"});
   $("stage").replaceChildren(image, over);
   over.addEventListener("pointerdown", place);
-  over.addEventListener("pointermove", (event) => { if (view.tool === "scale" && scaleKind() === "two_points") lens(event); });
+  over.addEventListener("pointermove", (event) => { if (placingMarks()) lens(event); });
   over.addEventListener("pointerleave", () => document.querySelector(".lens")?.remove());
   $("frame").disabled = Boolean(view.source);
   showNumber();
-  $("frame").oninput = (event) => showFrame(Number(event.target.value));
-  for (const radio of document.querySelectorAll("input[name=tool]")) {
-    radio.onchange = () => { view.tool = radio.value; $("axis-tool").hidden = view.tool !== "axis"; $("scale-tool").hidden = view.tool !== "scale"; drawOver(); drawTools(); };
-  }
-  const frames = [0, Math.floor((state.clip.frames - 1) / 2), state.clip.frames - 1];
-  $("three").replaceChildren(...frames.map((frame, i) => el("button", {type: "button", "data-frame": frame, onclick: () => showFrame(frame)},
-    el("img", {src: url("api/frame", {recording: row().video, frame}), alt: ""}), el("svg", {viewBox: `0 0 ${state.clip.width} ${state.clip.height}`, preserveAspectRatio: "none"}),
-    el("span", {}, `${["First", "Middle", "Last"][i]} frame, ${frame}`))));
   drawTools();
 }
 
@@ -97,32 +90,30 @@ export function currentAxis() {
   return state.clip?.axis ? {...state.clip.axis, given: ""} : null;
 }
 
-function redraw() {
-  drawOver();
-  drawTools();
-}
-
 const rounded = (point) => point.map((v) => round(v));
 
 function setAxis(axis, scope) {
-  const ends = {from_px: rounded(axis.from_px), to_px: rounded(axis.to_px)};
-  if (axis.via_px?.length) ends.via_px = axis.via_px.map(rounded);
+  const points = pointsOf(axis).map(rounded), via_px = points.slice(1, -1), {width_mm} = state.axis ?? {};
   if (scope === "trial") {
-    const width = axis.width ? `:${axis.width}` : "";
-    row().axis = `${[ends.from_px, ...(ends.via_px ?? []), ends.to_px].map((point) => point.join(",")).join(":")}${width}`;
+    row().axis = (axis.width ? [...points, axis.width] : points).join(":");
     if (!state.sheet.columns.includes("axis")) state.sheet.columns.push("axis");
   } else {
-    state.axis = {...(state.axis?.width_mm ? {width_mm: state.axis.width_mm} : {}), ...ends};
+    state.axis = {...(width_mm && {width_mm}), from_px: points[0], to_px: points.at(-1), ...(via_px.length && {via_px})};
     if (row().axis) row().axis = "";
   }
   changed();
   redraw();
 }
 
+function redraw() {
+  drawOver();
+  drawTools();
+}
+
 // Change points of the axis, in the scope that it has or that is chosen.
 function changeAxis(points) {
   const now = currentAxis();
-  setAxis({...now, ...points}, now.given || ($("axis-scope")?.value ?? "all"));
+  setAxis({...now, ...points}, now.given || $("axis-scope").value);
 }
 
 const pointsOf = (axis) => [axis.from_px, ...(axis.via_px ?? []), axis.to_px];
@@ -142,16 +133,12 @@ export function placesOf(axis) {
   return curve.path_px ?? pointsOf(axis);
 }
 
+// In the middle of the longest segment.
 function addBend() {
-  const now = currentAxis(), points = pointsOf(now), path = placesOf(now);
-  const apart = ([x0, y0], [x1, y1]) => Math.hypot(x1 - x0, y1 - y0);
-  const lengths = points.slice(1).map((point, i) => apart(points[i], point));
+  const now = currentAxis(), points = pointsOf(now);
+  const lengths = points.slice(1).map(([x, y], i) => Math.hypot(x - points[i][0], y - points[i][1]));
   const i = lengths.indexOf(Math.max(...lengths));
-  // In the middle of the longest segment: on the curve, if there is one.
-  const nearest = (point) => path.reduce((best, one, k) => (apart(one, point) < apart(path[best], point) ? k : best), 0);
-  const middle = points[i].map((v, k) => (v + points[i + 1][k]) / 2);
-  const bend = path.length > 2 ? path[Math.round((nearest(points[i]) + nearest(points[i + 1])) / 2)] : middle;
-  changeAxis({via_px: (now.via_px ?? []).toSpliced(i, 0, bend)});
+  changeAxis({via_px: (now.via_px ?? []).toSpliced(i, 0, points[i].map((v, k) => (v + points[i + 1][k]) / 2))});
   focusOn(bendWords(i));
 }
 
@@ -179,18 +166,11 @@ export function drawOver() {
   // Keep the focus when redrawing: a frame may arrive while its edge is moved with the keyboard.
   const held = over.contains(document.activeElement) ? document.activeElement.dataset.handle : "";
   over.setAttribute("viewBox", `0 0 ${view.width} ${view.height}`);
-  $("stage").classList.toggle("scale", view.tool === "scale");
   over.replaceChildren();
   const unit = view.width / Math.max($("stage").clientWidth, 1);
   const axis = currentAxis();
-  if (axis && !view.source) drawAxis(over, axis, unit, view.tool === "axis");
-  for (const button of $("three").children) {
-    button.setAttribute("aria-pressed", Number(button.dataset.frame) === view.frame && !view.source);
-    const small = button.querySelector("svg");
-    small.replaceChildren();
-    if (axis) drawAxis(small, axis, state.clip.width / Math.max(button.clientWidth, 1), false);
-  }
-  if (view.tool === "scale" && scaleKind() === "two_points") drawMarks(over, unit);
+  if (axis && !view.source) drawAxis(over, axis, unit);
+  if (placingMarks()) drawMarks(over, unit);
   if (view.edge && !view.source) {
     const {line, middle, put} = view.edge;
     over.append(el("line", {...line, class: "edge-line", "stroke-width": 2 * unit}), knob(8 * unit, unit, true, "Leading edge in this frame", middle, put));
@@ -198,7 +178,7 @@ export function drawOver() {
   if (held) focusOn(held);
 }
 
-function drawAxis(over, axis, unit, handles) {
+function drawAxis(over, axis, unit) {
   const kind = axis.given ? "axis-line given" : "axis-line proposed";
   const places = placesOf(axis);
   const [[x0, y0], [x1, y1]] = places.slice(-2);
@@ -211,7 +191,7 @@ function drawAxis(over, axis, unit, handles) {
   over.append(line(kind, 0, 0, 2));
   const tip = 11 * unit;
   over.append(el("path", {class: kind, "stroke-width": 2 * unit, d: `M${x1 - tip * (ux + 0.5 * uy)} ${y1 - tip * (uy - 0.5 * ux)} L${x1} ${y1} L${x1 - tip * (ux - 0.5 * uy)} ${y1 - tip * (uy + 0.5 * ux)}`}));
-  if (!handles) return;
+  if (chosen("tool") !== "axis") return;
   for (const [end, words] of Object.entries(AXIS_ENDS)) {
     over.append(knob(8 * unit, unit, axis.given, words, () => currentAxis()[end], (point) => changeAxis({[end]: point})));
   }
@@ -279,26 +259,24 @@ function lens(event) {
 
 // ---- the scale ---------------------------------------------------------------------------------------------------
 
-const marks = {from_px: null, to_px: null, length: "", square: "", marker: "", own: ""};
-let kind = null;
+const marks = {from_px: null, to_px: null};
+let board = null;
 
 export function readCalibration() {
-  const given = state.calibration;
-  kind = given?.kind ?? "two_points";
-  if (given?.kind === "two_points") Object.assign(marks, {from_px: given.from_px, to_px: given.to_px, length: String(given.length_mm)});
-  if (given?.kind === "mm_per_px") marks.own = String(given.mm_per_px);
-  if (given?.squares) Object.assign(marks, {square: String(given.square_mm), marker: String(given.marker_mm ?? ""), board: given});
+  const given = state.calibration ?? {kind: "two_points"};
+  const kind = given.squares ? "board" : given.kind;
+  document.querySelector(`input[name=scale][value=${kind}]`).checked = true;
+  if (given.from_px) Object.assign(marks, {from_px: given.from_px, to_px: given.to_px});
+  if (given.squares) board = given;
+  for (const [id, key] of [["length", "length_mm"], ["own-scale", "mm_per_px"], ["square", "square_mm"], ["marker", "marker_mm"]]) $(id).value = given[key] ?? "";
 }
 
-const scaleKind = () => (kind === "checkerboard" || kind === "charuco" ? "board" : kind);
-
 function place(event) {
-  if (view.tool !== "scale" || scaleKind() !== "two_points") return;
   const end = Object.keys(MARKS).find((key) => !marks[key]);
-  if (!end) return;
+  if (!placingMarks() || !end) return;
   setMark(end, at(event));
   // Pressing moves the focus to the pressed element.
-  if (marks.to_px) addEventListener("pointerup", () => setTimeout(() => $("length")?.focus()), {once: true});
+  if (marks.to_px) addEventListener("pointerup", () => setTimeout(() => $("length").focus()), {once: true});
 }
 
 const MARKS = {from_px: "First ruler mark", to_px: "Second ruler mark"};
@@ -306,7 +284,6 @@ const MARKS = {from_px: "First ruler mark", to_px: "Second ruler mark"};
 function setMark(end, point) {
   marks[end] = rounded(point);
   writeScale();
-  redraw();
 }
 
 function drawMarks(over, unit) {
@@ -322,120 +299,86 @@ function drawMarks(over, unit) {
 }
 
 function writeScale() {
-  const length = numberOf(marks.length) * MM[lengthUnit];
-  if (kind === "two_points") state.calibration = marks.from_px && marks.to_px && length > 0 ? {kind, from_px: marks.from_px, to_px: marks.to_px, length_mm: round(length, 4)} : null;
-  if (kind === "mm_per_px") state.calibration = numberOf(marks.own) > 0 ? {kind, mm_per_px: numberOf(marks.own)} : null;
-  if (scaleKind() === "board") {
-    const {board} = marks;
-    const [square, marker] = [numberOf(marks.square), numberOf(marks.marker)];
-    const whole = board && square > 0 && (board.kind === "checkerboard" || marker > 0);
-    const markers = board?.kind === "charuco" ? {marker_mm: marker, dictionary: board.dictionary} : {};
-    state.calibration = whole ? {kind: board.kind, image: board.image, squares: board.squares, square_mm: square, ...markers} : null;
-  }
+  const amount = (id) => numberOf($(id).value);
+  const [length_mm, mm_per_px, square_mm, marker_mm] = [round(amount("length") * $("length-unit").value, 4), amount("own-scale"), amount("square"), amount("marker")];
+  const {marker_share, ...printed} = board ?? {};
+  state.calibration = {
+    two_points: () => (marks.from_px && marks.to_px && length_mm > 0 ? {kind: "two_points", ...marks, length_mm} : null),
+    mm_per_px: () => (mm_per_px > 0 ? {kind: "mm_per_px", mm_per_px} : null),
+    board: () => (board && square_mm > 0 && (!board.dictionary || marker_mm > 0) ? {...printed, square_mm, ...(board.dictionary ? {marker_mm} : {})} : null),
+  }[chosen("scale")]();
   changed();
-}
-
-function mmPerPx() {
-  const given = state.calibration;
-  if (given?.kind === "mm_per_px") return given.mm_per_px;
-  if (given?.kind !== "two_points") return null;
-  return given.length_mm / Math.hypot(given.to_px[0] - given.from_px[0], given.to_px[1] - given.from_px[1]);
+  redraw();
 }
 
 async function findBoard() {
   const picture = view.source || row().video;
-  view.words = "busy";
-  drawTools();
+  $("board").replaceChildren(el("span", {class: "busy"}, "looking …"));
   try {
-    const board = await ask(url("api/board", {picture}));
-    view.words = board ? "" : `No printed board found in ${picture}: it must be fully visible, in focus and not mirrored.`;
-    if (board) { marks.board = board; kind = board.kind; if (numberOf(marks.square)) marks.marker = suggested(); writeScale(); }
+    const found = await ask(url("api/board", {picture}));
+    board = found ?? board;
+    suggestMarker();
+    writeScale();
+    if (!found) $("board").textContent = `No printed board found in ${picture}: it must be fully visible, in focus and not mirrored.`;
   } catch (error) {
-    view.words = error.message;
+    $("board").textContent = error.message;
   }
-  drawTools();
 }
 
-const suggested = () => (marks.board?.marker_share ? String(round(numberOf(marks.square) * marks.board.marker_share, 1)) : "");
-
-// ---- words and fields below the picture --------------------------------------------------------------------------
-
-function said(field) {
-  const found = state.problems.filter((problem) => problem.field === field || (problem.field === "cell" && problem.column === field && problem.trial === row()?.trial));
-  return el("ul", {class: "problems"}, ...listed(found));
+function suggestMarker() {
+  const side = numberOf($("square").value);
+  if (side && board?.marker_share) $("marker").value = round(side * board.marker_share, 1);
 }
 
-function field(id, label, value, write, more = {}) {
-  return el("label", {}, `${label} `, el("input", {id, type: "text", value, inputmode: "decimal", autocomplete: "off", ...more, oninput: (event) => { write(event.target.value); writeScale(); facts(); }}));
+// ---- words below the picture -------------------------------------------------------------------------------------
+
+function show(shown) {
+  for (const [id, wanted] of Object.entries(shown)) $(id).hidden = !wanted;
 }
 
 export function drawTools() {
   if (!state.clip) return;
-  drawAxisTool();
-  drawScaleTool();
-}
-
-// Keep the fields: the user may be typing in one.
-export function drawProblems() {
-  for (const [tool, name] of [["axis-tool", "axis"], ["scale-tool", "calibration"]]) $(tool).querySelector(".problems")?.replaceWith(said(name));
-}
-
-function drawAxisTool() {
-  const axis = currentAxis();
-  const words = {
-    "": axis ? "Found from the motion of this recording. Nothing is written: the axis of each recording is found separately. Drag an end if it is wrong." : `No axis found: ${state.clip.no_axis}.`,
+  const axis = currentAxis(), {clip} = state;
+  const from = {
+    "": axis ? "Found from the motion of this recording. Nothing is written: the axis of each recording is found separately. Drag an end if it is wrong." : `No axis found: ${clip.no_axis}.`,
     all: "Given for all trials, in experiment.yaml.", trial: `Given for ${row().trial} alone, in its row.`,
-  }[axis?.given ?? ""];
-  const ends = axis ? [axis.from_px, axis.to_px].map((end) => rounded(end).join(", ")).join(" to ") : "";
-  const scope = el("select", {id: "axis-scope", onchange: (event) => { if (axis?.given) setAxis(axis, event.target.value); }},
-    el("option", {value: "all", selected: axis?.given !== "trial"}, "all trials"), el("option", {value: "trial", selected: axis?.given === "trial"}, "this trial alone"));
-  const {width, height} = state.clip;
-  const place = () => setAxis({from_px: [0.1 * width, height / 2], to_px: [0.9 * width, height / 2]}, "all");
+  };
+  $("axis-from").textContent = from[axis?.given ?? ""];
+  $("axis-ends").textContent = axis ? `${[axis.from_px, axis.to_px].map((end) => rounded(end).join(", ")).join(" to ")} px` : "";
+  if (axis?.given) $("axis-scope").value = axis.given;
   const moved = Object.values(state.corrections).flat().filter((one) => one.action === "move").length;
-  const warning = moved ? el("p", {class: "hint", id: "moved-points", role: "note"}, `${moved === 1 ? "A moved point refers" : `${moved} moved points refer`} to the former axis: after a change of the axis, move them again.`) : null;
-  $("axis-tool").replaceChildren(...[said("axis"), el("p", {class: "hint"}, words), warning].filter(Boolean), el("div", {class: "row"},
-    axis ? el("span", {class: "fact"}, el("b", {}, ends), " px") : el("button", {type: "button", onclick: place}, "Draw one"),
-    axis ? el("button", {type: "button", class: "plain", id: "add-bend", onclick: addBend, title: "Adds a point in the middle of the longest segment; drag it to where the vine bends. Delete removes a point."}, "Add a bend") : null,
-    axis?.via_px?.length ? el("button", {type: "button", class: "plain", id: "straighten", onclick: () => changeAxis({via_px: []})}, "Make it straight") : null,
-    el("label", {}, "A dragged axis applies to ", scope), axis?.given ? el("button", {type: "button", class: "plain", onclick: clearAxis}, "Use the axis found from the motion") : null));
+  $("moved-points").textContent = moved ? `${moved === 1 ? "A moved point refers" : `${moved} moved points refer`} to the former axis: after a change of the axis, move them again.` : "";
+  show({"draw-axis": !axis, "add-bend": axis, straighten: axis?.via_px?.length, "clear-axis": axis?.given, again: marks.from_px, "board-sizes": board, "marker-size": board?.dictionary});
+  $("marks-step").textContent = !marks.from_px ? "Click the first mark of a ruler that lies in the plane of growth." : !marks.to_px ? "Click the second mark, as far away as the ruler allows." : "Drag a mark, or move it with the arrow keys.";
+  if (board) $("board").textContent = `${board.dictionary ? "ChArUco board" : "Checkerboard"}, ${board.squares.join(" × ")} squares${board.dictionary ? ` of ${board.dictionary}` : ""} in ${board.image}`;
+  const apart = marks.to_px ? Math.hypot(marks.to_px[0] - marks.from_px[0], marks.to_px[1] - marks.from_px[1]) : null;
+  const {mm_per_px, length_mm} = state.calibration ?? {}, scale = length_mm ? length_mm / apart : mm_per_px, words = [];
+  if (placingMarks() && apart) words.push(`${decimals(apart, 4)} px apart`);
+  if (scale) words.push(`${decimals(scale, 4)} mm a pixel`, `the picture is ${decimals(scale * clip.width, 3)} mm wide`);
+  if (view.source && (view.width !== clip.width || view.height !== clip.height)) {
+    words.push(`this picture is ${view.width} × ${view.height} px, the recording ${clip.width} × ${clip.height}: take it with the camera's settings of the trials`);
+  }
+  $("scale-facts").textContent = words.join("; ");
+  drawProblems();
 }
 
-function facts() {
-  const scale = mmPerPx();
-  const apart = marks.from_px && marks.to_px ? Math.hypot(marks.to_px[0] - marks.from_px[0], marks.to_px[1] - marks.from_px[1]) : null;
-  const words = [];
-  if (kind === "two_points" && apart) words.push(`${decimals(apart, 4)} px apart`);
-  if (scale) words.push(`${decimals(scale, 4)} mm a pixel`, `the picture is ${decimals(scale * state.clip.width, 3)} mm wide`);
-  if (view.source && (view.width !== state.clip.width || view.height !== state.clip.height)) {
-    words.push(`this picture is ${view.width} × ${view.height} px, the recording ${state.clip.width} × ${state.clip.height}: take it with the camera's settings of the trials`);
+export function drawProblems() {
+  for (const [tool, field] of [["axis-tool", "axis"], ["scale-tool", "calibration"]]) {
+    const found = state.problems.filter((problem) => problem.field === field || (problem.field === "cell" && problem.column === field && problem.trial === row()?.trial));
+    $(tool).querySelector(".problems").replaceChildren(...listed(found));
   }
-  const place = $("scale-facts");
-  if (place) place.textContent = words.join("; ");
 }
 
-function drawScaleTool() {
-  const kinds = [["two_points", "Two marks on a ruler"], ["board", "A printed board"], ["mm_per_px", "The scale itself"]];
-  const choose = (value) => { kind = value === "board" ? marks.board?.kind ?? "charuco" : value; writeScale(); redraw(); };
-  const segments = el("div", {class: "segments", role: "radiogroup", "aria-label": "Where the scale comes from"}, ...kinds.map(([value, words]) =>
-    el("label", {}, el("input", {type: "radio", name: "scale", id: `scale-${value}`, value, checked: scaleKind() === value, onchange: () => choose(value)}), words)));
-  const parts = [];
-  if (kind === "two_points") {
-    const step = !marks.from_px ? "Click the first mark of a ruler that lies in the plane of growth." : !marks.to_px ? "Click the second mark, as far away as the ruler allows." : "Drag a mark, or move it with the arrow keys.";
-    parts.push(el("p", {class: "hint"}, step), el("div", {class: "row"},
-      field("length", "Length between them", marks.length, (value) => { marks.length = value; }),
-      el("select", {id: "length-unit", "aria-label": "Unit of the length", onchange: (event) => { lengthUnit = event.target.value; writeScale(); facts(); }}, ...Object.keys(MM).map((unit) => el("option", {value: unit, selected: unit === lengthUnit}, unit))),
-      marks.from_px ? el("button", {type: "button", class: "plain", onclick: () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); redraw(); }}, "Click both again") : null));
-  } else if (kind === "mm_per_px") {
-    parts.push(el("div", {class: "row"}, field("own-scale", "Millimetres per pixel", marks.own, (value) => { marks.own = value; })));
-  } else {
-    const {board} = marks;
-    parts.push(el("div", {class: "row"}, el("button", {type: "button", id: "find-board", onclick: findBoard}, "Look for a board here"),
-      view.words === "busy" ? el("span", {class: "busy"}, "looking …") : board ? el("span", {class: "fact"}, el("b", {}, `${board.kind === "charuco" ? "ChArUco board" : "Checkerboard"}, ${board.squares.join(" × ")} squares`), board.dictionary ? ` of ${board.dictionary}` : "", ` in ${board.image}`) : el("span", {class: "muted"}, view.words || "Choose its picture above, or a recording that shows it in its first frame.")));
-    if (board) {
-      parts.push(el("div", {class: "row"}, field("square", "Side of a square, mm", marks.square, (value) => { marks.square = value; if (board.marker_share) { marks.marker = suggested(); if ($("marker")) $("marker").value = marks.marker; } }),
-        board.kind === "charuco" ? field("marker", "of a marker, mm", marks.marker, (value) => { marks.marker = value; }) : null, el("span", {class: "muted"}, "measured on the print")));
-    }
-  }
-  $("scale-tool").replaceChildren(said("calibration"), el("div", {class: "row"}, segments), ...parts, el("p", {class: "fact muted", id: "scale-facts"}));
-  facts();
+function drawAcross() {
+  const {width, height} = state.clip;
+  setAxis({from_px: [0.1 * width, height / 2], to_px: [0.9 * width, height / 2]}, $("axis-scope").value);
 }
+
+$("frame").oninput = (event) => showFrame(Number(event.target.value));
+$("tools").oninput = redraw;
+$("axis-scope").onchange = (event) => { if (currentAxis()?.given) setAxis(currentAxis(), event.target.value); };
+$("square").oninput = suggestMarker; // before the scale is written
+$("scale-tool").oninput = writeScale;
+const again = () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); };
+const clicks = {"draw-axis": drawAcross, "add-bend": addBend, straighten: () => changeAxis({via_px: []}), "clear-axis": clearAxis, again, "find-board": findBoard};
+for (const [id, act] of Object.entries(clicks)) $(id).onclick = act;

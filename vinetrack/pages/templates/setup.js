@@ -84,12 +84,15 @@ async function begin() {
   $("name").textContent = state.name;
   document.title = `${state.name} – vinetrack set-up`;
   readCalibration();
-  drawTable(choose);
+  drawTable();
   listeners.push(() => check());
   await Promise.all([check(), showRecording()]);
   document.body.dataset.ready = "yes";
 }
 
+for (const kind of ["click", "focusin"]) {
+  $("trials").addEventListener(kind, ({target}) => { const line = target.closest("tr[data-row]"); if (line) choose(Number(line.dataset.row)); });
+}
 $("save").onclick = save;
 $("check").onclick = () => check(true);
 $("track").onclick = () => track();

@@ -40,14 +40,12 @@ export const quantityOf = (name) => state.known[name]?.quantity ?? name;
 // Columns shown: those of the sheet and those offered, each quantity once, in its unit in the sheet.
 export function shownColumns() {
   const names = state.sheet.columns.filter((name) => !["trial", "video"].includes(name));
-  const quantities = new Set(names.map(quantityOf));
   for (const name of [...Object.keys(state.shared), ...state.offered]) {
-    if (quantities.has(quantityOf(name))) continue;
-    quantities.add(quantityOf(name));
-    names.push(name);
+    if (!names.some((one) => quantityOf(one) === quantityOf(name))) names.push(name);
   }
-  const order = (name) => { const i = state.offered.findIndex((other) => quantityOf(other) === quantityOf(name)); return i < 0 ? 99 : i; };
-  return names.map((name, i) => [order(name), i, name]).sort((a, b) => a[0] - b[0] || a[1] - b[1]).map((entry) => entry[2]);
+  const offered = state.offered.map(quantityOf);
+  const order = (name) => (offered.includes(quantityOf(name)) ? offered.indexOf(quantityOf(name)) : offered.length);
+  return names.sort((a, b) => order(a) - order(b));
 }
 
 // Display name of a column: without its unit if that can be chosen.

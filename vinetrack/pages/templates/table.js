@@ -1,10 +1,10 @@
 // The table: one row for all trials, one for each trial, with problems under the cell concerned.
 import {$, ask, changed, el, labelOf, listed, quantityOf, sharedKey, sharedValue, shownColumns, state, url} from "./state.js";
 
-export function drawTable(choose) {
+export function drawTable() {
   const columns = shownColumns();
   const table = $("trials");
-  table.replaceChildren(head(columns), el("tbody", {}, sharedRow(columns), ...state.sheet.rows.map((row, i) => trialRow(row, i, columns, choose))));
+  table.replaceChildren(head(columns), el("tbody", {}, sharedRow(columns), ...state.sheet.rows.map((row, i) => trialRow(row, i, columns))));
   table.onpaste = paste;
   table.onkeydown = move;
   $("notes").replaceChildren(el("option", {value: ""}, "…"), ...state.notes.map((name) => el("option", {value: name}, name)));
@@ -21,14 +21,12 @@ function head(columns) {
     const title = known ? [known.meaning, known.measured, known.default && `Blank: ${known.default}.`].filter(Boolean).join(" ") : "Not a column of a trial sheet: kept, but ignored.";
     const unit = known && known.units.length > 1
       ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => setUnit(name, event.target.value)},
-        ...known.units.map((key) => el("option", {value: key, selected: name.endsWith(`_${key}`) && unitOf(name) === key}, state.units[key])))
+        ...known.units.map((key) => el("option", {value: key, selected: name === `${known.quantity}_${key}`}, state.units[key])))
       : el("span", {class: "unit"});
     return el("th", {scope: "col"}, el("span", {title}, labelOf(name)), unit);
   });
   return el("thead", {}, el("tr", {}, el("td"), el("th", {scope: "col"}, "trial", el("span", {class: "unit"}, "recording")), ...cells));
 }
-
-const unitOf = (name) => name.slice(quantityOf(name).length + 1);
 
 function setUnit(name, unit) {
   const other = `${quantityOf(name)}_${unit}`;
@@ -39,11 +37,8 @@ function setUnit(name, unit) {
   for (const row of state.sheet.rows) rename(row, name);
   rename(state.shared, sharedKey(name));
   changed();
-  redraw();
+  drawTable();
 }
-
-let chooser = null;
-function redraw() { drawTable(chooser); }
 
 function sharedRow(columns) {
   const cells = columns.map((name) => {
@@ -56,10 +51,9 @@ function sharedRow(columns) {
   return el("tr", {class: "all"}, el("td", {class: "pic"}), el("td", {class: "label"}, "All trials"), ...cells);
 }
 
-function trialRow(row, i, columns, choose) {
-  chooser = choose;
+function trialRow(row, i, columns) {
   const picture = row.video
-    ? el("button", {type: "button", class: "pick", title: `Show ${row.video}`, "aria-label": `Show ${row.trial}`, onclick: () => choose(i)},
+    ? el("button", {type: "button", class: "pick", title: `Show ${row.video}`, "aria-label": `Show ${row.trial}`},
       el("img", {src: url("api/thumbnail", {recording: row.video}), alt: "", loading: "lazy"}))
     : null;
   const name = cell("trial", i, row.trial ?? "", "", (value) => {
@@ -70,9 +64,7 @@ function trialRow(row, i, columns, choose) {
   name.classList.add("name");
   name.append(el("small", {class: "file"}, row.video || row.track || ""));
   const cells = columns.map((column) => cell(column, i, row[column] ?? "", sharedValue(column), (value) => setCell(row, column, value)));
-  const line = el("tr", {"data-row": i, class: i === state.chosen ? "chosen" : ""}, el("td", {class: "pic"}, picture), name, ...cells);
-  line.addEventListener("focusin", (event) => { if (event.target.matches("input, td select")) choose(i); });
-  return line;
+  return el("tr", {"data-row": i, class: i === state.chosen ? "chosen" : ""}, el("td", {class: "pic"}, picture), name, ...cells);
 }
 
 function setCell(row, column, value) {
@@ -83,7 +75,7 @@ function setCell(row, column, value) {
 function cell(column, row, value, placeholder, write) {
   const known = state.known[column];
   const label = `${labelOf(column)}, ${row === "shared" ? "all trials" : state.sheet.rows[row].trial}`;
-  const given = {"data-column": column, "data-row": row, "aria-label": label};
+  const given = {"data-column": column, "data-quantity": quantityOf(column), "data-row": row, "aria-label": label};
   const heard = (event) => { write(event.target.value.trim()); changed(); };
   const field = known?.kind === "yes_no"
     ? el("select", {...given, onchange: heard}, ...["", "yes", "no"].map((word) => el("option", {value: word, selected: word === value}, word)))
@@ -124,31 +116,31 @@ async function propose(block, column, row) {
   } catch (error) {
     placed = {cells: [], notes: [error.message]};
   }
-  const notes = el("ul", {class: "problems"}, ...listed(placed.notes.map((text) => ({severity: "warning", text}))));
-  $("pasted").replaceChildren(notes);
-  if (!placed.cells.length) return;
-  const lines = placed.cells.map(([at, name, value]) => {
+  const {cells} = placed;
+  $("pasted").replaceChildren(...listed(placed.notes.map((text) => ({severity: "warning", text}))));
+  $("preview").hidden = !cells.length;
+  $("changes").replaceChildren(...cells.map(([at, name, value]) => {
     const now = (at === "shared" ? sharedValue(name) : rows[at][name]) || "blank";
     return el("tr", {}, ...[at === "shared" ? "All trials" : rows[at].trial, name.replaceAll("_", " "), now, "→", value].map((text) => el("td", {}, text)));
-  });
-  const put = () => {
+  }));
+  $("put-in").textContent = `Fill in ${cells.length} cells`;
+  $("put-in").onclick = () => {
     before = structuredClone({sheet: state.sheet, shared: state.shared});
-    for (const [at, name, value] of placed.cells) {
+    for (const [at, name, value] of cells) {
       if (at === "shared") state.shared[sharedKey(name) ?? name] = value;
       else setCell(state.sheet.rows[at], name, value);
     }
-    $("pasted").replaceChildren(notes);
+    $("preview").hidden = true;
     refreshAt(column, row);
   };
-  const button = (id, words, onclick) => el("button", {type: "button", id, onclick}, words);
-  $("pasted").append(el("div", {class: "scroll preview", tabindex: 0, "aria-label": "What would change"}, el("table", {}, ...lines)),
-    el("div", {class: "row"}, button("put-in", `Fill in ${lines.length} cells`, put), button("leave", "Leave the table as it is", () => $("pasted").replaceChildren())));
   $("put-in").focus();
 }
 
+$("leave").onclick = () => { $("preview").hidden = true; $("pasted").replaceChildren(); };
+
 function refreshAt(column, row) {
   changed();
-  redraw();
+  drawTable();
   $("trials").querySelector(`[data-column="${column}"][data-row="${row}"]`)?.focus();
 }
 
@@ -169,7 +161,7 @@ function drawAdder(columns) {
   $("add-column").replaceChildren(el("option", {value: ""}, "…"), ...left.map((name) => el("option", {value: name, title: state.known[name].meaning}, name)));
   $("add-column").onchange = (event) => {
     state.offered.push(event.target.value);
-    redraw();
+    drawTable();
     $("trials").querySelector(`[data-column="${event.target.value}"]`)?.focus();
   };
 }
@@ -183,12 +175,10 @@ export function markProblems() {
   }
   for (const {severity, field, trial, column, text, code, of_a_measurement} of state.problems) {
     if (!["cell", "row", "shared"].includes(field)) continue;
-    const row = field === "shared" ? "shared" : state.sheet.rows.findIndex((one) => one.trial === trial);
-    const wanted = field === "row" ? "trial" : column;
-    const all = [...$("trials").querySelectorAll("[data-column]")].filter((one) => quantityOf(one.dataset.column) === quantityOf(wanted));
-    const inputs = all.filter((one) => one.dataset.row === String(row));
+    const here = `[data-row="${field === "shared" ? field : state.sheet.rows.findIndex((one) => one.trial === trial)}"]`;
+    const at = (name, more) => $("trials").querySelector(`[data-quantity="${quantityOf(name)}"]${more}`);
     // A column in neither file is missing for all trials; a problem without a cell is shown with its trial.
-    const input = inputs[0] ?? all[0] ?? $("trials").querySelector(`[data-column="trial"][data-row="${row}"]`);
+    const input = at(column, here) ?? at(column, "") ?? at("trial", here);
     if (!input) {
       placeless.push({severity, text});
       continue;
