@@ -15,7 +15,6 @@ from vinetrack.core.units import PREDICTION_UNITS, decimals, display_unit, numbe
 from vinetrack.diagnosis.result import (
     EXPECTED,
     NOT_TESTABLE,
-    Candidate,
     Diagnosis,
     Round,
 )
@@ -257,30 +256,23 @@ def measurement_text(trace_decides: bool, effects: Sequence[Effect], faults_only
 
 def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
     """Return the trials to make, as a list within a sentence."""
-    return "; ".join(_trial_in_words(trial) for trial in trials)
-
-
-def _trial_in_words(trial: Mapping[str, Any]) -> str:
-    count = trial["replicates"]
-    words = f"{count} {'trial' if count == 1 else 'trials'} at {trial['pressure_kPa']:.3g} kPa"
-    if trial["payload_g"]:
-        words += f" with {trial['payload_g']:.3g} g"
-    size = f"{trial['diameter_mm']:.3g} mm × {trial['thickness_um']:.3g} µm × {trial['length_mm']:.3g} mm"
-    words += f" with {'a new' if trial['new_vine'] else 'the'} vine of {size}"
-    changed = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in trial["changed"]]
-    return f"{words}, {' and '.join(changed)}" if changed else words
+    told = []
+    for trial in trials:
+        words = f"{_count(trial['replicates'], 'trial')} at {trial['pressure_kPa']:.3g} kPa"
+        if trial["payload_g"]:
+            words += f" with {trial['payload_g']:.3g} g"
+        size = f"{trial['diameter_mm']:.3g} mm × {trial['thickness_um']:.3g} µm × {trial['length_mm']:.3g} mm"
+        words += f" with {'a new' if trial['new_vine'] else 'the'} vine of {size}"
+        changed = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in trial["changed"]]
+        told.append(f"{words}, {' and '.join(changed)}" if changed else words)
+    return "; ".join(told)
 
 
 def separation_text(if_true: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the expected significance with which the trials separate each pair of hypotheses."""
-    parts = []
-    for pair, by_truth in if_true.items():
-        least, most = sorted(by_truth, key=by_truth.__getitem__)
-        # 1.5: ratio from which the larger of two expected significances is stated beside the smaller (chosen)
-        is_much_larger = by_truth[most] > 1.5 * max(by_truth[least], 1.0)
-        note = f" ({by_truth[most]:.2g} σ if {most} is true)" if is_much_larger else ""
-        parts.append(f"{pair.replace(' | ', ' from ')} by {by_truth[least]:.2g} σ{note}")
-    return ", ".join(parts)
+    """Return the significance with which the trials would separate each pair of hypotheses, at least."""
+    return ", ".join(
+        f"{pair.replace(' | ', ' from ')} by {min(by_truth.values()):.2g} σ" for pair, by_truth in if_true.items()
+    )
 
 
 def advice_text(
@@ -351,7 +343,7 @@ def _count(n: int, noun: str) -> str:
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors, next experiment."""
+    """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors."""
     if not diagnosis.rounds:
         return diagnosis.explanation
     lines = [verdict_line(diagnosis), *table_lines(diagnosis), "", diagnosis.explanation]
@@ -362,8 +354,6 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
         lines += ["", "position error", *_ladder_table(diagnosis.ladder)]
     if diagnosis.where:
         lines += ["", *map(str, diagnosis.where)]
-    if diagnosis.next_experiment:
-        lines += ["", str(diagnosis.next_experiment.get("text", ""))]
     lines += [f"! {note}" for note in diagnosis.notes]
     return "\n".join(lines)
 
@@ -384,30 +374,23 @@ def _ranking(step: Round) -> list[str]:
 
     rows = []
     testable = [candidate for candidate in step.ranking if candidate.status != NOT_TESTABLE]
+    is_tied = sum(candidate.in_answer_set for candidate in testable) > 1
     # 8: candidates of a round that the terminal shows (chosen)
     for candidate in testable[:8]:
+        weight = candidate.posterior_weight if is_tied and candidate.in_answer_set else math.nan
+        share = f", posterior weight {100 * weight:.0f} %" if weight < 0.995 else ""
         rows.append(
             (
                 ("* " if candidate.in_answer_set else "  ") + candidate.effect,
                 f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
                 f"{candidate.sigma:.1f}",
                 estimates_text(candidate),
-                str(candidate.reason) or _status(candidate, step),
+                str(candidate.reason) or candidate.status + share,
             )
         )
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
     untestable = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
     return lines + ([f"{NOT_TESTABLE}: {', '.join(untestable)}"] if untestable else [])
-
-
-def _status(candidate: Candidate, step: Round) -> str:
-    """How a candidate was tested, with its posterior weight and its richer forms where those share that weight."""
-    if not (candidate.in_answer_set and candidate.posterior_weight < 0.995):
-        return candidate.status
-    text = f"{candidate.status}, posterior weight {100 * candidate.posterior_weight:.0f} %"
-    weighed = [row for row in step.ranking if row.posterior_weight > 0]
-    richer = [row.effect for row in weighed if row.is_richer_form_of(candidate.effect)]
-    return f"{text}, shared with {joined(richer)}, which contain{'s' * (len(richer) == 1)} it" if richer else text
 
 
 def _ladder_table(ladder: pd.DataFrame) -> list[str]:
@@ -515,22 +498,15 @@ def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
         size=size,
         low=f"{1e3 * max(law.low, 0.0):.0f}",
         high=f"{1e3 * law.high:.0f}",
-        scale_mm=_whole_or_two_digits(1e3 * law.scale),
-        scale_ms=_whole_or_two_digits(1e3 * law.scale),
+        scale_mm=number(1e3 * law.scale),
+        scale_ms=number(1e3 * law.scale),
         scale=f"{law.scale:.2g}",
     )
     return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text
 
 
-def _whole_or_two_digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
-
-
 def _force_text(value_N: float, sigma_N: float) -> str:
-    if not math.isfinite(sigma_N):
-        return "any size"
-    digits = decimals(sigma_N)
-    return f"{value_N:.{digits}f} ± {sigma_N:.{digits}f} N"
+    return f"{with_error(value_N, sigma_N)} N" if math.isfinite(sigma_N) else "any size"
 
 
 # ------------------------------------------------------------------------------
@@ -645,13 +621,14 @@ def learned_force_text(
     """Return the variables of the learned force and how certain they are, its range and error, from where it is
     measured, what limits the result, and which trials would help.
     """
+    shares = {one: f" (posterior weight {weights[one]:.0%})" for one in weights}
+    choices = joined([f"{_variables_text(one)}{shares.get(one, '')}" for one in (name, *alternatives)], "or by")
     low, high = range_N
-    subject = f" As a function of {_variables_text(name)} it" if alternatives else " It"
     text = (
-        f"Learned as a smooth function inside the fit, the missing force {_dependence(name, weights, alternatives)}."
-        f"{subject} ranges from {low:.2f} to {high:.2f} N where there are trials, with a standard error of"
-        f" {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit. {_begins_text(begins, undecided_N)} A law"
-        " over other variables may fit the tracks as well."
+        f"Learned as a smooth function inside the fit, the missing force is described by {choices}. As a function of"
+        f" {_variables_text(name)} it ranges from {low:.2f} to {high:.2f} N where there are trials, with a standard"
+        f" error of {sigma_N:.2f} N, and takes away {explained:.0%} of the misfit. {_begins_text(begins, undecided_N)}"
+        " A law over other variables may fit the tracks as well."
     ).replace("-", "−")
     if not is_repeated:
         text += " No condition was repeated: how sure this is rests on the scatter that the fit assumes."
@@ -659,28 +636,10 @@ def learned_force_text(
         text += " All trials had one pressure, so they do not show whether the force depends on it."
     if alternatives:
         text += (
-            " Trials that reach the same growth at another speed or time, by another pressure or payload, would tell"
-            " them apart."
+            " These trials do not tell which: trials that reach the same growth at another speed or time, by another"
+            " pressure or payload, would."
         )
     return text
-
-
-def _dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[str]) -> str:
-    """Return what the force depends on and how certain that is."""
-    if not alternatives:
-        # 0.95: weight from which a choice counts as certain (chosen)
-        likely = "is" if weights[name] >= 0.95 else "is most likely"
-        return f"{likely} described by {_variables_text(name)} (posterior weight {weights[name]:.0%})"
-    names = [name, *alternatives]
-    shares = [f" ({weights[one]:.0%})" if one in weights else "" for one in names]
-    choices = [one.split("+") for one in names]
-    common = [variable for variable in choices[0] if all(variable in choice for choice in choices)]
-    remaining = ["+".join(variable for variable in choice if variable not in common) for choice in choices]
-    shared, last = "", "or by"
-    if common and all(remaining):
-        names, shared, last = remaining, f"{_variables_text('+'.join(common))}, and by ", "or"
-    listed = joined([f"{_variables_text(one)}{share}" for one, share in zip(names, shares, strict=True)], last)
-    return f"is described by {shared}{listed}: these trials do not tell which"
 
 
 def _begins_text(begins: str, undecided_N: float) -> str:
@@ -689,18 +648,13 @@ def _begins_text(begins: str, undecided_N: float) -> str:
 
     if not begins:
         return "These trials do not decide how much of it belongs to B, n and P_y; it is drawn as small as they allow."
-    if begins == FREE_AT_START:
-        return (
-            "It is not zero where growth begins, because B, n and P_y cannot account for all that acts there; they"
-            f" could account for a part of it that is the same all along the growth, ±{undecided_N:.2f} N."
-        )
-    constant = ", except for a constant, which P_y cannot account for within its error"
-    competitors = f" (±{undecided_N:.2f} N), which B, n and P_y" if undecided_N else ", which P_y"
-    return (
-        f"It is measured from where growth begins{constant if begins == CONSTANT_AT_START else ''}: B, n and P_y are"
-        " those of the vine there. The trials determine how it changes from there on, but not a part that is the same"
-        f" all along the growth{competitors} could account for as well."
-    )
+    from_start = "It is measured from where growth begins"
+    start = {
+        FREE_AT_START: "It is not zero where growth begins, since B, n and P_y cannot account for all that acts there",
+        CONSTANT_AT_START: f"{from_start}, except for a constant, which P_y cannot account for within its error",
+    }.get(begins, from_start)
+    size = f" (±{undecided_N:.2f} N)" if undecided_N else ""
+    return f"{start}. B, n and P_y could account as well for a part{size} that is the same all along the growth."
 
 
 def proposal_lines(proposal: Proposal) -> list[str]:
@@ -814,11 +768,6 @@ def film_matters_text(error: float, changes: Sequence[tuple[str, float, str]]) -
     )
 
 
-def mostly_shared_text(names: Sequence[str], source: str) -> str:
-    """Return the message that a measurement would improve numbers more than further trials."""
-    return f"most of the error of {', '.join(names)} comes from what all trials share: {SHARED_REMEDIES[source]}"
-
-
 def _recordings(trials: Sequence[str]) -> str:
     return f"{_count(len(trials), 'recording')} ({joined(trials[:4])}{' and others' if len(trials) > 4 else ''})"
 
@@ -839,7 +788,9 @@ REMARKS: dict[str, Callable[..., str]] = {
         f"{f', although {joined(may_vary)} may vary from trial to trial' if may_vary else ''}: an effect is missing, or"
         " the tracks have slow errors larger than their noise"
     ),
-    "mostly_shared": mostly_shared_text,
+    "mostly_shared": lambda names, source: (
+        f"most of the error of {', '.join(names)} comes from what all trials share: {SHARED_REMEDIES[source]}"
+    ),
     "trials_disagree": lambda differences: (
         "trials disagree by more than their noise, in "
         f"{', '.join(f'{name} by ± {size}' for name, size in _with_sizes(differences))}: they get nearly equal weights"

@@ -55,35 +55,28 @@ def trials_differ(names: Sequence[str]) -> bool:
     return bool(names) and all(name in BETWEEN for name in names)
 
 
-def difference_headline(names: Sequence[str]) -> str:
-    """The differences between trials of an answer set, each in a clause."""
-    return " or ".join(BETWEEN[name].summary for name in names)
-
-
 def difference_in_words(result: LikelihoodRatio) -> str:
     """The size of one difference between trials: `pressure rises by 0.42 ± 0.03 % with each trial`."""
     name = result.names[-1]
     if name == N_BY_VINE:
         return "n differs between the vines: " + ", ".join(
-            f"{_value(number.value, number.sigma)} ({number.vine})" for number in result.numbers
+            f"{with_error(number.value, number.sigma)} ({number.vine})" for number in result.numbers
         )
     if name == ORDER_DRIFT:
         slope = result.numbers[0]
         if slope.key.endswith(".step"):
             way = "higher" if slope.value > 0 else "lower"
-            return f"pressure is {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % {slope.vine}"
+            return f"pressure is {way} by {with_error(100 * abs(slope.value), 100 * slope.sigma)} % {slope.vine}"
         way = "rises" if slope.value > 0 else "falls"
         what, each = ("B", "each trial of a tube") if slope.key.endswith(".B") else ("pressure", "each trial")
-        return f"{what} {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % with {each}"
+        return f"{what} {way} by {with_error(100 * abs(slope.value), 100 * slope.sigma)} % with {each}"
+    told = (".B", "in B", 100, "%"), (".P", "in pressure (zero of the gauge, or P_y)", 1e-3, "kPa"), (
+        ".gain", "in pressure (setting of a regulator)", 100, "%",
+    )  # fmt: skip
     parts = []
-    in_B = [number for number in result.numbers if number.key.endswith(".B")]
-    in_P = [number for number in result.numbers if number.key.endswith(".P")]
-    if in_B:
-        parts.append(f"in B by {_range(in_B, 100, '%')}")
-    if in_P:
-        parts.append(f"in pressure (zero of the gauge, or P_y) by {_range(in_P, 1e-3, 'kPa')}")
-    if gains := [number for number in result.numbers if number.key.endswith(".gain")]:
-        parts.append(f"in pressure (setting of a regulator) by {_range(gains, 100, '%')}")
+    for ending, what, factor, unit in told:
+        if alike := [number for number in result.numbers if number.key.endswith(ending)]:
+            parts.append(f"{what} by {_range(alike, factor, unit)}")
     return f"{name}s differ {' and '.join(parts)}"
 
 
@@ -105,15 +98,10 @@ def remedies_in_words(step: SelectionStep, answers: Sequence[LikelihoodRatio] = 
     return text
 
 
-def _value(value: float, sigma: float) -> str:
-    digits = decimals(sigma)
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
-
-
 def _range(numbers: Sequence[Number], factor: float, unit: str) -> str:
     """One coefficient with its standard error; several as a range."""
     if len(numbers) == 1:
-        return f"{_value(factor * numbers[0].value, factor * numbers[0].sigma)} {unit} ({numbers[0].vine})"
+        return f"{with_error(factor * numbers[0].value, factor * numbers[0].sigma)} {unit} ({numbers[0].vine})"
     values = [factor * number.value for number in numbers]
     return f"{min(values):+.2g} to {max(values):+.2g} {unit}"
 
@@ -170,7 +158,8 @@ def _told(diagnosis: Diagnosis, shown: Callable[[str], str]) -> str:
     if answers == (DROPPED_FRAMES,):
         return "frames are missing from the recordings"
     if verdict == ARTEFACT and trials_differ(answers):
-        return f"the trials differ, and no physics is missing: {difference_headline(answers)}"
+        how = " or ".join(BETWEEN[name].summary for name in answers)
+        return f"the trials differ, and no physics is missing: {how}"
     return {
         MISSING: f"{joined(names)} {'is' if len(names) == 1 else 'are'} missing",
         AMBIGUOUS: f"{joined(names, 'or')} is missing, and these trials cannot tell which",
@@ -416,8 +405,13 @@ def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
         return ""
     factor = display_unit(alike[0].number.unit)[1]
     low, high = left_open(alike)
-    names = joined([spaced_name(rival.effect) for rival in alike])
-    return f"; allowing for {names}: {number(factor * low, 4)} to {number(factor * high, 4)}"
+    names = []
+    for rival in alike:
+        unit, times = display_unit(rival.unit)
+        names.append(
+            f"{spaced_name(rival.effect)} ({rival.symbol} up to {number(rival.limit * times, 2)} {unit}".rstrip() + ")"
+        )
+    return f"; allowing for {joined(names)}: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 
 def interval_text(entry: Number) -> str:
@@ -443,71 +437,51 @@ def sizes_in_words(numbers: Sequence[Number]) -> str:
     return ", ".join(map(estimate_text, numbers))
 
 
+# The first sentences of an explanation, by verdict; those of an adequate and of an unexplained model take more
+_EXPLAINED = {
+    MISSING: "{name} is missing from {model}: with {sizes} the fit to {trials} improves by Δχ² = {gain:.0f}"
+    " ({sigma:.1f} σ).",
+    AMBIGUOUS: "{model} lacks an effect, and these data cannot tell which: {hypotheses}. Their fits to {trials} lie"
+    " within Δχ² = 9 of each other{by_film}.",
+    BETWEEN_TRIALS: "The trials differ from each other, and no effect is missing from {model}: {hypotheses}. That"
+    " explains the misfit of {trials} (Δχ² = {gain:.0f}).",
+    ARTEFACT: "A fault of the measurement, not missing physics, explains the misfit of {model} to {trials}:"
+    " {hypotheses}. It is not added to the model: find the fault and measure again, or correct the sheet.",
+}
+
+
 def explain(step: SelectionStep) -> str:
     """Return the explanation of one round: its verdict with the reasons."""
-    fit = step.tests.fit
+    fit, answers, verdict = step.tests.fit, step.answer_set, step.verdict
     count = len(fit.trials)
     model, trials = " + ".join(fit.model.names), f"{count} trial{'s' if count != 1 else ''}"
-    if step.verdict == ARTEFACT and trials_differ(step.answer_names):
-        return _difference_between_trials(step, model, trials)
-    explanation = {
-        ADEQUATE: _adequate,
-        MISSING: _missing,
-        AMBIGUOUS: _ambiguous,
-        ARTEFACT: _measurement_fault,
-        UNEXPLAINED: _unexplained,
-    }
-    return explanation[step.verdict](step, model, trials)
-
-
-def _missing(step: SelectionStep, model: str, trials: str) -> str:
-    best = step.answer_set[0]
-    text = (
-        f"{best.names[0] if step.note else best.names[-1]} is missing from {model}: with "
-        f"{sizes_in_words(best.numbers) or 'it'} the fit to {trials} improves by Δχ² = {best.delta_chi2:.0f} "
-        f"({abs(best.sigma):.1f} σ)."
+    if verdict in (ADEQUATE, UNEXPLAINED):
+        return (_adequate if verdict == ADEQUATE else _unexplained)(step, model, trials)
+    if verdict == ARTEFACT and trials_differ(step.answer_names):
+        verdict = BETWEEN_TRIALS
+    best = answers[0]
+    text = _EXPLAINED[verdict].format(
+        name=best.names[0] if step.note else best.names[-1],
+        sizes=sizes_in_words(best.numbers) or "it",
+        model=model,
+        trials=trials,
+        gain=best.delta_chi2,
+        sigma=abs(best.sigma),
+        hypotheses=_hypotheses(answers),
+        by_film=_by_film(answers),
     )
     if step.note:
-        return f"{text} {_capital(step.note)} ({' and '.join(best.names)} together do)."
-    if best.names[-1] == "tail_slack":
-        return (
-            f"{text} The model predicts compression in the tail, which thin film cannot carry: `tail_slack: free` in "
-            "experiment.yaml lets the tail go slack."
+        text += f" {_capital(step.note)} ({' and '.join(best.names)} together do)."
+    text += f"{_chamber(answers)}{_slips(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
+    if step.verdict == ARTEFACT:
+        text += _with_the_fault(step)
+    if verdict == ARTEFACT and (others := best.names[1:]):
+        # Effects fitted beside a fault may describe more of the same fault.
+        text += (
+            f" {joined(others)} {'explains' if len(others) == 1 else 'explain'} what {best.names[0]} leaves, which may "
+            "be more of the same fault: repeat the diagnosis once it is corrected."
         )
-    return f"{text}{_chamber(step.answer_set)}{confounders_in_words(step.confounded)}"
-
-
-def _ambiguous(step: SelectionStep, model: str, trials: str) -> str:
-    answers = step.answer_set
-    return (
-        f"{model} lacks an effect, and these data cannot tell which: {joined(list(step.answer_names), 'or')}. "
-        f"{_hypotheses(answers)}. Their fits to {trials} lie within Δχ² = 9 of each other{_by_film(answers)}."
-        f"{_chamber(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
-    )
-
-
-def _difference_between_trials(step: SelectionStep, model: str, trials: str) -> str:
-    answers = step.answer_set
-    return (
-        f"The trials differ from each other, and no effect is missing from {model}: {_hypotheses(answers)}. That "
-        f"explains the misfit of {trials} (Δχ² = {answers[0].delta_chi2:.0f}).{remedies_in_words(step)}"
-        f"{_with_the_fault(step)}"
-    )
-
-
-def _measurement_fault(step: SelectionStep, model: str, trials: str) -> str:
-    answers, (fault, *others) = step.answer_set, step.answer_set[0].names
-    # Effects fitted beside a fault may describe more of the same fault.
-    beside = (
-        f" {joined(others)} {'explains' if len(others) == 1 else 'explain'} what {fault} leaves, which may be more of "
-        "the same fault: repeat the diagnosis once it is corrected."
-    )
-    return (
-        f"A fault of the measurement, not missing physics: {joined(list(step.answer_names), 'or')} explains the misfit "
-        f"of {model} to {trials} ({_hypotheses(answers)}). It is not added to the model: find the fault and measure "
-        f"again, or correct the sheet.{_slips(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
-        f"{_with_the_fault(step)}{beside if others else ''}"
-    )
+    return text
 
 
 def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
@@ -521,42 +495,11 @@ def _unexplained(step: SelectionStep, model: str, trials: str) -> str:
         return text
     last = step.partial[-1]
     added = joined([f"{each.names[-1]} (Δχ² = {each.delta_chi2:.0f} in all)" for each in step.partial], "then")
-    before, after = step.tests.fit.chi2_per_dof, last.fit.chi2_per_dof
     return (
-        f"{text} Part of the misfit is explained by adding {added}: χ² per degree of freedom falls from {before:.1f} "
-        f"to {after:.1f}, with {sizes_in_words(last.numbers)}. Because a significant misfit remains, these steps are "
-        "partial: none is shown to be missing."
+        f"{text} Adding {added} explains a part: χ² per degree of freedom falls from {step.tests.fit.chi2_per_dof:.1f} "
+        f"to {last.fit.chi2_per_dof:.1f}, with {sizes_in_words(last.numbers)}. A significant misfit remains, so none of"
+        " them is shown to be missing."
     )
-
-
-def confounders_in_words(confounders: Sequence[Confounder]) -> str:
-    """State how far each fitted size would change with another effect that the data do not exclude in the model."""
-    text = ""
-    for name in dict.fromkeys(confounder.number.name for confounder in confounders):
-        alike = [confounder for confounder in confounders if confounder.number.name == name]
-        number = alike[0].number
-        unit, factor = display_unit(number.unit)
-        tail, digits = f" {unit}" if unit else "", decimals(number.sigma * factor)
-        smaller = [_change_in_words(rival, digits) for rival in alike if abs(rival.value) < abs(number.value)]
-        larger = [_change_in_words(rival, digits) for rival in alike if abs(rival.value) >= abs(number.value)]
-        parts = [f"too large by up to {joined(smaller, 'or')}"] if smaller else []
-        parts += [f"too small by up to {joined(larger, 'or')}"] if larger else []
-        low, high = left_open(alike)
-        text += (
-            f" This {number.title} may be {', or '.join(parts)}, which the data do not exclude. "
-            f"Allowing for {joined([rival.effect for rival in alike])}, {number.title} lies between "
-            f"{factor * low:.{digits}f} and {factor * high:.{digits}f}{tail} (95 %)."
-        )
-    return text
-
-
-def _change_in_words(confounder: Confounder, digits: int) -> str:
-    """`0.061 because of air_drag (C_D up to 4.1)`: the change, the other effect, and its largest size."""
-    unit, factor = display_unit(confounder.number.unit)
-    limit_unit, limit_factor = display_unit(confounder.unit)
-    change = f"{abs(confounder.value - confounder.number.value) * factor:.{digits}f}{' ' + unit if unit else ''}"
-    limit = f"{confounder.symbol} up to {confounder.limit * limit_factor:.2g}{' ' + limit_unit if limit_unit else ''}"
-    return f"{change} because of {confounder.effect} ({limit})"
 
 
 def _chamber(answers: Sequence[LikelihoodRatio]) -> str:
@@ -662,11 +605,6 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
             f" Nearest to its threshold is {names[best]}, {tests.one_sided_z[best]:.1f} of {thresholds[best]:.1f} σ;"
             f" chance takes a candidate to it in one of {1 / tests.level:.0f} campaigns."
         )
-        kind = next(effect.kind for effect in tests.effects if effect.name == names[best])
-        # 3.0: significance from which a fault of the measurement below its threshold is named as worth a
-        # check (chosen)
-        if kind == "measurement" and tests.one_sided_z[best] >= 3.0:
-            text += f" It is a fault of the measurement that is soon checked: see `vinetrack effects {names[best]}`."
     if not step.unstated_differences:
         return text
     unstated = max(step.unstated_differences, key=lambda result: result.delta_chi2)

@@ -254,7 +254,8 @@ def power_entry(power: Power | None) -> dict[str, Any] | None:
     if power is None:
         return None
     order = [] if power.wary else sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
-    return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "sizes": power_rows(order)}
+    wary = could_have_seen(power) if power.wary else []
+    return {"sentences": [false_alarm_sentence(power), *wary], "sizes": power_rows(order)}
 
 
 def tied_pairs(entry: Round) -> list[str]:
