@@ -52,9 +52,6 @@ if TYPE_CHECKING:
 LOW_POWER = 0.1  # Power below which an effect counts as undetectable (chosen)
 
 
-AT_LARGEST = "with 90 % power at their largest plausible size"  # Follows the number of detectable effects
-
-
 def percent(rate: float) -> str:
     """Return a rate in per cent, two digits."""
     return f"{number(100 * rate, 2)} %"

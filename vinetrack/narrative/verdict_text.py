@@ -296,7 +296,7 @@ def _why_not(row: Candidate, best: float) -> str:
 
 
 def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
-    from vinetrack.narrative.diagnosis_text import AT_LARGEST, detectable_count, unseen
+    from vinetrack.narrative.diagnosis_text import detectable_count, unseen
 
     power = diagnosis.power
     if power is None:
@@ -307,7 +307,8 @@ def _not_excluded(diagnosis: Diagnosis) -> tuple[str, str]:
     # 6: undetectable effects that are named, at most (chosen)
     named = [*undetectable[:6], *(["others"] if len(undetectable) > 6 else [])]
     note = f"not even then: {listed_names(named)}" if named else ""
-    return f"smaller effects: by linear theory {detectable_count(power)} would have been detected {AT_LARGEST}", note
+    seen = f"by linear theory {detectable_count(power)} would have been detected with 90 % power at their largest"
+    return f"smaller effects: {seen} plausible size", note
 
 
 def _to_do(diagnosis: Diagnosis) -> tuple[str, str]:

@@ -613,8 +613,7 @@ def model_errors(table: pd.DataFrame) -> str:
         return ""
     worst = table.sort_values("rms_position_m").iloc[-1]
     conditions = "one condition" if len(table) == 1 else f"{len(table)} conditions"
-    sentence = f"Over {conditions} the model is off by {_rms_mm(table['rms_position_m'])} mm"
-    sentence += " (root mean square)"
+    sentence = f"Over {conditions} the model is off by {_rms_mm(table['rms_position_m'])} mm (root mean square)"
     if known := int(np.isfinite(table["expected_m"]).sum()):
         above = int((table["rms_position_m"] > table["expected_high_m"]).sum())
         sentence += f"; in {above} of {known} that is more than an adequate model would show"
