@@ -11,7 +11,8 @@ changes the forces beside the mass; where several vines differ, for `n_by_vine` 
 of ε/2 in the frame rate or of −ε in the scale of one vine's recordings is equivalent for horizontal growth without a
 payload, and nearly so elsewhere.
 
-Reduce it by weighing a piece of each vine: its mass over its length is λ.
+Reduce it by weighing a piece of each vine: its mass over its length is λ. Where it differs between vines, check the
+frame rate, the scale and the gauge of each vine's recordings too.
 
 Source: Eq. (2) of Alvarez et al. (2025); ASTM D6988 on the thickness of film.
 """

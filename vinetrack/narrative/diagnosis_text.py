@@ -585,21 +585,15 @@ def drift_text(
 
 def like_no_law_text(law: str, explained: float, variable: str, alone: float) -> str:
     """Return that no simple law describes the missing force, and the variable that a force of it alone explains it."""
-    variables = {
-        "growth": "the growth",
-        "speed": "the speed",
-        "time": "the time",
-        "condition": "the condition, and not on what happens within a trial",
-    }
     text = f"What is missing looks like none of the simple laws: the best, {law}, explains {explained:.0%} of it."
-    depends = f" It depends on {variables[variable]}: a force of that alone explains {alone:.0%}."
+    depends = f" It depends on {_variables_text(variable)}: a force of that alone explains {alone:.0%}."
     return text + depends if alone else text
 
 
 def _variables_text(name: str) -> str:
     """Return a choice of variables in words."""
     words = {"growth": "the growth", "speed": "the speed of the tail", "time": "the time since release",
-             "pressure": "the pressure"}  # fmt: skip
+             "pressure": "the pressure", "condition": "the condition, not on what happens in a trial"}  # fmt: skip
     return " and ".join(words[variable] for variable in name.split("+"))
 
 

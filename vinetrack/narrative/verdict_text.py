@@ -33,7 +33,6 @@ from vinetrack.dynamics.model import base_model
 from vinetrack.effects import catalogue, remedy
 from vinetrack.experiment.folder import CONFOUNDING_CORRELATION, order_pressure_correlation, trial_order
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Number
-from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.robust_covariance import FILM_ERROR
 
 if TYPE_CHECKING:
@@ -473,7 +472,7 @@ def explain(step: SelectionStep) -> str:
     )
     if step.note:
         text += f" {_capital(step.note)} ({' and '.join(best.names)} together do)."
-    text += f"{_chamber(answers)}{_slips(answers)}{_camera_of_a_vine(answers)}{remedies_in_words(step)}"
+    text += f"{_chamber(answers)}{_slips(answers)}{remedies_in_words(step)}"
     if step.verdict == ARTEFACT:
         text += _with_the_fault(step)
     if verdict == ARTEFACT and (others := best.names[1:]):
@@ -530,17 +529,6 @@ def _slips(answers: Sequence[LikelihoodRatio]) -> str:
                 effect_of_slip.setdefault(slip[1], entry.key.split(".")[0])
     return "".join(
         f" {name} has the size that results if {slip}: check that first." for slip, name in effect_of_slip.items()
-    )
-
-
-def _camera_of_a_vine(answers: Sequence[LikelihoodRatio]) -> str:
-    """Name the faults of camera and gauge equivalent to film masses that differ between vines; blank where none do."""
-    vines = [{one.vine for one in answer.numbers if one.key.startswith(f"{FILM}.")} for answer in answers]
-    if not any(FILM in answer.names and len(of) > 1 for answer, of in zip(answers, vines, strict=True)):
-        return ""
-    return (
-        " In a vine's recordings an error of ε/2 in frame rate, of −ε in scale or of −ε in pressure has the same effect"
-        " as an error of ε in its film mass: check the camera settings and the gauge of each vine too."
     )
 
 
