@@ -20,7 +20,7 @@ from vinetrack.diagnosis.propose import effect_text, propose, table_name, table_
 from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
-from vinetrack.inference import smooth_functions as smooth
+from vinetrack.inference import gaussian_processes as smooth
 from vinetrack.inference.sensitivity import PRESSURE, RELEASE
 
 GROWTH = learned_force.Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))

@@ -21,11 +21,11 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference import solving, trial_effects
 from vinetrack.inference.fit import fit_subset, predict_prepared
 from vinetrack.inference.fit_data import prepare
+from vinetrack.inference.gaussian_processes import products, whiten
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trial_effects import products_at_releases, residuals_in, trial_costs
-from vinetrack.inference.whitening import products, whiten
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from scipy.stats import multivariate_normal
 
 from vinetrack.inference import marginal_likelihood as marginal
 from vinetrack.inference.fit_result import _deviate
+from vinetrack.inference.gaussian_processes import all_products, at_correlation, products, whiten
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
 from vinetrack.inference.position_errors import degrees_of_freedom, precision
-from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 RHO, SIGMA = 0.45, 0.3
 

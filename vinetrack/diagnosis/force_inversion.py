@@ -30,11 +30,10 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.gaussian_processes import splines, whiten
 from vinetrack.inference.marginal_likelihood import eliminated, inverse_of_block, trial_effect_prior
 from vinetrack.inference.optimiser import track_correlation, variance_floor
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Job
-from vinetrack.inference.smooth_functions import splines
-from vinetrack.inference.whitening import whiten
 
 # ------------------------------------------------------------------------------
 # Compiled integration of the variational equations: responses of motions to small accelerations.

@@ -31,7 +31,7 @@ from vinetrack.diagnosis.force_inversion import (
     settled,
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
-from vinetrack.inference.smooth_functions import (
+from vinetrack.inference.gaussian_processes import (
     LENGTH_SCALES,
     Posterior,
     posterior,

@@ -42,11 +42,11 @@ from vinetrack.effects import Effect
 from vinetrack.experiment.schema import GROUPINGS
 from vinetrack.inference.fit_data import FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, Fit
+from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import DEVIATION_COLUMNS, eliminated, matrix_root, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, estimable, solve
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, systematics_of
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Predictor
-from vinetrack.inference.whitening import at_correlation
 
 # ------------------------------------------------------------------------------
 # Expected scores of effects of finite size: the model without the effect, fitted to noise-free data with it.

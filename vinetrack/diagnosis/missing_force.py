@@ -44,7 +44,7 @@ from vinetrack.diagnosis.replicates import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.smooth_functions import (
+from vinetrack.inference.gaussian_processes import (
     LENGTH_SCALES,
     posterior,
     root_of_covariance,

@@ -29,6 +29,7 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, group_names
+from vinetrack.inference.gaussian_processes import all_products, at_correlation
 from vinetrack.inference.marginal_likelihood import (
     LEAST_BETWEEN_TRIAL_SD,
     FitState,
@@ -43,7 +44,6 @@ from vinetrack.inference.marginal_likelihood import trial_deviation_sd as betwee
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import Systematics, cluster_variance, coarsest_groups
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, position_change
-from vinetrack.inference.whitening import all_products, at_correlation
 
 # ------------------------------------------------------------------------------
 # Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried.
@@ -357,8 +357,8 @@ class Products:
         return [slice(begin, begin + trials_at_once) for begin in range(0, len(self.columns), trials_at_once)]
 
     def cross_products(self, part: slice) -> Floats:
-        """Cross products of a part of the trials, see `whitening`. They are cached where there is only one part; those
-        of several would be three times as large as the columns. Shape (n_trials, 3, n_columns, n_columns).
+        """Cross products of a part of the trials, see `gaussian_processes`. They are cached where there is only one
+        part; those of several would be three times as large as the columns. Shape (n_trials, 3, n_columns, n_columns).
         """
         return self._all_cross_products if len(self.parts) == 1 else self._cross_products_of(part)
 

@@ -28,6 +28,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_result import YIELD_PRESSURE, BetweenTerm, Fit, ParameterMap, TrialFit, make_layout
+from vinetrack.inference.gaussian_processes import at_correlation, whiten
 from vinetrack.inference.marginal_likelihood import FitState, inverse_of_block, matrix_root, trial_deviation_sd
 from vinetrack.inference.optimiser import (
     CONVERGED_DECREASE,
@@ -63,7 +64,6 @@ from vinetrack.inference.solving import (
     with_fitted_trace_errors,
 )
 from vinetrack.inference.trial_effects import Indices, subset
-from vinetrack.inference.whitening import at_correlation, whiten
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment

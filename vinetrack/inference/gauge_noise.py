@@ -4,7 +4,7 @@ The speed of a light vine follows the pressure immediately: 0.1 kPa of noise wou
 moved, and a noisy pressure crosses a threshold early, at a different time in every trial.
 
 A trace is a constant and smooth functions of time and of the observed growth, since the pressure falls as the tube
-fills and has its corner where growth begins: Gaussian processes (`vinetrack.inference.smooth_functions`) on the scale
+fills and has its corner where growth begins: Gaussian processes (`vinetrack.inference.gaussian_processes`) on the scale
 on which the pressure of an expanding gas is linear in the growth. Their size, how smooth they are, and what they depend
 on are averaged over by the evidence of all traces of a campaign together: where all other pressures are constant, a
 bend that one shows by chance counts as noise. The growth is shifted by the clock offset of gauge and camera. A trace
@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.units import AMBIENT_PRESSURE_PA
-from vinetrack.inference.smooth_functions import posterior, product_of_modes, root_of_covariance, splines
-from vinetrack.inference.whitening import whiten
+from vinetrack.inference.gaussian_processes import posterior, product_of_modes, root_of_covariance, splines, whiten
 from vinetrack.tracks.position_noise import rough_noise
 
 # ------------------------------------------------------------------------------
@@ -56,8 +55,7 @@ FEWEST_BLOCKS = 4
 NOISE_DEGREES = 2 / 4.62  # Degrees of freedom of the noise variance per sample (derived)
 
 
-# Lag at which noise is compared with that of neighbouring readings, and its largest correlation (chosen)
-COMPARED_LAG, LARGEST_CORRELATION = 4, 0.97
+COMPARED_LAG = 4  # Lag at which noise is compared with that of neighbouring readings (chosen)
 
 
 @dataclass(frozen=True)
@@ -327,7 +325,7 @@ def noise_correlation(traces: Sequence[Floats]) -> float:
     ratio = float(np.median(ratios))
     if ratio < threshold:
         return 0.0
-    rhos = np.linspace(0.0, LARGEST_CORRELATION, 98)
+    rhos = np.linspace(0.0, 0.97, 98)
     return float(
         np.interp(
             ratio, np.log(_third_difference_variance(rhos**COMPARED_LAG) / _third_difference_variance(rhos)), rhos
@@ -353,12 +351,6 @@ def whitened(values: Floats, rho: float) -> Floats:
 GAMMA = 1.2  # Exponent with which a chamber empties into the tube, between isothermal and adiabatic (derived)
 
 TIME_SPLINES, GROWTH_SPLINES = 24, 12  # Splines over the time of a trace and over its growth (chosen)
-
-AMPLITUDES = tuple(np.geomspace(1e-6, 0.3, 16))  # Of the smooth functions, parts of the absolute pressure (chosen)
-
-TIME_LENGTHS = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8)  # Length scales in time, parts of a trace (chosen)
-
-LARGEST_OFFSET_FRAMES = 60  # Largest clock offset, samples (chosen)
 
 
 @dataclass(frozen=True)
@@ -470,7 +462,8 @@ def kinds_of_curves() -> tuple[list[Floats], list[float]]:
     bent, smooth = (
         product_of_modes([root_of_covariance(GROWTH_SPLINES, length, zero_at_start=True)]) for length in (0.25, 0.8)
     )
-    in_time = [over_time, *(product_of_modes([root_of_covariance(TIME_SPLINES, length)]) for length in TIME_LENGTHS)]
+    lengths = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8)  # in time, parts of a trace (chosen)
+    in_time = [over_time, *(product_of_modes([root_of_covariance(TIME_SPLINES, length)]) for length in lengths)]
     # 0.1: by how much a chamber's pressure departs from the line, as a part of its fall (chosen)
     in_growth = [line, np.hstack([line, 0.1 * smooth]), smooth, bent]
     time = [np.vstack([modes, np.zeros((GROWTH_SPLINES, modes.shape[1]))]) for modes in in_time]
@@ -488,8 +481,9 @@ def gauge_clock(traces: Sequence[Recorded]) -> tuple[float, float]:
     frames_s = [trace.growth.frame_s for trace in traces if trace.growth is not None]
     if not frames_s:
         return 0.0, 0.0
+    largest = 60  # Largest clock offset, samples (chosen)
     step_s = float(np.median(frames_s))
-    offsets_s: Floats = step_s * np.arange(-LARGEST_OFFSET_FRAMES, LARGEST_OFFSET_FRAMES + 1.0)
+    offsets_s: Floats = step_s * np.arange(-largest, largest + 1.0)
     log_likelihood = np.zeros(offsets_s.size)
     for trace in traces:
         # 5: readings from which the curve, of four coefficients, leaves anything
@@ -498,7 +492,7 @@ def gauge_clock(traces: Sequence[Recorded]) -> tuple[float, float]:
     best = int(np.clip(np.argmax(log_likelihood), 1, offsets_s.size - 2))
     before, at, after = log_likelihood[best - 1 : best + 2]
     bend = 2 * at - before - after
-    if not bend > LARGEST_OFFSET_FRAMES**-2:
+    if not bend > largest**-2:
         return 0.0, 0.0
     return float(offsets_s[best] + 0.5 * step_s * (after - before) / bend), step_s / math.sqrt(bend)
 
@@ -572,7 +566,8 @@ class Curves:
         products = np.swapaxes(rows, 1, 2) @ rows
         information, score, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
         modes, log_odds = kinds_of_curves()
-        self.found = posterior(information, score, modes, np.array(AMPLITUDES), log_odds)
+        # Amplitudes of the smooth functions, parts of the absolute pressure (chosen)
+        self.found = posterior(information, score, modes, np.geomspace(1e-6, 0.3, 16), log_odds)
         explained = 2 * score - np.einsum("nkl,nl->nk", information, self.found.mean)
         self.residual_squares = squares - np.sum(self.found.mean * explained, axis=1)
         scales = np.array([math.log(trace.noise.sigma_Pa) * trace.readings.places.size for trace in traces])

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import njit
+from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE, RELEASE
-from vinetrack.inference.whitening import at_correlation
 
 # ------------------------------------------------------------------------------
 # The nonlinear mixed-effects model of a fit, and its linearisation about the current trajectories.

@@ -16,6 +16,7 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.gaussian_processes import at_correlation
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
@@ -35,7 +36,6 @@ from vinetrack.inference.trial_effects import (
     residuals_in,
     trial_costs,
 )
-from vinetrack.inference.whitening import at_correlation
 
 # ------------------------------------------------------------------------------
 # The constant part of a fit (priors, bounds) and its initial state (noise, between-trial standard deviations).
@@ -194,7 +194,7 @@ class FixedTerms:
 @dataclass(frozen=True)
 class Solution:
     """Where the iterations ended. `columns` are the sensitivities and residuals of each trial at `state`
-    (`Predictor.linearise`), `cross_products` their sums of products (`whitening.products`).
+    (`Predictor.linearise`), `cross_products` their sums of products (`gaussian_processes.products`).
     """
 
     state: FitState

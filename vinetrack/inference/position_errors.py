@@ -23,6 +23,7 @@ from scipy.special import stdtrit
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     DEVIATION_COLUMNS,
     FitState,
@@ -51,7 +52,6 @@ from vinetrack.inference.optimiser import (
     variance_floor,
 )
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
-from vinetrack.inference.whitening import whiten
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit

@@ -31,7 +31,7 @@ from vinetrack.dynamics.simulate import (
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import DAMPING, EXPONENT, ParameterMap
-from vinetrack.inference.whitening import all_products
+from vinetrack.inference.gaussian_processes import all_products
 
 # ------------------------------------------------------------------------------
 # Jobs of trajectories to simulate, as arrays: a fit needs a hundred at a time, thousands of times.
@@ -403,8 +403,8 @@ class Predictor:
                 clip_at_end(change[starts[k] : starts[k + 1]], over, moved_ends=perturbed_end[0] == ENDED)
 
     def products(self, columns: Sequence[Floats]) -> Floats:
-        """Cross products of the columns of every trial under its noise, see `whitening`. Shapes: columns (n_points, k)
-        → (n_trials, 3, k, k).
+        """Cross products of the columns of every trial under its noise, see `gaussian_processes`. Shapes: columns
+        (n_points, k) → (n_trials, 3, k, k).
         """
         return all_products(
             columns,

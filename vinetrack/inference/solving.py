@@ -29,6 +29,7 @@ from vinetrack.inference.fit_result import (
     ParameterMap,
     TrialFit,
 )
+from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
@@ -79,7 +80,6 @@ from vinetrack.inference.sensitivity import (
     initial_trial_effects,
 )
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, trial_costs
-from vinetrack.inference.whitening import whiten
 
 # Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks (chosen)
 CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40

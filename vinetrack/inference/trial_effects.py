@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import njit
 from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.gaussian_processes import whiten
 from vinetrack.inference.marginal_likelihood import (
     FitState,
     MixedProblem,
@@ -35,7 +36,6 @@ from vinetrack.inference.sensitivity import (
     Jobs,
     Predictor,
 )
-from vinetrack.inference.whitening import whiten
 
 # ------------------------------------------------------------------------------
 # Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take cross products.
@@ -56,7 +56,7 @@ def products_at_releases(
     rho: float,
 ) -> Floats:
     """Whitened cross products of the columns and residual of a trial for each candidate release. Equivalent to
-    `whitening.whiten` and a matrix product for each release. Curves are interpolated linearly, and constant beyond the
+    `gaussian_processes.whiten` and a matrix product for each release. Curves are interpolated linearly, and constant beyond the
     ends of the grid. The last column is the residual. Shapes: time_s, position_m, first, relative_sd (n_points,);
     releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) → (n_releases, n_columns, n_columns).
     """
@@ -181,7 +181,7 @@ def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> F
     return effects
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of a long step: see `whitening`
+@np.errstate(over="ignore", invalid="ignore")  # of a long step: see `gaussian_processes`
 def trial_costs(
     predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
 ) -> Floats:
