@@ -21,11 +21,11 @@ from vinetrack.figures.style import render
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 from vinetrack.narrative.verdict_text import verdict_sentence
-from vinetrack.pipeline import report_stage
 from vinetrack.pipeline.effects_stage import propose_effect
 from vinetrack.pipeline.model_stage import sheet_contradictions, with_contradictions
 from vinetrack.pipeline.predict_stage import choose_fit
 from vinetrack.planning.predictive_inputs import damping_prior
+from vinetrack.report import build
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 
 
@@ -236,8 +236,8 @@ def test_a_figure_is_shown_from_the_files_there_are(tmp_path, monkeypatch):
         path(".svg").parent.mkdir(exist_ok=True)
         for form, content in files.items():
             path(f".{form}").write_text(content)
-        monkeypatch.setattr(report_stage, "MAX_SVG_BYTES", limit)
-        return report_stage._picture(path)
+        monkeypatch.setattr(build, "MAX_SVG_BYTES", limit)
+        return build._picture(path)
 
     assert shown("both", 9, png="png", svg="<svg/>") == shown("alone", 9, svg="<svg/>") == "<svg/>"
     assert shown("both", 5) == b"png"

@@ -66,9 +66,19 @@ PROVENANCE = {
 
 
 def page(**changes: object) -> str:
-    content = {"name": "vines", "trials": trials("a"), "windows": windows("a"), "damping": damping("v")}
-    content |= {"provenance": PROVENANCE, "kinematics": curves("a")}
-    return build.build_report(build.ReportContent(**{**content, **changes}))  # type: ignore[arg-type]
+    content = dict.fromkeys(("clip", "fit", "comparison", "check", "diagnosis", "moved", "laws"))
+    content |= {key: {} for key in ("motions", "strips", "flags", "calibrations", "clips", "effects")}
+    content |= {"name": "vines", "trials": trials("a"), "windows": windows("a"), "damping": damping("v")}
+    content |= {"provenance": PROVENANCE, "kinematics": curves("a"), "figures": [], "sections": [], "notes": []}
+    return build.build_report({**content, **changes})
+
+
+def further(title: str, paragraphs: list, tables: list, figures: list) -> dict:
+    return {"key": "paper", "title": title, "paragraphs": paragraphs, "tables": tables, "figures": figures}
+
+
+def clip(caption: str, mp4: bytes = b"film") -> dict:
+    return {"trial": "a", "mp4": mp4, "caption": caption, "poster": b"frame"}
 
 
 class Tags(HTMLParser):
@@ -102,10 +112,10 @@ def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped():
     content["drift"][0]["sentence"] = content["next_experiment"]["text"] = EVIL
     content["next_experiment"]["calibration"] = content["rounds"][0]["explanation"] = EVIL
     content["rounds"][0]["ranking"][0] |= {"reason": EVIL, "effect": EVIL}
-    figure, section = build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL), ("paper", EVIL, [EVIL], [table], [])
+    figure, section = build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL), further(EVIL, [EVIL], [table], [])
     given = {"name": EVIL, "damping": fit, "provenance": PROVENANCE | written, "figures": [figure]}
-    given |= {"clips": {"a": "overlays/a.mp4"}, "clip": build.Clip("a", b"film", EVIL, b"frame")}
-    given |= result(messages=[EVIL], warnings=[EVIL]) | {"sections": [build.ReportSection(*section)]}
+    given |= {"clips": {"a": "overlays/a.mp4"}, "clip": clip(EVIL)}
+    given |= result(messages=[EVIL], warnings=[EVIL]) | {"sections": [section]}
     rows = {"trials": trials(EVIL, reason=EVIL), "windows": windows(EVIL).assign(rule=EVIL, reason=EVIL)}
     for html in (page(**rows), page(damping=unfitted), page(**given), shown(content)):
         assert EVIL not in html
@@ -119,7 +129,7 @@ def test_the_page_is_one_file_with_the_numbers_of_its_figures_that_asks_for_noth
     figure = build.ReportFigure("own", "Own", "caption", SVG, "o.csv", "a\n1\n")
     html = page(
         figures=[build.ReportFigure("law", "Law", "caption", SVG, "points.csv", "µ,b\n1,2\n")],
-        sections=[build.ReportSection("paper", "The paper", ["Beside it."], [table], [figure])],
+        sections=[further("The paper", ["Beside it."], [table], [figure])],
         trials=trials("a", "b", status="failed", reason="fewer than 5 points"),
         windows=windows(),
     )
@@ -174,7 +184,7 @@ def test_a_sparkline_marks_the_steady_window():
 
 
 def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn():
-    html = page(figures=[build.ReportFigure("law", "Law", "caption", png())], trial_figures={"a": png()})
+    html = page(figures=[build.ReportFigure("law", "Law", "caption", png())], motions={"a": png()})
     images = [attributes for tag, attributes in Tags(html).tags if tag == "img"]
     assert [image["style"] for image in images] == ["--wide:192px"] * 2  # 2 in of 96 px
     assert all(str(image["src"]).startswith("data:image/webp;base64,") for image in images)
@@ -293,7 +303,7 @@ def test_table_two_sets_departures_beside_the_errors():
     named = zip(DEPARTURES, (0.057, 0.069, 0.095, 0.110, 0.114), strict=True)
     departures = [("Fig. 4", 7.0, one.name, size, math.nan, math.nan) for one, size in named]
     table = pd.DataFrame(departures, columns=list(DEPARTURE_COLUMNS))
-    positions, speeds = build.paper_section(as_table([row]), table, []).tables[1:3]
+    positions, speeds = build.paper_section(as_table([row]), table, [])["tables"][1:3]
     assert positions.rows[0] == ("7", "1.9", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
     assert positions.rows[1] == ("14", "0.29", "–", "–", "–", "–")
     assert [row[:2] for row in speeds.rows] == [("14", "0.27"), ("28", "0.56"), ("41", "1.35")]
@@ -301,16 +311,17 @@ def test_table_two_sets_departures_beside_the_errors():
 
 
 # Recordings and calibrations in the report, from entries written by hand.
-def recording() -> build.TrackedRecording:
+def recordings(*names: str) -> dict:
     board = {"kind": "charuco", "image": "calibration/board.png", "mm_per_px": 0.2407, "scale_rel_sigma": 9e-5}
     board |= {"reprojection_px": 0.031, "n_corners": 52, "n_pictures": 1}
     board |= {"notes": ["the target spans only 40 % of the picture"]}
-    return build.TrackedRecording(SVG, ["before_release", "", "", "doubtful"], board)
+    seen = {"strips": SVG, "flags": ["before_release", "", "", "doubtful"], "calibrations": board}
+    return {kind: dict.fromkeys(names, one) for kind, one in seen.items()}
 
 
 def test_strip_and_motion_stand_side_by_side_with_calibration_and_clips():
-    clips = {"clips": {"a": "overlays/a.mp4"}, "clip": build.Clip("a", b"film", "caption", b"frame")}
-    html = page(recordings={"a": recording()}, trial_figures={"a": SVG}, **clips)
+    clips = {"clips": {"a": "overlays/a.mp4"}, "clip": clip("caption")}
+    html = page(motions={"a": SVG}, **recordings("a"), **clips)
     for once in ('<div class="pair">', 'aria-label="Strip of a with its tracked edge"', 'aria-label="Motion of a"'):
         assert html.count(once) == 1
     assert not Tags(html).wrong
@@ -323,10 +334,9 @@ def test_strip_and_motion_stand_side_by_side_with_calibration_and_clips():
 
 def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch):
     names = ("a", "b", "c")
-    recordings = {name: recording() for name in names}
     weight = len(build.inline_picture(SVG, "s-a", "Strip of a with its tracked edge"))
     monkeypatch.setattr(build, "MAX_TRIAL_FIGURES_BYTES", 2 * weight)
-    html = page(trials=trials(*names), recordings=recordings)
+    html = page(trials=trials(*names), **recordings(*names))
     assert html.count('aria-label="Strip of') == 2
     assert "The figures of 1 trials are left out here" in html
     assert html.count("4 frames: 1 before release, 1 doubtful") == 3
@@ -350,9 +360,10 @@ def address(tmp_path_factory):
         windows=windows(*names),
         kinematics=curves(*names),
         figures=[build.ReportFigure(key, key, "caption", svg, f"{key}.csv", "a\n1\n") for key, svg in pictures.items()],
-        trial_figures=dict.fromkeys(names, pictures["before_after"]),
-        recordings={name: build.TrackedRecording(pictures["ladder"], ["", "doubtful"]) for name in names},
-        clip=build.Clip(names[0], (folder / "a.mp4").read_bytes(), "caption"),
+        motions=dict.fromkeys(names, pictures["before_after"]),
+        strips=dict.fromkeys(names, pictures["ladder"]),
+        flags=dict.fromkeys(names, ("", "doubtful")),
+        clip=clip("caption", (folder / "a.mp4").read_bytes()) | {"trial": names[0], "poster": b""},
         diagnosis=replace(Diagnosis.from_json(diagnosis("ambiguous")), ladder=steps),
         moved=moved(),
     )

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from html import escape
-from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -19,12 +21,12 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from vinetrack.core import published
-from vinetrack.core.records import split_flags
 from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.diagnosis.result import ADEQUATE, EXPECTED, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
+from vinetrack.effects import EffectError, catalogue, own_effects
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
-from vinetrack.figures.registry import all_figures
+from vinetrack.figures.registry import FigureTables, RegisteredFigure, all_figures, campaign_figures, figures_of
 from vinetrack.figures.style import RULE_NAMES, TOKENS, page_tokens, rows
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import (
@@ -49,21 +51,22 @@ from vinetrack.narrative.verdict_text import (
     verdict_sentence,
     verdict_table,
 )
+from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.power import Power
     from vinetrack.effects import Effect
-    from vinetrack.inference.fit_summary import FitSummary
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.figures.diagnosis_figures import DiagnosisTables
 
 
 # ------------------------------------------------------------------------------
 # Building blocks of the page.
 
 
-def inline_picture(picture: str | bytes, prefix: str, description: str) -> Markup:
-    """Return an SVG or PNG file as an element of the page, `--wide` if there is room; blank for an empty one."""
+def inline_picture(picture: str | bytes | None, prefix: str, description: str) -> Markup:
+    """Return an SVG or PNG file as an element of the page, `--wide` if there is room; blank for none."""
     if not picture:
         return Markup()
     if isinstance(picture, str):
@@ -144,33 +147,21 @@ class ReportTable:
         return bool(self.rows)
 
 
-@dataclass(frozen=True)
-class ReportSection:
-    """A part of the page under one heading: paragraphs, then tables, then figures."""
-
-    key: str
-    title: str
-    paragraphs: Sequence[str] = ()
-    tables: Sequence[ReportTable] = ()
-    figures: Sequence[ReportFigure] = ()
-
-
 def data_uri(name: str, text: str) -> str:
-    """Return a file as a data URI, in the shorter of two encodings."""
-    unescaped = ",;:!*'()/ -._~+@=$?"  # Characters that need no escaping in a quoted URL
+    """Return a file as a data URI."""
     kind = "application/json" if name.endswith(".json") else "text/csv"
-    escaped = f"data:{kind};charset=utf-8,{quote(text, safe=unescaped)}"
-    encoded = base64_uri(f"{kind};charset=utf-8", text.encode("utf-8"))
-    return min(encoded, escaped, key=len)
+    escaped = quote(text, safe=",;:!*'()/ -._~+@=$?")  # the characters that need no escaping
+    return f"data:{kind};charset=utf-8,{escaped}"
 
 
 # ------------------------------------------------------------------------------
 # The section of the report on the diagnosis: candidates, upper limits, tied candidates, the next trial, drift.
 
 
-def diagnosis_section(content: ReportContent) -> dict[str, Any] | None:
+def diagnosis_section(content: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the section on the diagnosis as text for the template; None if there is no diagnosis."""
-    diagnosis, effects = content.diagnosis, content.effects
+    diagnosis: Diagnosis | None = content["diagnosis"]
+    effects: Mapping[str, Effect] = content["effects"]
     if diagnosis is None:
         return None
     drifting = [str(row["sentence"]) for row in diagnosis.drift if row.get("sentence") and row.get("significant", True)]
@@ -179,6 +170,10 @@ def diagnosis_section(content: ReportContent) -> dict[str, Any] | None:
         untestable = [row for row in entry.ranking if row.status == NOT_TESTABLE]
         blind = [f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in untestable]
         rounds.append({"ranking": ranking_rows(entry), "blind": blind, "of": entry})
+    sizes, power = [], diagnosis.power
+    wary = could_have_seen(power) if power is not None and power.wary else []
+    if power is not None and not power.wary:
+        sizes = power_rows(sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest)))
     return {
         "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
         "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
@@ -192,12 +187,12 @@ def diagnosis_section(content: ReportContent) -> dict[str, Any] | None:
         "rounds": rounds,
         # Upper limits are valid only if no effect is missing.
         "hidden": upper_limits(diagnosis.rounds[-1].ranking if diagnosis.final_verdict == ADEQUATE else (), effects),
-        "power": power_entry(diagnosis.power),
+        "power": power and {"sentences": [false_alarm_sentence(power), *wary], "sizes": sizes},
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
-        "moved": moved_table(content.moved),
-        "laws": law_rows(content.laws),
+        "moved": moved_table(content["moved"]),
+        "laws": law_rows(content["laws"]),
         "notes": list(diagnosis.notes),
     }
 
@@ -247,15 +242,6 @@ def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) ->
                 shown, factor = display_unit(unit)
                 rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
     return rows
-
-
-def power_entry(power: Power | None) -> dict[str, Any] | None:
-    """Return what the trials could have detected, for the template: sentences and rows of sizes; None if unknown."""
-    if power is None:
-        return None
-    order = [] if power.wary else sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
-    wary = could_have_seen(power) if power.wary else []
-    return {"sentences": [false_alarm_sentence(power), *wary], "sizes": power_rows(order)}
 
 
 def tied_pairs(entry: Round) -> list[str]:
@@ -356,16 +342,16 @@ def law_rows(laws: pd.DataFrame | None) -> list[tuple[str, ...]]:
 # Section of the report that compares the paper's numbers with ours: Tables I and II, `paper.csv`, figures.
 
 
-def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> ReportSection:
-    """Return the section."""
+def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> dict[str, Any]:
+    """Return the section for the template: paragraphs, then tables, then figures."""
     from vinetrack.paper.rows import MARKS
 
     by_row = {row.row: row for row in rows(table)}
     present = [f"“{mark}”: {words}" for mark, words in MARKS.items() if (table["mark"] == mark).any()]
-    return ReportSection(
-        key="paper",
-        title="Comparison with the paper",
-        paragraphs=[
+    return {
+        "key": "paper",
+        "title": "Comparison with the paper",
+        "paragraphs": [
             f"The numbers of {published.SOURCE} next to ours. {tally(table)} Each row is marked with its kind.",
             f"{'; '.join(present)}.",
             "The errors of Eq. (2) at low pressure (1.90 cm at 7 kPa) are compared with those that a chamber without "
@@ -373,9 +359,9 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
             "how fast the regulator refills, and how long the vines were, is not published, and B and n of Fig. 6 may "
             "have absorbed a part of it.",
         ],
-        tables=[table_one(by_row), *table_two(by_row, departures), *every_row(table)],
-        figures=list(figures),
-    )
+        "tables": [table_one(by_row), *table_two(by_row, departures), *every_row(table)],
+        "figures": figures,
+    }
 
 
 def tally(table: pd.DataFrame) -> str:
@@ -436,9 +422,10 @@ def table_two(by_row: Mapping[str, Any], departures: pd.DataFrame) -> list[Repor
 def every_row(table: pd.DataFrame) -> list[ReportTable]:
     """Return all rows of `paper.csv`, in one table for each part of the paper."""
     head = ("what", "printed", "here (95 %)", "kind", "how obtained, and remarks")
-    parts = table["where"].str.split(";|,| against", n=1, regex=True).str[0].map(_PARTS).fillna(_ELSEWHERE)
+    elsewhere = "The fast vine, air drag, pressures"
+    parts = table["where"].str.split(";|,| against", n=1, regex=True).str[0].map(_PARTS).fillna(elsewhere)
     made = []
-    for title in dict.fromkeys([*_PARTS.values(), _ELSEWHERE]):
+    for title in dict.fromkeys([*_PARTS.values(), elsewhere]):
         body = []
         for row in rows(table[parts == title]):
             what = ", ".join(filter(None, (row.quantity, row.setting))) + (f" ({row.unit})" if row.unit != "1" else "")
@@ -459,7 +446,6 @@ _PARTS = {
     "Fig. 9": "Fig. 9",
     **dict.fromkeys(("Section III-B", "Section V-B"), "Chamber and injector"),
 }
-_ELSEWHERE = "The fast vine, air drag, pressures"
 
 
 def _value(row: Any, column: str = "ours") -> float | None:
@@ -483,36 +469,21 @@ def _shown(value: float | None) -> str:
 # Trials in the report: values, status and reason, strip, motion, data, and calibration.
 
 
-@dataclass(frozen=True)
-class TrackedRecording:
-    """A recording in the report: its strip as SVG or PNG (empty for none), the flags of its frames, its calibration.
-    `calibration` was written by the recording's stage: `kind, image, mm_per_px, scale_rel_sigma, reprojection_px,
-    n_corners, n_pictures, notes`; None if there is none.
-    """
-
-    strip: str | bytes
-    flags: Sequence[str]
-    calibration: Mapping[str, Any] | None = None
-
-
-def count_frames(flags: Iterable[str]) -> str:
+def count_frames(flags: Sequence[str]) -> str:
     """Return the number of frames, and of those with each flag, as text."""
-    flags = list(flags)
-    counted = Counter(part for flag in flags for part in split_flags(flag))
+    counted = Counter(filter(None, ";".join(flags).split(";")))
     words = {"lost": "without the edge", "corrected": "corrected by hand", "after_end": "after the end"}
     parts = [f"{count} {words.get(flag, flag.replace('_', ' '))}" for flag, count in counted.items()]
     return f"{len(flags)} frames" + (f": {', '.join(parts)}" if parts else "")
 
 
-def calibration_table(recordings: Mapping[str, TrackedRecording]) -> list[dict[str, Any]]:
+def calibration_table(calibrations: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return one row per calibration, with its results and its trials."""
     groups: dict[tuple[Any, ...], list[tuple[str, Mapping[str, Any]]]] = {}
-    for name, recording in recordings.items():
-        one = recording.calibration
-        if one is not None:
-            key = (one["kind"], one["image"], one["n_corners"], one["reprojection_px"], *one["notes"])
-            own = (one["mm_per_px"],) if one["kind"] == "sheet" else ()
-            groups.setdefault((*key, *own), []).append((name, one))
+    for name, one in calibrations.items():
+        key = (one["kind"], one["image"], one["n_corners"], one["reprojection_px"], *one["notes"])
+        own = (one["mm_per_px"],) if one["kind"] == "sheet" else ()
+        groups.setdefault((*key, *own), []).append((name, one))
     return list(map(_calibration_row, groups.values()))
 
 
@@ -545,38 +516,37 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
 MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single trials
 
 
-def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
+def trial_entries(content: Mapping[str, Any]) -> tuple[list[dict[str, Any]], int]:
     """Return all trials for the template, and how many of them have their figures left out for size."""
-    entries, left_out, weight = [], 0, 0
-    for row in rows(content.trials):
-        name, curve = row.trial, content.kinematics.get(row.trial)
+    entries, left_out, weight, windows = [], 0, 0, content["windows"]
+    # 240, 24_000: maximum rows of motion data in the page, per trial and in total
+    most = max(min(24_000 // len(content["trials"]), 240), 2)
+    for row in rows(content["trials"]):
+        name, curve = row.trial, content["kinematics"].get(row.trial)
         curve = None if curve is None or len(curve) < 2 else curve
-        shown = None if row.status == "failed" else content.recordings.get(name)
-        strip = inline_picture(shown.strip if shown else "", f"s-{name}", f"Strip of {name} with its tracked edge")
-        drawn = "" if row.status == "failed" else content.trial_figures.get(name, "")
-        motion = inline_picture(drawn, f"t-{name}", f"Motion of {name}")
+        kinds = ("strips", "motions", "flags")
+        strip, motion, flags = (None if row.status == "failed" else content[kind].get(name) for kind in kinds)
+        strip = inline_picture(strip, f"s-{name}", f"Strip of {name} with its tracked edge")
+        motion = inline_picture(motion, f"t-{name}", f"Motion of {name}")
         if weight + len(strip) + len(motion) > MAX_TRIAL_FIGURES_BYTES:
             left_out += bool(strip or motion)
             strip = motion = Markup()
         weight += len(strip) + len(motion)
         entry = {
             "row": row,
-            "frames": count_frames(shown.flags) if shown else "",
+            "frames": count_frames(flags) if flags else "",
             "spark": "" if curve is None else speed_sparkline(curve, (row.steady_from_s, row.steady_to_s)),
-            "data": "" if curve is None else data_uri(f"{name}.csv", _thinned(curve, len(content.trials))),
-            "clip": content.clips.get(name, ""),
-            "windows": list(rows(content.windows[content.windows["trial"] == name])),
+            "data": "" if curve is None else data_uri(f"{name}.csv", _csv(curve.iloc[:: -(-len(curve) // most)])),
+            "clip": content["clips"].get(name, ""),
+            "windows": list(rows(windows[windows["trial"] == name])),
         }
         entries.append({**entry, "strip": strip, "motion": motion})
     return entries, left_out
 
 
-def _thinned(curve: pd.DataFrame, n_trials: int) -> str:
-    """Motion of a trial as CSV, with five digits, more than the accuracy of any value."""
-    # 240, 24_000: maximum rows of motion data in the page, per trial and in total
-    most = max(min(24_000 // n_trials, 240), 2)
-    shown = curve.iloc[:: -(-len(curve) // most)]
-    return str(shown.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
+def _csv(table: pd.DataFrame) -> str:
+    """A table as CSV, with five digits, more than the accuracy of any value."""
+    return str(table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
 
 
 def speed_sparkline(curve: pd.DataFrame, steady_s: tuple[float, float]) -> Markup:
@@ -613,7 +583,8 @@ def model_errors(table: pd.DataFrame) -> str:
         return ""
     worst = table.sort_values("rms_position_m").iloc[-1]
     conditions = "one condition" if len(table) == 1 else f"{len(table)} conditions"
-    sentence = f"Over {conditions} the model is off by {_rms_mm(table['rms_position_m'])} mm (root mean square)"
+    rms_m = math.sqrt(float((table["rms_position_m"] ** 2).mean()))
+    sentence = f"Over {conditions} the model is off by {number(1e3 * rms_m)} mm (root mean square)"
     if known := int(np.isfinite(table["expected_m"]).sum()):
         above = int((table["rms_position_m"] > table["expected_high_m"]).sum())
         sentence += f"; in {above} of {known} that is more than an adequate model would show"
@@ -636,109 +607,140 @@ def final_errors(diagnosis: Diagnosis) -> str:
     )
 
 
-def _rms_mm(values_m: pd.Series) -> str:
-    return number(1e3 * math.sqrt(float((values_m**2).mean())))
+# ------------------------------------------------------------------------------
+# What the report shows of a results folder, and the page.
+
+MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 
 
-@dataclass(frozen=True)
-class Clip:
-    """A clip that plays in the page: trial, MP4 file, caption; a WebP poster, shown until it plays and in print."""
-
-    trial: str
-    mp4: bytes
-    caption: str
-    poster: bytes = b""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportContent:
-    """Content of the report: tables, figures and provenance of the results folder. `recordings` has an entry for every
-    trial with a recording; `clips` has the path of the clip of a trial relative to the page, and `clip` the one that
-    plays in it. `sections` are further parts, shown before the trials.
-    """
-
-    name: str
-    trials: pd.DataFrame
-    windows: pd.DataFrame
-    damping: Mapping[str, Any]
-    provenance: Mapping[str, Any]
-    kinematics: Mapping[str, pd.DataFrame]
-    figures: Sequence[ReportFigure] = ()
-    trial_figures: Mapping[str, str | bytes] = field(default_factory=dict)
-    recordings: Mapping[str, TrackedRecording] = field(default_factory=dict)
-    clips: Mapping[str, str] = field(default_factory=dict)
-    clip: Clip | None = None
-    fit: FitSummary | None = None
-    comparison: pd.DataFrame | None = None
-    check: pd.DataFrame | None = None
-    diagnosis: Diagnosis | None = None
-    moved: pd.DataFrame | None = None
-    laws: pd.DataFrame | None = None
-    effects: Mapping[str, Effect] = field(default_factory=dict)
-    sections: Sequence[ReportSection] = ()
-    notes: Sequence[str] = ()
-
-
-def build_report(content: ReportContent) -> str:
-    """Return the page. User text is escaped; only SVG made by the package is inserted as it is."""
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
-
-    folder = files("vinetrack.report") / "templates"
-    loader = FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8"))
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"number": number, "with_error": with_error, "interval": interval}
-    environment.globals |= {"rows": rows, "display_unit": display_unit, "bounds_text": bounds_text}
-    environment.globals |= {
-        "listed_names": listed_names,
-        "expected_text": expected_text,
-        "inline_picture": inline_picture,
+def report_content(experiment: Experiment, folder: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect tables, figures and recordings of a results folder, by their names in the templates."""
+    results, tables = Results(folder), FigureTables(folder, experiment.trials)
+    trials, diagnosis = read_result(results.trials), read_diagnosis(results)
+    drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
+    filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
+    seen = {name: read_json(results.analysed(name)).get("calibration") for name in filmed}
+    sections = []
+    if experiment.settings.published:
+        figures = _figures(tables, figures_of("paper").values(), diagnosis)
+        sections = [paper_section(tables.paper, tables.paper_departures, figures)]
+    known = dict(catalogue())
+    with contextlib.suppress(EffectError):  # the file of an effect may no longer exist
+        known |= own_effects([experiment.folder / path for path in experiment.settings.effects])
+    moved, laws = (results.diagnosed(name) for name in ("moved.csv", "damping_laws.csv"))
+    return {
+        "name": experiment.name,
+        "trials": trials,
+        "windows": read_result(results.steady),
+        "damping": read_json(results.damping),
+        "provenance": provenance,
+        "kinematics": {name: read_result(results.kinematics(name)) for name in drawn},
+        "figures": _figures(tables, campaign_figures().values(), diagnosis),
+        "motions": {name: _picture(partial(results.trial_figure, name)) for name in drawn},
+        "strips": {name: _picture(partial(results.strip_figure, name)) for name in filmed},
+        "flags": {name: read_result(results.track(name))["flag"].tolist() for name in filmed},
+        "calibrations": {name: one for name, one in seen.items() if one},
+        "clips": {name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
+        "clip": _clip(results, tables.diagnosed, trials),
+        "fit": read_fit(results),
+        "comparison": read_result(results.comparison),
+        "check": read_result(results.model_check),
+        "diagnosis": diagnosis,
+        "moved": read_result(moved) if moved.exists() else None,
+        "laws": read_result(laws) if laws.exists() else None,
+        "effects": known,
+        "sections": sections,
+        "notes": experiment.blank_notes,
     }
-    environment.globals |= {"data_uri": data_uri, "base64_uri": base64_uri}
-    settings = content.provenance.get("settings") or {}
+
+
+def _picture(path: Callable[[str], Path]) -> str | bytes:
+    """Return a figure for the page: its SVG, or its PNG if there is none or it is too large; empty if there is none."""
+    svg, png = path(".svg"), path(".png")
+    if svg.exists() and svg.stat().st_size <= MAX_SVG_BYTES:
+        return svg.read_text(encoding="utf-8")
+    return png.read_bytes() if png.exists() else b""
+
+
+def _figures(
+    tables: FigureTables, figures: Iterable[RegisteredFigure], diagnosis: Diagnosis | None
+) -> list[ReportFigure]:
+    """Return the drawn figures with their data: a file of the results, or a table of its own with five digits."""
+    shown = []
+    for one in figures:
+        if picture := _picture(partial(tables.results.figure, one.name)):
+            name, data = one.data, ""
+            if "." in name:
+                data = (tables.results.folder / name).read_text(encoding="utf-8")
+            elif name:
+                name, data = f"{one.name}.csv", _csv(getattr(tables, name))
+            refuted = one.if_refuted if diagnosis is not None and diagnosis.refutes else ""
+            shown.append(ReportFigure(one.name, one.title, f"{one.caption} {refuted}".strip(), picture, name, data))
+    return shown
+
+
+def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFrame) -> dict[str, Any] | None:
+    """Return the clip that plays in the page, of the condition that the model predicts worst if it has one, else the
+    first: trial, caption, MP4 file, and a WebP poster (empty if it cannot be read), shown until it plays and in print.
+    """
+    import av
+
+    with_clip = trials[[results.overlay(name).exists() for name in trials["trial"]]]
+    if not len(with_clip):
+        return None
+    worst = diagnosed.before_after["trial"] if diagnosed is not None and len(diagnosed.before_after) else ()
+    chosen = with_clip[with_clip["trial"].isin(worst)] if with_clip["trial"].isin(worst).any() else with_clip
+    name = str(chosen["trial"].iloc[0])
+    path, poster = results.overlay(name), io.BytesIO()
+    if path.stat().st_size > 2_500_000:  # chosen: a sixth of the 15 MB that a report may have
+        return None
+    with contextlib.suppress(av.error.FFmpegError), av.open(str(path)) as container:
+        frames = list(container.decode(video=0))
+        frames[2 * len(frames) // 3].to_image().save(poster, "WEBP", quality=60)  # where models differ visibly
+    note = " The condition is the one that the model predicts worst." if len(chosen) < len(with_clip) else ""
+    edges = "the tracked edge (yellow)"
+    if diagnosed is not None:
+        edges += ", that of the initial model (vermillion)"
+        edges += f", and that with {diagnosed.added} (blue)" if diagnosed.added else ""
+    caption = f"The recording, slowed down, with {edges}.{note}"
+    return {"trial": name, "caption": caption, "mp4": path.read_bytes(), "poster": poster.getvalue()}
+
+
+def build_report(content: Mapping[str, Any]) -> str:
+    """Return the page with this content (`report_content`). User text is escaped; only SVG of the package is not."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    form = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
+    environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
+    in_templates = (rows, display_unit, bounds_text, listed_names, expected_text, model_errors, final_errors)
+    environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, data_uri, base64_uri)}
     sections = {name: figure.section for name, figure in all_figures().items()}
     figures: dict[str, list[ReportFigure]] = {section: [] for section in sections.values()}
-    for figure in content.figures:
+    for figure in content["figures"]:
         figures[sections.get(figure.key, "damping")].append(figure)
     trials, n_left_out = trial_entries(content)
     laws = [
         (vine, law, method)
         for method in LAW_METHODS
-        for vine, law in ((content.damping.get(method) or {}).get("vines") or {}).items()
+        for vine, law in ((content["damping"].get(method) or {}).get("vines") or {}).items()
     ]
     return environment.get_template("report.html").render(
-        **vars(content)
+        content
         | {
-            "style": Markup(page_tokens() + (folder / "report.css").read_text(encoding="utf-8")),
-            "headline": damping_headline(content.damping),
-            "tally": status_tally(content.trials),
+            "page_tokens": Markup(page_tokens()),
+            "headline": damping_headline(content["damping"]),
+            "tally": status_tally(content["trials"]),
             "law_methods": LAW_METHODS,
             "laws": sorted(laws, key=lambda one: (one[1]["diameter_mm"], one[1]["thickness_um"], one[0])),
-            "model_errors": model_errors,
-            "final": content.diagnosis,
-            "final_errors": final_errors,
+            "final": content["diagnosis"],
             "diagnosis": diagnosis_section(content),
             "power_columns": POWER_COLUMNS,
             "figures": figures,
-            # Chosen: a sixth of the 15 MB that a report may have
-            "clip": content.clip if content.clip is not None and len(content.clip.mp4) <= 2_500_000 else None,
             "trials": trials,
             "rule_names": RULE_NAMES,
             "n_left_out": n_left_out,
-            "calibrations": calibration_table(content.recordings),
-            "run": settings,
-            "settings": sorted(_flat(settings)),
+            "calibrations": calibration_table(content["calibrations"]),
+            "run": content["provenance"]["settings"],
         }
     )
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested settings as (dotted name, value) pairs."""
-    pairs: list[tuple[str, str]] = []
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            pairs += _flat(value, f"{prefix}{key}.")
-        else:
-            pairs.append((f"{prefix}{key}", "–" if value is None else str(value)))
-    return pairs
