@@ -11,12 +11,14 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, Generic, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from rich.progress import Progress
 
 Item = TypeVar("Item")
 
@@ -61,58 +63,30 @@ def _is_numeric(cells: Sequence[str]) -> bool:
     return bool(values) and all(re.fullmatch(number, cell) for cell in values)
 
 
-class Progress(Generic[Item]):
-    """A bar with the time left, or a spinner for work of unknown length; on standard error, if that is a terminal."""
+@contextmanager
+def _bar(description: str, total: int | None) -> Iterator[Progress]:
+    from rich import progress as rich
+    from rich.console import Console
 
-    def __init__(self, work: Sequence[Item] | int | None, description: str, unit: str = "trial") -> None:
-        from rich import progress as rich
-        from rich.console import Console
-
-        self._items: Sequence[Item] = () if isinstance(work, int | None) else work
-        total = work if isinstance(work, int | None) else len(work)
-        self._spinner = (rich.SpinnerColumn(), "{task.description} … {task.elapsed:.0f} s")
-        amount = (rich.BarColumn(), rich.MofNCompleteColumn(), unit, rich.TimeRemainingColumn(compact=True), "left")
-        self._count = ("{task.description}:", *amount)
-        screen = Console(stderr=True, markup=False, emoji=False, highlight=False)
-        columns = self._spinner if total is None else self._count
-        self._bar = rich.Progress(*columns, console=screen, transient=True, disable=not sys.stderr.isatty())
-        self._task = self._bar.add_task(description, total=total)
-
-    def advance(self, count: int = 1) -> None:
-        """Advance by a number of steps."""
-        self._bar.advance(self._task, count)
-
-    def begin(self, description: str) -> None:
-        """Show other work, of unknown length until `reach` says more."""
-        self._bar.remove_task(self._task)
-        self._bar.columns = self._spinner
-        self._task = self._bar.add_task(description, total=None)
-
-    def reach(self, done: int, total: int, what: str) -> None:
-        """Set the number of completed steps, of how many, and of what."""
-        self._bar.columns = self._count
-        self._bar.update(self._task, completed=done, total=total, description=what)
-
-    def __iter__(self) -> Iterator[Item]:
-        with self:
-            for element in self._items:
-                yield element
-                self.advance()
-
-    def __enter__(self) -> Progress[Item]:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+    columns = (rich.SpinnerColumn(), "{task.description}", rich.BarColumn(), rich.MofNCompleteColumn())
+    screen = Console(stderr=True, markup=False, emoji=False, highlight=False)
+    times = rich.TimeElapsedColumn(), rich.TimeRemainingColumn(compact=True)
+    with rich.Progress(*columns, *times, console=screen, transient=True, disable=not sys.stderr.isatty()) as bar:
+        bar.add_task(description, total=total)
+        yield bar
 
 
-progress = Progress
+def progress(items: Sequence[Item] | Iterator[Item], description: str, total: int | None = None) -> Iterator[Item]:
+    """Yield items, and show how many are done; `total` is their number if they are no sequence."""
+    with _bar(description, len(items) if isinstance(items, Sequence) else total) as bar:
+        for item in items:
+            yield item
+            bar.advance(bar.task_ids[0])
 
 
-def waiting(description: str) -> Progress[None]:
-    """Return a spinner with the elapsed time, for work of unknown length."""
-    return Progress(None, description, unit="")
+def waiting(description: str) -> AbstractContextManager[Progress]:
+    """A bar for work of unknown length, with the elapsed time."""
+    return _bar(description, None)
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:

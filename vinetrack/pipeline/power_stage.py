@@ -15,7 +15,7 @@ import numpy as np
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.records import SYSTEMATIC_OF_TRAVEL
 from vinetrack.core.tables import PROVENANCE
-from vinetrack.core.terminal import Progress, progress, waiting
+from vinetrack.core.terminal import progress, waiting
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.campaign_power import (
@@ -246,12 +246,7 @@ def _simulated_rates(
         known = filter(math.isfinite, sizes)
         wanted += [(entry.effect, (value, *entry.other_values), entry.probability_at(value)) for value in known]
     seeds = range(request.first_seed, request.first_seed + request.simulate)
-    bar: Progress[None]
-    with progress(len(wanted) * len(seeds), "simulating", unit="campaign") as bar:
-        for effect, values, predicted_rate in wanted:
-            diagnoses = []
-            work = partial(simulated_diagnosis, design, effect, values)
-            for answer in map_unordered(work, seeds, request.jobs):
-                diagnoses.append(answer)
-                bar.advance()
-            yield rates_of(effect, diagnoses, values[0], predicted_rate)
+    for effect, values, predicted_rate in wanted:
+        done = map_unordered(partial(simulated_diagnosis, design, effect, values), seeds, request.jobs)
+        diagnoses = list(progress(done, f"campaigns with {effect or 'nothing missing'}", len(seeds)))
+        yield rates_of(effect, diagnoses, values[0], predicted_rate)

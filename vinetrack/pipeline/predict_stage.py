@@ -187,7 +187,7 @@ def predict_conditions(
     check_figure(figure)
     basis = read_basis(**given)
     with planning_errors():
-        all_inputs = progress(basis.inputs, "predicting", unit="condition")
+        all_inputs = progress(basis.inputs, "predicting")
         predictions = [predict_vine(one, samples=samples, seed=seed, at_fraction=at_fraction) for one in all_inputs]
         content = [_json_entry(prediction) for prediction in predictions]
         several = len(predictions) > 1

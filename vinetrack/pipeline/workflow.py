@@ -443,12 +443,13 @@ def run_chain(experiment: Path, results: Path, cores: int, say: Say, verbose: bo
         told = {COMPILING, *(stage.done for stage in STAGES.values())}
         for line in map(str.rstrip, process.stdout):
             if match := re.fullmatch(r"(\d+) of (\d+) (\w+)", line):  # what a stage says while it works
-                bar.reach(int(match[1]), int(match[2]), match[3])
+                bar.update(bar.task_ids[0], completed=int(match[1]), total=int(match[2]), description=match[3])
             elif line in told:
                 say(line)
                 told -= {COMPILING}
             else:
-                bar.begin(line)
+                bar.remove_task(bar.task_ids[0])
+                bar.add_task(line, total=None)
     if process.returncode:
         # 12: last lines of a run that failed which are printed (chosen)
         explanation = log.read_text(encoding="utf-8").splitlines()[-12:]

@@ -706,11 +706,16 @@ def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFr
     return {"trial": name, "caption": caption, "mp4": path.read_bytes(), "poster": poster.getvalue()}
 
 
-def build_report(content: Mapping[str, Any]) -> str:
+def build_report(content: dict[str, Any]) -> str:
     """Return the page with this content (`report_content`). User text is escaped; only SVG of the package is not."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    form = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    form: dict[str, Any] = {
+        "autoescape": True,
+        "undefined": StrictUndefined,
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+    }
     environment = Environment(loader=PackageLoader("vinetrack.report"), **form)
     environment.filters |= {one.__name__: one for one in (number, with_error, interval)}
     in_templates = (rows, display_unit, bounds_text, listed_names, expected_text, model_errors, final_errors)

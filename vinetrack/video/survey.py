@@ -349,7 +349,7 @@ class Surveyor:
         problems: list[Problem] = []
         opened: dict[Trial, Recording] = {}
         sound: list[Trial] = []
-        for trial in progress(list(trials), "recordings", unit="recording"):
+        for trial in progress(list(trials), "recordings"):
             try:
                 opened[trial] = recording = inspect_recording(trial.video or Path())
                 of_trial = _recording_problems(trial, recording)
@@ -362,7 +362,7 @@ class Surveyor:
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
         of_scale, calibrations = _scale_problems(experiment.settings, experiment.folder, opened)
         self.looked_into = _one_per_condition(sound)
-        for trial in progress(sound, "looking into recordings", unit="recording"):
+        for trial in progress(sound, "looking into recordings"):
             scale = calibrations.get((opened[trial].width, opened[trial].height))
             facts, of_trial = _stated_facts(trial, experiment.settings, opened[trial], scale), []
             if trial in self.looked_into:
