@@ -151,21 +151,11 @@ def join_flags(*flags: str) -> str:
     return ";".join(flag for flag in FLAGS if flag in present)
 
 
-def split_flags(flag: str) -> list[str]:
-    """Split the flags of one point."""
-    return [part for part in flag.split(";") if part]
-
-
 def with_flag(flags: Iterable[str], *names: str) -> NDArray[np.bool_]:
     """Return the mask of points that carry one of these flags. Shape (n_frames,)."""
     texts = np.asarray(flags, dtype=str).tolist()
     carrying = {text for text in set(texts) if not set(names).isdisjoint(text.split(";"))}
     return np.array([text in carrying for text in texts], dtype=bool)
-
-
-def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
-    """Return the mask of points that were moved, dropped or confirmed by hand. Shape (n_frames,)."""
-    return with_flag(flags, "corrected")
 
 
 @dataclass(frozen=True)

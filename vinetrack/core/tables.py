@@ -68,11 +68,6 @@ def file_size(path: Path) -> int:
     return size
 
 
-def is_readable(path: Path) -> bool:
-    """Whether a path leads to a readable regular file or folder."""
-    return os.access(path, os.R_OK) and (path.is_file() or (path.is_dir() and os.access(path, os.X_OK)))
-
-
 def is_disk_full(error: BaseException) -> bool:
     """Whether an error means that the disk is full, or a quota exhausted."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected, with_flag
+from vinetrack.core.records import UNUSABLE_FLAGS, with_flag
 from vinetrack.core.units import with_error
 from vinetrack.figures import style as st
 from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
@@ -91,7 +91,7 @@ def draw_trial_motion(
     """Draw one trial."""
     if kinematics.empty:
         return None
-    unusable, by_hand = with_flag(track["flag"], *UNUSABLE_FLAGS), hand_corrected(track["flag"])
+    unusable, by_hand = with_flag(track["flag"], *UNUSABLE_FLAGS), with_flag(track["flag"], "corrected")
     counts = f"{len(kinematics)} points"
     counts += f", {unusable.sum()} left out (×)" if unusable.any() else ""
     counts += f", {by_hand.sum()} corrected by hand (○)" if by_hand.any() else ""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import FLAGS, UNUSABLE_FLAGS, Floats, hand_corrected, with_flag
+from vinetrack.core.records import FLAGS, UNUSABLE_FLAGS, Floats, with_flag
 from vinetrack.figures import style as st
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     small = _shrunk(strip, 480, 480)
     dark, light = np.nanpercentile(small, [1, 99])
     panel.picture(small, vmin=dark, vmax=light)
-    edge, by_hand = track.edge_px, hand_corrected(track.flag)
+    edge, by_hand = track.edge_px, with_flag(track.flag, "corrected")
     odd = with_flag(track.flag, *set(FLAGS) - {"before_release"}) & ~by_hand
     fine = ~odd & ~by_hand & np.isfinite(edge)
     panel.plot(edge[fine], time_ms[fine], color=st.ORANGE, lw=1.0, label=f"leading edge, N = {fine.sum()}")

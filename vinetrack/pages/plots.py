@@ -38,7 +38,7 @@ from jinja2 import Environment, FileSystemLoader
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import Floats, Trial, hand_corrected
+from vinetrack.core.records import Floats, Trial, with_flag
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS, vine_styles
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.pages.campaign import Campaign, ExplorerTrial, Job, Prediction, condition_labels, drawn_rows
@@ -544,7 +544,7 @@ class FilmPanel:
             if math.isfinite(m)
         ]
         if isinstance(view, RecordingView) and frame < len(view.track):
-            if hand_corrected(view.track["flag"])[frame]:
+            if with_flag(view.track["flag"], "corrected")[frame]:
                 said.append("corrected by hand")
             along_px = view.along_px(positions_m)
             along_px[0] = view.track["edge_px"].iloc[frame]

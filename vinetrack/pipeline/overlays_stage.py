@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.problems import INTERNAL_ERROR, UserError
-from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, hand_corrected, with_flag
+from vinetrack.core.records import UNUSABLE_FLAGS, Floats, PictureAxis, Trial, with_flag
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.core.terminal import table
 from vinetrack.core.units import number
@@ -190,7 +190,7 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
                 edges.append(Edge(label, colour, to_px(position_m), 1e3 * (position_m - measured_m)))
         fitted = read_fit(results).trials if results.fit.exists() else {}
         release_s = fitted[trial].release_s if trial in fitted else release_s
-    by_hand = hand_corrected(track["flag"])
+    by_hand = with_flag(track["flag"], "corrected")
     if by_hand.any():
         edges.append(Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan), by_hand=True))
     return edges, release_s

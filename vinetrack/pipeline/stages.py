@@ -94,7 +94,7 @@ STAGES = {
         "report_stage:write_report",
         (),
         ("<inputs>", "<tracks>", "<kinematics>", "<analysed>", "<pictures>", "<made of model>"),
-        ("<paper>", "report.html", "provenance.json"),  # which figures have content is not known in advance
+        ("report.html", "provenance.json"),  # which figures have content is not known in advance
         "report written",
         parallel=True,
     ),

@@ -6,7 +6,6 @@ Imports stay light: Snakemake loads this module at every start and in every job.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import json
 import math
 import os
@@ -22,9 +21,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, UserError, format_problems
-from vinetrack.core.tables import is_readable, write_text
+from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import table, waiting
-from vinetrack.figures.registry import figures_of
+from vinetrack.core.units import number
 from vinetrack.pipeline.stages import COMPILING, PACKAGE, STAGES, Kept, Stage, code_hash, identity
 from vinetrack.results.folder_layout import Results, read_diagnosis, read_fit, read_result
 
@@ -45,15 +44,14 @@ CLAIM_FILE = "experiment.json"  # File of a results folder that names its experi
 
 def find_experiment(folder: Path) -> Path:
     """Return `folder` if it exists."""
+    from vinetrack.experiment.sheet import closest_entry
+
     if folder.exists():
         return folder
-    parent = next(above for above in folder.absolute().parents if above.is_dir())
-    names = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
-    close = difflib.get_close_matches(folder.absolute().relative_to(parent).parts[0], names, 1, 0.5)
-    experiments = [name for name in names if (parent / name / "trials.csv").is_file()][:3]
-    shown = ", ".join(os.path.relpath(parent / name) for name in close or experiments or [""])
-    others = "existing experiments are" if experiments else "the nearest existing folder is"
-    remedy = f"did you mean {shown}?" if close else f"{others} {shown}"
+    missing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.parent.is_dir())
+    close = closest_entry(missing)
+    near = os.path.relpath(missing.with_name(close) if close else missing.parent)
+    remedy = f"did you mean {near}?" if close else f"the nearest existing folder is {near}"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
 
 
@@ -147,12 +145,6 @@ def begin_run(results: Path, experiment: Path) -> FileLock:
 # ------------------------------------------------------------------------------
 # What the Snakefile asks: the plan of a run with its inputs and outputs.
 
-# Additional tables of an experiment that is compared with published numbers
-PAPER_TABLES = (
-    "paper", "paper_departures", "paper_motions", "paper_means", "paper_positions", "paper_pressures", "paper_speeds",
-    "paper_speed_curves",
-)  # fmt: skip
-
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 
 TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings of a job take a minute or a few)
@@ -173,7 +165,6 @@ class WorkflowPlan:
     unwatched: str
     settings: RunSettings
     ground_truth: Path | None
-    published: bool
 
     @property
     def version_file(self) -> str:
@@ -209,10 +200,6 @@ class WorkflowPlan:
         if group == "<pictures>":
             filmed = [trial for trial in trials if trial in self.filmed]
             return [*self._figures("trial_", trials), *self._figures("strip_", filmed)]
-        if group == "<paper>":
-            if not self.published:
-                return []
-            return [*(self.result(f"{name}.csv") for name in PAPER_TABLES), *self._figures("", figures_of("paper"))]
         kinds = {"<experiment>": (True,), "<measurements>": (False,), "<inputs>": (True, False)}[group]
         return [path.as_posix() for path in self.inputs if _is_stated(path) in kinds]
 
@@ -266,7 +253,11 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         raise ExperimentError(problems)
     refuse_shared_results(results, folder)
     # The virtual laboratory has yet to make the measurements of its experiments.
-    inputs = [path for path in input_files(experiment) if is_readable(path) or (ground_truth and not _is_stated(path))]
+    inputs = [
+        path
+        for path in input_files(experiment)
+        if (os.access(path, os.R_OK) and (path.is_file() or path.is_dir())) or (ground_truth and not _is_stated(path))
+    ]
     unwatched = [identity(path) for path in inputs if has_wildcard(path)]
     return WorkflowPlan(
         experiment=folder,
@@ -277,7 +268,6 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         unwatched=repr(unwatched),
         settings=settings,
         ground_truth=ground_truth,
-        published=experiment.settings.published is not None,
     )
 
 
@@ -491,18 +481,10 @@ def comparison_lines(folder: Path) -> list[str]:
     fit, compared = read_fit(results), read_result(results.comparison)
     if fit.refused:
         return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"]
-    columns = (  # heading, unit, column, factor, decimals
-        ("rms position", "mm", "rms_position_m", 1e3, 3),
-        ("replicates", "mm", "replicate_floor_m", 1e3, 3),
-        ("adequate from", "mm", "expected_low_m", 1e3, 3),
-        ("to", "mm", "expected_high_m", 1e3, 3),
-        ("rms final speed", "m/s", "rms_final_velocity_m_s", 1, 3),
-        ("worst at", "ms", "worst_at_s", 1e3, 1),
-        ("", "mm", "worst_at_m", 1e3, 1),
-    )
-    cells = [compared["condition"].tolist()]
-    for _, _, name, factor, decimals in columns:
-        cells.append([f"{factor * v:.{decimals}f}" if math.isfinite(v) else "–" for v in compared[name].tolist()])
-    headings, units, *_ = zip(*columns, strict=True)
-    lines = table(zip(*cells, strict=True), ("condition", *headings), ("", *units), align="<>>>>>>>")
+    in_mm = ("rms_position_m", "replicate_floor_m", "expected_low_m", "expected_high_m")
+    scale = dict.fromkeys(in_mm, 1e3) | {"rms_final_velocity_m_s": 1.0, "worst_at_s": 1e3, "worst_at_m": 1e3}
+    shown = (compared[[*scale]] * [*scale.values()]).map(number)
+    head = ("condition", "rms position", "replicates", "adequate from", "to", "rms final speed", "worst at", "")
+    rows = zip(compared["condition"], *(shown[name] for name in scale), strict=True)
+    lines = table(rows, head, ("", "mm", "mm", "mm", "mm", "m/s", "ms", "mm"), align="<>>>>>>>")
     return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)]

@@ -12,13 +12,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from html import escape
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from vinetrack.core import published
 from vinetrack.core.units import display_unit, interval, number, with_error
@@ -246,17 +246,14 @@ def upper_limits(ranking: Sequence[Candidate], effects: Mapping[str, Effect]) ->
 
 def tied_pairs(entry: Round) -> list[str]:
     """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
-    names, matrix = entry.cosine_names, entry.cosines
+    names = list(map(spaced_name, entry.cosine_names))
     pairs = [
-        (abs(matrix[i][j]), names[i], names[j], matrix[i][j])
-        for i in range(len(matrix))
-        for j in range(i)
-        if is_finite(matrix[i][j]) and abs(matrix[i][j]) >= TIED_COSINE
+        (abs(value), f"{names[j]} and {names[i]} (cosine {number(value)})")
+        for i, row in enumerate(entry.cosines)
+        for j, value in enumerate(row[:i])
+        if is_finite(value) and abs(value) >= TIED_COSINE
     ]
-    return [
-        f"{spaced_name(b)} and {spaced_name(a)} (cosine {number(value)})"
-        for _, a, b, value in sorted(pairs, reverse=True)
-    ]
+    return [text for _, text in sorted(pairs, reverse=True)]
 
 
 def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -481,9 +478,9 @@ def calibration_table(calibrations: Mapping[str, Mapping[str, Any]]) -> list[dic
     """Return one row per calibration, with its results and its trials."""
     groups: dict[tuple[Any, ...], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, one in calibrations.items():
-        key = (one["kind"], one["image"], one["n_corners"], one["reprojection_px"], *one["notes"])
-        own = (one["mm_per_px"],) if one["kind"] == "sheet" else ()
-        groups.setdefault((*key, *own), []).append((name, one))
+        own = one["mm_per_px"] if one["kind"] == "sheet" else None
+        key = (one["kind"], one["image"], one["n_corners"], one["reprojection_px"], *one["notes"], own)
+        groups.setdefault(key, []).append((name, one))
     return list(map(_calibration_row, groups.values()))
 
 
@@ -551,26 +548,21 @@ def _csv(table: pd.DataFrame) -> str:
 
 def speed_sparkline(curve: pd.DataFrame, steady_s: tuple[float, float]) -> Markup:
     """Return the speed of a trial as a small SVG, its steady window thick; blank if there is nothing to draw."""
-    spark_px = (132, 30)  # Width and height of the small curve of a trial (chosen)
+    width, height = 132, 30  # of the small curve of a trial, px (chosen)
     known = curve[np.isfinite(curve["time_s"]) & np.isfinite(curve["lead_velocity_m_s"])]
-    known = known.iloc[:: max(len(known) // spark_px[0], 1)]
+    known = known.iloc[:: max(len(known) // width, 1)]
     time_s, speed_m_s = (known[name].to_numpy(dtype=float) for name in ("time_s", "lead_velocity_m_s"))
     if len(known) < 2 or np.ptp(time_s) <= 0:
         return Markup()
-    width, height = spark_px
     top = max(float(np.percentile(speed_m_s, 99)), 1e-12)
     x = 1 + (width - 2) * (time_s - time_s[0]) / np.ptp(time_s)
     y = np.clip(height - 2 - (height - 5) * speed_m_s / top, 1, height - 1)
-    steady = (time_s >= steady_s[0]) & (time_s <= steady_s[1])
-    thick = f'<polyline class="steady" points="{_polyline(x[steady], y[steady])}"/>' if steady.sum() > 1 else ""
+    points = [f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True)]
+    thin, thick = " ".join(points), " ".join(compress(points, (time_s >= steady_s[0]) & (time_s <= steady_s[1])))
     return Markup(
         f'<svg class="spark" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-        f'aria-hidden="true"><polyline points="{_polyline(x, y)}"/>{thick}</svg>'
+        f'aria-hidden="true"><polyline points="{thin}"/><polyline class="steady" points="{thick}"/></svg>'
     )
-
-
-def _polyline(x: NDArray[np.float64], y: NDArray[np.float64]) -> str:
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
 
 
 # ------------------------------------------------------------------------------
@@ -721,9 +713,8 @@ def build_report(content: dict[str, Any]) -> str:
     in_templates = (rows, display_unit, bounds_text, listed_names, expected_text, model_errors, final_errors)
     environment.globals |= {one.__name__: one for one in (*in_templates, inline_picture, data_uri, base64_uri)}
     sections = {name: figure.section for name, figure in all_figures().items()}
-    figures: dict[str, list[ReportFigure]] = {section: [] for section in sections.values()}
-    for figure in content["figures"]:
-        figures[sections.get(figure.key, "damping")].append(figure)
+    drawn = [(sections.get(one.key, "damping"), one) for one in content["figures"]]
+    figures = {part: [one for section, one in drawn if section == part] for part in sections.values()}
     trials, n_left_out = trial_entries(content)
     laws = [
         (vine, law, method)

@@ -15,7 +15,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, hand_corrected, join_flags
+from vinetrack.core.records import Bools, Floats, Indices, Track, Trial, join_flags, with_flag
 
 # ------------------------------------------------------------------------------
 # Detect positions that were smoothed before they were handed in, by the frequencies that their noise lacks.
@@ -466,7 +466,7 @@ def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
     is_wild = find_outliers(track.time_s[rows], track.lead_position_m[rows], spare_copies=spare_copies)
     outlying = rows[is_wild]
     # A point that a person has placed or confirmed is right.
-    outlying = outlying[~hand_corrected(track.flag[outlying])] if outlying.size else outlying
+    outlying = outlying[~with_flag(track.flag[outlying], "corrected")] if outlying.size else outlying
     if not outlying.size:
         return track
     flag = track.flag.astype("<U80")
