@@ -194,7 +194,7 @@ def _column_parameter(column: Column, meaning: str) -> inspect.Parameter:
     info = typer.Option(
         option(column.name),
         help=meaning or f"{column.meaning.rstrip('.')}{unset}.",
-        metavar=column.scale.metavar if column.scale else "NUMBER",
+        metavar=(column.unit_key or "number").upper(),
         rich_help_panel="The vine" if column.name.startswith(of_vine) else "The rig",
         show_default=False,
     )

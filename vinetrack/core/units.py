@@ -95,7 +95,6 @@ class Unit:
     text: str
     multiply: float = 1.0
     divide: float = 1.0
-    metavar: str = "NUMBER"
 
     def to_si(self, value: float) -> float:
         """Return a value in SI."""
@@ -110,12 +109,10 @@ def _units(scales: dict[str, str]) -> Iterator[tuple[str, Unit]]:
     """Yield the units of a table that states, by SI unit, `name=multiply/divide` of each."""
     texts = {"um": "µm", "m": "metres", "us": "µs", "cm3": "cm³", "l": "litres", "m3": "m³", "deg": "degrees"}
     texts |= {"rad": "radians", "g_cm3": "g/cm³", "kg_m3": "kg/m³", "fps": "frames per second"}
-    metavars = {"kPa": "KPA", "MPa": "MPA", "um": "UM", "mm": "MM", "g": "GRAMS", "l": "LITRES", "deg": "DEGREES"}
     for si, units in scales.items():
         for name, _, scale in (unit.partition("=") for unit in units.split()):
             multiply, _, divide = scale.partition("/")
-            metavar = metavars.get(name, "NUMBER")
-            yield name, Unit(si, texts.get(name, name), float(multiply), float(divide or 1), metavar)
+            yield name, Unit(si, texts.get(name, name), float(multiply), float(divide or 1))
 
 
 # Units by the suffix of a name

@@ -77,11 +77,7 @@ def choose_fit(folder: Path, anyway: bool = False) -> tuple[FitSummary, tuple[st
         return final, (str(remark("from_final_model", added=added)),)
     verdict = f"{diagnosis.final_verdict or diagnosis.verdict}: {diagnosis.explanation}"
     if not anyway:
-        reason = (
-            f"because the fit with {added} is not stored there: run the diagnosis again"
-            if diagnosis.final_verdict == ADEQUATE
-            else "because the diagnosis refuted the model and found none that describes the trials"
-        )
+        reason = "because the diagnosis refuted the model, and no fit of one that describes the trials is there"
         raise ResultsError(f"{folder}: no prediction, {reason}; or predict from it with --anyway. {verdict}")
     caution = remark("from_refuted_model", model=f"the model with {added} added" if final else "the model in use")
     return final or in_use, (f"! {verdict}", f"! {caution}")
@@ -216,18 +212,19 @@ def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
             rows.append((one.symbol, median, band, display_unit(one.unit, PREDICTION_UNITS)[0], str(one.origin)))
     yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
-    quantities = [_quantity_row(quantity) for quantity in prediction.quantities]
-    yield from table(quantities, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
+    head = ("prediction", "at y/L", "median", "90 % band", "unit")
+    yield from table(map(_quantity_row, prediction.quantities), head, align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
     yield from table([(share.name, speed_band_text(share), str(share.why)) for share in prediction.shares], head)
     # 0.005: smallest relative change of the final speed for which a neglected effect is listed (chosen)
-    listed = [omitted for omitted in prediction.neglected if abs(omitted.change) >= 0.005]
-    speeds = [" → ".join(value_in_unit(m_s, "m/s") for m_s in (one.without_m_s, one.final_m_s)) for one in listed]
-    if listed:
-        yield ""
-        changes = [(o.effect, o.size, f"{m_s} m/s", f"{o.change:+.1%}") for o, m_s in zip(listed, speeds, strict=True)]
-        yield from table(changes, ("not in the model", "at the size", "final speed", "change"))
+    changes = [
+        (one.effect, one.size, f"{number(one.without_m_s)} → {number(one.final_m_s)} m/s", f"{one.change:+.1%}")
+        for one in prediction.neglected
+        if abs(one.change) >= 0.005
+    ]
+    if changes:
+        yield from ("", *table(changes, ("not in the model", "at the size", "final speed", "change")))
     yield ""
     yield from (f"! {warning}" for warning in prediction.hazards)
 
@@ -250,15 +247,10 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
 def _table_lines(predictions: Sequence[VinePrediction]) -> Iterator[str]:
     """Yield a table with one row per condition."""
     yield str(remark("medians_and_bands", model=predictions[0].inputs.model.names, samples=predictions[0].samples))
-    rows = [
-        (
-            prediction.inputs.trial.condition,
-            *_quantity_row(prediction.final)[1:4],
-            *_quantity_row(prediction[TIME])[2:4],
-            f"{prediction.slack:.0%}",
-        )
-        for prediction in predictions
-    ]
+    rows = []
+    for prediction in predictions:
+        speed, time = _quantity_row(prediction.final)[1:4], _quantity_row(prediction[TIME])[2:4]
+        rows.append((prediction.inputs.trial.condition, *speed, *time, f"{prediction.slack:.0%}"))
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
     if any(prediction.inputs.trial.payload_kg > 0 for prediction in predictions):
@@ -343,18 +335,12 @@ def design_vine(
     if figure is not None:
         write_figure(draw_choice(choices), figure)
         lines.append(f"Figure: {figure}")
-    entries = [
-        {
-            **{name: COLUMNS[name].of_trial(choice.prediction.inputs.trial) for name in REQUIRED_FOR_PREDICTION},
-            "final_speed_m_s": {
-                "y_over_L": (final := choice.prediction.final).y_over_L,
-                **{"median": final.median, "low_90": final.low, "high_90": final.high},
-            },
-            "fastest_in_share_of_draws": choice.odds,
-            "limited_by": list(choice.limits),
-        }
-        for choice in choices
-    ]
+    entries = []
+    for choice in choices:
+        trial, final = choice.prediction.inputs.trial, choice.prediction.final
+        speed = {"y_over_L": final.y_over_L, "median": final.median, "low_90": final.low, "high_90": final.high}
+        entry = {name: COLUMNS[name].of_trial(trial) for name in REQUIRED_FOR_PREDICTION} | {"final_speed_m_s": speed}
+        entries.append({**entry, "fastest_in_share_of_draws": choice.odds, "limited_by": list(choice.limits)})
     return lines, {"warnings": basis.heading, "films": entries}
 
 
@@ -420,9 +406,7 @@ def design_reservoir(
         lines.append(f"! {remark('supply_needs_wall')}")
     if figure is not None:
         drawn_m3 = swept * np.geomspace(3.0, 300.0, 200)
-        drawn = [_losses(trial, volume_m3) for volume_m3 in drawn_m3.tolist()]
-        losses = {law: np.array([one[law] for one in drawn]) for law in GAMMAS}
-        write_figure(draw_reservoir(drawn_m3, losses, loss, swept, trial.chamber_m3), figure)
+        write_figure(draw_reservoir(drawn_m3, _losses(trial, drawn_m3), loss, swept, trial.chamber_m3), figure)
         lines.append(f"Figure: {figure}")
     entries = [
         {"chamber": name, "volume_l": 1e3 * volume_m3, "loss_of_gauge_pressure": lost[name]}
@@ -431,8 +415,8 @@ def design_reservoir(
     return lines, {"warnings": basis.heading, "chambers": entries}
 
 
-def _losses(trial: Trial, volume_m3: float) -> dict[str, float]:
-    """Fraction of the gauge pressure that a chamber loses, by the gas law."""
+def _losses(trial: Trial, volume_m3: Any) -> dict[str, Any]:
+    """Fraction of the gauge pressure that a chamber, or each of several, loses, by the gas law."""
     return {law: gauge_loss(trial, volume_m3, gamma) for law, gamma in GAMMAS.items()}
 
 
