@@ -51,11 +51,6 @@ def missing_file_message(path: Path) -> tuple[str, str]:
     return "does not exist", "check the path and its upper and lower case"
 
 
-def is_pipe_or_device(path: Path) -> bool:
-    """Whether a path leads to something other than a file or folder, reading which may block or never end."""
-    return os.access(path, os.F_OK) and not (path.is_file() or path.is_dir())
-
-
 def file_size(path: Path) -> int:
     """Return the size of a readable regular file."""
     size = path.stat().st_size

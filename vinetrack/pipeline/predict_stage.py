@@ -212,8 +212,8 @@ def _condition_lines(prediction: VinePrediction) -> Iterator[str]:
             rows.append((one.symbol, median, band, display_unit(one.unit, PREDICTION_UNITS)[0], str(one.origin)))
     yield from table(rows, ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
-    head = ("prediction", "at y/L", "median", "90 % band", "unit")
-    yield from table(map(_quantity_row, prediction.quantities), head, align="<<><<")
+    columns = ("prediction", "at y/L", "median", "90 % band", "unit")
+    yield from table(map(_quantity_row, prediction.quantities), columns, align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
     yield from table([(share.name, speed_band_text(share), str(share.why)) for share in prediction.shares], head)

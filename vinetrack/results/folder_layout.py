@@ -112,14 +112,11 @@ class Results:
     analysed = _Named("analysed", ".json")  # A trial's contribution to the tables of the experiment
     trajectories = _Named("comparison", ".csv")  # Measured and modelled trajectories of one condition
     predictions = _Named("diagnosis/predictions", ".csv")  # Predictions of one trial, by the initial and final model
+    diagnosed = _Named("diagnosis")  # Another file of the diagnosis
     overlay = _Named("overlays", ".mp4")  # The clip of one trial with the edges drawn
     figure = _Named("figures")  # A figure of the whole experiment
     trial_figure = _Named("figures", prefix="trial_")  # The figure of one trial
     strip_figure = _Named("figures", prefix="strip_")  # The strip of one recording with its tracked edge
-
-    def diagnosed(self, name: str) -> Path:
-        """Return a file of the folder `diagnosis`."""
-        return self.folder / "diagnosis" / name
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import SIDE_FILES, Floats, Trial
-from vinetrack.core.tables import NOT_A_FILE, file_size, is_pipe_or_device
+from vinetrack.core.tables import NOT_A_FILE, file_size
 from vinetrack.video.frames import (
     IMAGES,
     Frames,
@@ -410,7 +410,7 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
     images = sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGES and not f.name.startswith("."))
     if not images:
         raise RecordingError("the folder holds no images", "expected PNG, JPEG, TIFF or DNG frames", folder.name)
-    if unreadable := next(filter(is_pipe_or_device, images), None):
+    if unreadable := next((one for one in images if not (one.is_file() or one.is_dir()) and one.exists()), None):
         raise RecordingError(f"{unreadable.name} cannot be read: {NOT_A_FILE}", name=folder.name)
     groups: dict[tuple[str, str], list[tuple[int, Path]]] = {}
     for file in images:
