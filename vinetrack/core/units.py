@@ -75,14 +75,14 @@ def interval(bounds: Sequence[float | None] | None) -> str:
     return f"{low:.{places}f} to {high:.{places}f}"
 
 
-def with_interval(value: float | None, bounds: Sequence[float | None] | None, shown: bool = True) -> str:
+def with_interval(value: float | None, bounds: Sequence[float | None] | None) -> str:
     """Return `value (95 %: low to high)`, with decimals that suit the width; without bounds the value."""
     low, high = map(or_nan, bounds or (None, None))
     if value is None or not math.isfinite(low + high):
         return number(value)
     half = float(f"{(high - low) / 2:.1e}")  # 0.00999 rounds to 0.010
     places = min(decimals(half), 6) if half > 0 else 3
-    return f"{value:.{places}f}" + (f" (95 %: {low:.{places}f} to {high:.{places}f})" if shown else "")
+    return f"{value:.{places}f} (95 %: {low:.{places}f} to {high:.{places}f})"
 
 
 @dataclass(frozen=True)
