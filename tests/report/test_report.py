@@ -31,6 +31,9 @@ EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
 
 
+CLIP = {"trial": "a", "caption": "caption", "mp4": b"film", "poster": b"frame"}
+
+
 def damping(*vines: str, refused: str | None = None) -> dict:
     law = {"B": 2.0, "B_95": [1.9, 2.1], "B_95_total": [1.8, 2.2], "R2": 0.98, "n_trials": 4}
     law |= {"diameter_mm": 12.0, "thickness_um": 100.0}
@@ -73,14 +76,6 @@ def page(**changes: object) -> str:
     return build.build_report({**content, **changes})
 
 
-def further(title: str, paragraphs: list, tables: list, figures: list) -> dict:
-    return {"key": "paper", "title": title, "paragraphs": paragraphs, "tables": tables, "figures": figures}
-
-
-def clip(caption: str, mp4: bytes = b"film") -> dict:
-    return {"trial": "a", "mp4": mp4, "caption": caption, "poster": b"frame"}
-
-
 class Tags(HTMLParser):
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -112,9 +107,10 @@ def test_whatever_a_user_wrote_and_whatever_stands_in_the_file_is_escaped():
     content["drift"][0]["sentence"] = content["next_experiment"]["text"] = EVIL
     content["next_experiment"]["calibration"] = content["rounds"][0]["explanation"] = EVIL
     content["rounds"][0]["ranking"][0] |= {"reason": EVIL, "effect": EVIL}
-    figure, section = build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL), further(EVIL, [EVIL], [table], [])
+    section = {"key": "paper", "title": EVIL, "paragraphs": [EVIL], "tables": [table], "figures": []}
+    figure = build.ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL)
     given = {"name": EVIL, "damping": fit, "provenance": PROVENANCE | written, "figures": [figure]}
-    given |= {"clips": {"a": "overlays/a.mp4"}, "clip": clip(EVIL)}
+    given |= {"clips": {"a": "overlays/a.mp4"}, "clip": CLIP | {"caption": EVIL}}
     given |= result(messages=[EVIL], warnings=[EVIL]) | {"sections": [section]}
     rows = {"trials": trials(EVIL, reason=EVIL), "windows": windows(EVIL).assign(rule=EVIL, reason=EVIL)}
     for html in (page(**rows), page(damping=unfitted), page(**given), shown(content)):
@@ -129,7 +125,7 @@ def test_the_page_is_one_file_with_the_numbers_of_its_figures_that_asks_for_noth
     figure = build.ReportFigure("own", "Own", "caption", SVG, "o.csv", "a\n1\n")
     html = page(
         figures=[build.ReportFigure("law", "Law", "caption", SVG, "points.csv", "µ,b\n1,2\n")],
-        sections=[further("The paper", ["Beside it."], [table], [figure])],
+        sections=[{"key": "paper", "title": "The paper", "paragraphs": ["By"], "tables": [table], "figures": [figure]}],
         trials=trials("a", "b", status="failed", reason="fewer than 5 points"),
         windows=windows(),
     )
@@ -320,7 +316,7 @@ def recordings(*names: str) -> dict:
 
 
 def test_strip_and_motion_stand_side_by_side_with_calibration_and_clips():
-    clips = {"clips": {"a": "overlays/a.mp4"}, "clip": clip("caption")}
+    clips = {"clips": {"a": "overlays/a.mp4"}, "clip": CLIP}
     html = page(motions={"a": SVG}, **recordings("a"), **clips)
     for once in ('<div class="pair">', 'aria-label="Strip of a with its tracked edge"', 'aria-label="Motion of a"'):
         assert html.count(once) == 1
@@ -363,7 +359,7 @@ def address(tmp_path_factory):
         motions=dict.fromkeys(names, pictures["before_after"]),
         strips=dict.fromkeys(names, pictures["ladder"]),
         flags=dict.fromkeys(names, ("", "doubtful")),
-        clip=clip("caption", (folder / "a.mp4").read_bytes()) | {"trial": names[0], "poster": b""},
+        clip={"trial": names[0], "caption": "caption", "mp4": (folder / "a.mp4").read_bytes(), "poster": b""},
         diagnosis=replace(Diagnosis.from_json(diagnosis("ambiguous")), ladder=steps),
         moved=moved(),
     )
