@@ -38,7 +38,6 @@ from vinetrack.pages import controls
 from vinetrack.pages.campaign import BackgroundFit, Campaign, Job, choice_in_use, commands, predict_choice, slider_range
 from vinetrack.pages.page import Page, open_campaign, start_server
 from vinetrack.pages.plots import RecordingView, decode, recording_view
-from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.video.axis import Axis
 
@@ -298,13 +297,13 @@ def test_the_proposed_effect_is_opened_fitted_and_saved(opened, tmp_path, monkey
     browser, reopened = opened
     folder, going_on = tmp_path / "vines", threading.Event()
 
-    def search(experiment, results: Path, to: Path | None, told: Callable[[str], None]) -> WrittenProposal:
+    def search(experiment, results: Path, to: Path | None, told: Callable[[str], None]) -> tuple[list, list]:
         assert (experiment.folder, results, to) == (folder, tmp_path / "results", None)
         told("learning the missing force as a table")
         assert going_on.wait(60)
         path = write_effect(folder)
         remember(path)
-        return WrittenProposal(("A law of the travel does.", f"Written to {path}."), (path,))
+        return ["A law of the travel does.", f"Written to {path}."], [path]
 
     monkeypatch.setattr(controls, "propose_effect", search)
     assert browser.model("propose_panel").visible
@@ -356,7 +355,7 @@ def test_a_stopped_or_failed_search_can_be_restarted(opened, monkeypatch):
     torn = browser.page.campaign.experiment.folder / "no law.py"
     torn.write_text("def tail_force(", encoding="utf-8")
     failures: list[Callable] = [Mock(side_effect=ResultsError("no law"))]
-    for search in (*failures, lambda *_: WrittenProposal(("no law",), ()), lambda *_: WrittenProposal((), (torn,))):
+    for search in (*failures, lambda *_: (["no law"], []), lambda *_: ([], [torn])):
         monkeypatch.setattr(controls, "propose_effect", search)
         browser.click("propose")
         browser.until(lambda: "no law" in browser.text("proposal"))

@@ -137,8 +137,8 @@ def _propose(results: Path, to: Path | None, experiment: Path | None, report: Sa
     from vinetrack.pipeline.effects_stage import propose_effect
     from vinetrack.results.folder_layout import read_source_experiment
 
-    proposal = propose_effect(read_source_experiment(results, experiment), results, to, report)
-    return proposal.lines, {"lines": proposal.lines, "files": proposal.files}
+    lines, files = propose_effect(read_source_experiment(results, experiment), results, to, report)
+    return lines, {"lines": lines, "files": files}
 
 
 @command()

@@ -209,13 +209,13 @@ def propose_and_read(
     """Propose an effect and write it to the experiment's folder; return what is said of it, and the campaign read anew
     with the first of its files (the law, if there is one) in the model, if there are files.
     """
-    written = propose_effect(campaign.experiment, campaign.folder, None, on_progress)
-    proposed = {effect.name: effect for effect in map(load_effect, written.files)}
+    lines, files = propose_effect(campaign.experiment, campaign.folder, None, on_progress)
+    proposed = {effect.name: effect for effect in map(load_effect, files)}
     if not proposed:
-        return written.lines, None
+        return lines, None
     known = {name: effect for name, effect in campaign.effects.items() if name not in proposed}
     read = read_campaign(campaign.folder, campaign.experiment, known | proposed)
-    return written.lines, BackgroundFit(read, choice_in_use(read).with_effect(next(iter(proposed))))
+    return lines, BackgroundFit(read, choice_in_use(read).with_effect(next(iter(proposed))))
 
 
 class ProposalPanel:

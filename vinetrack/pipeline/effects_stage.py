@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -73,16 +73,8 @@ def model_problems(experiment: Experiment) -> list[Problem]:
 Report = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class WrittenProposal:
-    """Lines for the terminal, and the effect files written, the law first."""
-
-    lines: tuple[str, ...]
-    files: tuple[Path, ...]
-
-
-def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> WrittenProposal:
-    """Write the force law that explains a misfit which no effect of the catalogue explains, or else a learned table."""
+def propose_effect(experiment: Experiment, folder: Path, to: Path | None, say: Report) -> tuple[list[str], list[Path]]:
+    """Write the law of a force that no effect of the catalogue explains, and its table; return lines, and the files."""
     from vinetrack.diagnosis.propose import effect_text, propose, table_text
     from vinetrack.diagnosis.result import UNEXPLAINED
     from vinetrack.narrative.diagnosis_text import proposal_lines
@@ -102,7 +94,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), user_effects)
     pairs, _ = measured_trials(experiment, results)
-    proposal = propose(model, pairs, report)
+    proposal = propose(model, pairs, say)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal_lines(proposal)]
     origin = (
@@ -131,4 +123,4 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     if files:
         settings = experiment.folder / "experiment.yaml"
         lines.append(f"To test it in the diagnosis, list it under `effects:` in {settings}.")
-    return WrittenProposal(tuple(lines), tuple(paths))
+    return lines, paths
