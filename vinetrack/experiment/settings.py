@@ -7,7 +7,6 @@ that are not allowed are reported together.
 
 from __future__ import annotations
 
-import ast
 import math
 import os
 import re
@@ -47,7 +46,9 @@ Pixel = tuple[Number, Number]
 class _Strict(BaseModel):
     """Base of all settings: immutable, without unknown keys, NaN or infinity."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True, use_attribute_docstrings=True
+    )
 
     @classmethod
     def read_from(cls, document: YamlDocument, file: str) -> Self:
@@ -451,18 +452,8 @@ class Entry(NamedTuple):
     measured: str = ""
 
 
-def _meanings(model: type[BaseModel]) -> dict[str, str]:
-    """The string below each key of a model. Read here alone: pydantic would read them at every start, in 0.1 s."""
-    own = ast.parse(Path(__file__).read_text(encoding="utf-8")).body
-    bodies = {part.name: part.body for part in own if isinstance(part, ast.ClassDef)}
-    rows = chain(*(pairwise(bodies.get(one.__name__, ())) for one in reversed(model.__mro__)))
-    texts = [(key, text.value) for key, text in rows if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)]
-    return {ast.unparse(key.target): " ".join(ast.literal_eval(text).split()) for key, text in texts}
-
-
 def setting_entries(model: type[BaseModel], prefix: str = "", suffix: str = "") -> Iterator[Entry]:
     """Yield the entries of all keys of a settings model that are not columns; keys of a group as `group.key`."""
-    meanings = _meanings(model)
     for name, field in model.model_fields.items():
         if name == "kind" or (model is ExperimentSettings and name in SHARED):
             continue
@@ -472,8 +463,8 @@ def setting_entries(model: type[BaseModel], prefix: str = "", suffix: str = "") 
             continue
         key = split_unit(name)[1]
         unit = UNITS[key].text if key else "mm/px" if name == "mm_per_px" else "px" if name.endswith("_px") else ""
+        meaning = " ".join((field.description or "").split())
         measured = next((text for text in field.metadata if isinstance(text, str)), "")
-        meaning = meanings.get(name, "")
         yield Entry(f"{prefix}{name}{suffix}", unit, _default(name, field), _allowed(field), meaning, measured)
         if isinstance(field.default, BaseModel):
             yield from setting_entries(type(field.default), f"{name}.")
