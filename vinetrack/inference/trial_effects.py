@@ -55,9 +55,9 @@ def products_at_releases(
     curves: Floats,
     rho: float,
 ) -> Floats:
-    """Whitened cross products of the columns and residual of a trial for each candidate release. Equivalent to
-    `gaussian_processes.whiten` and a matrix product for each release. Curves are interpolated linearly, and constant beyond the
-    ends of the grid. The last column is the residual. Shapes: time_s, position_m, first, relative_sd (n_points,);
+    """Whitened cross products of the columns and residual of a trial for each candidate release. Equivalent to `whiten`
+    and a matrix product for each release. Curves are interpolated linearly, and constant beyond the ends of the grid.
+    The last column is the residual. Shapes: time_s, position_m, first, relative_sd (n_points,);
     releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) → (n_releases, n_columns, n_columns).
     """
     count, size, last = len(curves), len(time_s), len(grid_s) - 1

@@ -94,11 +94,6 @@ class LineFit:
     bend_m_s: float
     bend_sigma_m_s: float
 
-    @property
-    def drift_95(self) -> tuple[float, float]:
-        """95 % interval of the drift."""
-        return self.drift - 1.96 * self.drift_sigma, self.drift + 1.96 * self.drift_sigma
-
 
 def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -> LineFit:
     """Fit the raw positions of one window of at least three points by least squares, with errors for AR(1) noise. Where
@@ -152,7 +147,7 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
         x_ss_m_s=kinematics.travel_ratio * fit.speed_m_s,
         x_ss_sigma_m_s=kinematics.travel_ratio * math.hypot(fit.speed_sigma_m_s, bend),
         drift=fit.drift,
-        drift_95=fit.drift_95,
+        drift_95=(fit.drift - 1.96 * fit.drift_sigma, fit.drift + 1.96 * fit.drift_sigma),
         cv=float(velocity.std(ddof=1) / abs(velocity.mean())) if velocity.mean() != 0 else math.nan,
     )
 
@@ -160,7 +155,6 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
 BAND = 0.5  # Half width of the band that contains every velocity, in drift limits (derived)
 
 SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (derived)
-
 
 BAND_SIGMAS = 4.0  # Standard errors by which a single velocity may lie outside the band
 

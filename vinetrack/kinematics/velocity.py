@@ -125,10 +125,9 @@ def correlated(weights: Floats, rho: float) -> Floats:
     """
     if rho == 0 or weights.size == 0:
         return weights
-    before, after = np.array(weights, order="C"), np.array(weights[..., ::-1], order="C")
-    for sums in (before, after):
-        _add_up(sums.reshape(-1, sums.shape[-1]), rho)
-    return before + after[..., ::-1] - weights
+    both_ways = np.array([weights, weights[..., ::-1]])
+    _add_up(both_ways.reshape(-1, weights.shape[-1]), rho)
+    return both_ways[0] + both_ways[1, ..., ::-1] - weights
 
 
 @njit(nogil=True)
