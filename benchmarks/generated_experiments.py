@@ -136,7 +136,6 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
     figures : whether figures are drawn and the report is written.
     """
     from vinetrack.pipeline.stages import STAGES, Job
-    from vinetrack.pipeline.trials import TRIAL_NOT_ANALYSED
 
     read = read_experiment(folder)
     job = Job(read, results, run_settings(SETTINGS))
@@ -150,7 +149,7 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
         except Exception:
             return [f"{name}: {traceback.format_exc()}"]
     rows = [read_json(Results(results).analysed(name))["row"] for name in read.names if name not in read.left_out]
-    faults = [f"tracks: {row['trial']}: {row['reason']}" for row in rows if row["reason"] == TRIAL_NOT_ANALYSED]
+    faults = [f"tracks: {row['trial']}: {row['reason']}" for row in rows if INTERNAL_ERROR in row["reason"]]
     refused = {path.stem: read_json(path)["refused"] for path in (Results(results).fit, Results(results).diagnosis)}
     return [*faults, *(f"{stage}: {reason}" for stage, reason in refused.items() if reason == INTERNAL_ERROR)]
 

@@ -163,8 +163,8 @@ def test_commands_and_explorer_give_the_numbers_of_the_files(small_run, loaded):
     said, compared = run("compare", small_run), loaded.tables["comparison"]
     for row in compared.itertuples():
         line = next(line for line in said.splitlines() if str(row.condition) in line)
-        assert f"{1e3 * row.rms_position_m:.3f}" in line
-        assert f"{1e3 * row.expected_high_m:.3f}" in line
+        assert number(1e3 * row.rms_position_m) in line
+        assert number(1e3 * row.expected_high_m) in line
     campaign = open_campaign(small_run)
     assert campaign.stored.numbers == loaded.fit.numbers
     assert dict(campaign.highest_m) == compared.set_index("condition")["expected_high_m"].to_dict()
