@@ -329,6 +329,14 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials):
     assert size["day 2"] - size["day 3"] == pytest.approx(np.log(1.05 / 0.96), abs=0.025)
 
 
+@pytest.mark.parametrize("sd", ["B_sd", "pressure_sd_Pa", "gain_sd"])
+def test_a_difference_between_days_is_tried_in_the_form_that_has_a_standard_deviation(trials, monkeypatch, sd):
+    monkeypatch.setitem(result.BETWEEN, "day", result.BetweenHypothesis("days differ", "film again", **{sd: 0.03}))
+    known = [replace(trial, day=str(k % 2)) for k, trial in enumerate(trials)]
+    found = differences(fit(vt.base_model(), made(known, [1.0] * len(known), seed=9), profile=False))
+    assert [len(each.terms) for each in found if each.name == "day"] == [1]
+
+
 @pytest.mark.slow
 def test_the_best_of_many_places_is_no_more_than_chance(trials):
     """Where nothing differs, a change may begin anywhere: what is worth as much as one chance in a thousand is rare."""

@@ -15,7 +15,7 @@ from vinetrack.core.records import Bend, Kinematics, Trial
 from vinetrack.dynamics import kernel as batch
 from vinetrack.dynamics.audit import Audit, AuditedMotion, audit, evaluate, measured_motion
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import effects_on, host_for, shared_host
+from vinetrack.dynamics.model import check_needs, effects_on, host_for, shared_host, stated
 from vinetrack.dynamics.simulate import SimulationError, prepare, simulate_many
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue, load_effect, own_effects
 
@@ -201,6 +201,16 @@ def test_removing_by_effect_or_by_name_removes_its_values():
     for twice in (lambda: vt.base_model() + effects.gravity, lambda: vt.make_model(["gravity", "gravity"])):
         with pytest.raises(EffectError):
             twice()
+
+
+@pytest.mark.parametrize("column", ["bends", "day", "chamber_l"])
+def test_a_column_that_an_effect_needs_is_blank_without_bends_text_or_number(column):
+    blank, needy = replace(BALL, travel_ratio=2.0), replace(catalogue()[BASE_EFFECTS[-1]], needs=(column,))
+    model = vt.make_model(BASE_EFFECTS[:-1]) + needy
+    assert not stated(column, blank)
+    with pytest.raises(EffectError):
+        check_needs(model, blank)
+    check_needs(model, replace(blank, bends=(Bend(0.1, 0.1, 0.05),), day="1", chamber_m3=1e-3))
 
 
 def test_values_have_their_defaults_until_given_and_may_belong_to_each_vine():

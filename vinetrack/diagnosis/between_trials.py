@@ -139,7 +139,7 @@ def _groups(trials: Sequence[Trial]) -> list[Difference]:
     """Differences between the specimens, days and other groups of trials that columns of the sheet state."""
     found: list[Difference] = []
     for name in BETWEEN:
-        if BETWEEN[name].B_sd and all(getattr(trial, name) for trial in trials):
+        if all(getattr(trial, name, "") for trial in trials):
             groups = [trial.group(name) for trial in trials]
             tubes = Counter(vine for vine, _ in {(trial.vine, trial.specimen) for trial in trials})
             # A vine with a single tube has its own B already.
@@ -164,8 +164,8 @@ def _forms(name: str, groups: Sequence[str], trials: Sequence[Trial], *, stated:
     is_confounded = confounded(member, trials)
     return [
         Difference(name, terms, stated=stated, confounded=is_confounded)
-        for terms in ((in_B,), (in_P,), (in_B, in_P), *([(in_gain,)] if sd.gain_sd else []))
-        if not any(term.pressure for term in terms) or driven.any()
+        for terms in ((in_B,), (in_P,), (in_B, in_P), (in_gain,))
+        if all(term.prior_sd > 0 and (driven.any() or not term.pressure) for term in terms)
     ]
 
 

@@ -259,15 +259,15 @@ def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: F
     return changed
 
 
-def _of_trial(column: str, trial: Trial) -> object:
-    """Value of a trial in a column of the sheet, SI; NaN for a column that no sheet has."""
-    return getattr(trial, COLUMNS[column].field, math.nan) if column in COLUMNS else math.nan
+def _is_blank(column: str, trial: Trial) -> bool:
+    """Whether a trial has no value in a column of the sheet, or no sheet has the column."""
+    value = getattr(trial, COLUMNS[column].field, None) if column in COLUMNS else None
+    return value in (None, "", ()) or (isinstance(value, float) and not math.isfinite(value))
 
 
 def stated(column: str, trial: Trial) -> bool:
     """Whether the sheet gives a trial a value other than zero in this column."""
-    value = _of_trial(column, trial)
-    return not isinstance(value, float) or (math.isfinite(value) and value != 0)
+    return not _is_blank(column, trial) and getattr(trial, COLUMNS[column].field) != 0
 
 
 def check_needs(model: Model, *trials: Trial) -> None:
@@ -275,8 +275,7 @@ def check_needs(model: Model, *trials: Trial) -> None:
     needs = [(effect, column) for effect in model for column in effect.needs]
     for trial in trials:
         for effect, column in needs:
-            value = _of_trial(column, trial)
-            if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
+            if _is_blank(column, trial) and trial.travel_ratio != 1:
                 error = EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")
                 error.effect, error.column = effect.name, column
                 raise error

@@ -443,7 +443,7 @@ def _compile_faults(effect: Effect, hook: str, _text: bytes) -> tuple[str, ...]:
         compiled = njit(**flags)(effect.functions[hook])
         compiled(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
     except NumbaError:
-        return (f"{hook} cannot be compiled: it may use numbers, math and numpy functions only",)
+        return (f"{hook} cannot be compiled: it may use numbers, functions of math and numpy, and fields of s and rig",)
     except Exception as error:
         return (f"{hook} fails in motion ({type(error).__name__}: {error})",)
     return ()

@@ -1,4 +1,4 @@
-"""Every figure of a results folder: a drawing function with the decorator `figure`, which says all about it.
+"""Every figure of a whole experiment: a drawing function with the decorator `figure`, which says all about it.
 
 The decorator gives name, section of the report, title and data to download; the docstring of the function is the
 caption, and its parameters are the names of the tables that it shows. `draw` takes them from any object that has them

@@ -1,4 +1,4 @@
-"""Read recordings that are image files: a numbered folder of PNG, JPEG, TIFF, DNG or BMP, or one TIFF stack."""
+"""Read recordings that are image files (a numbered folder, a TIFF stack) or files of high-speed cameras."""
 
 from __future__ import annotations
 
