@@ -47,19 +47,16 @@ def _say(line: str, err: bool = False) -> None:
 @contextmanager
 def progress_line() -> Iterator[Callable[[str], None]]:
     """Show the current step on one line of a terminal, which is erased at the end; print nothing elsewhere."""
-    shown: list[str] = []
 
     def show(text: str) -> None:
         if sys.stderr.isatty():
-            shown.append(text)
             sys.stderr.write(f"\r\x1b[K{text}")
             sys.stderr.flush()
 
     try:
         yield lambda step: show(f"{step} …")
     finally:
-        if shown:
-            show("")
+        show("")
 
 
 @contextmanager
@@ -81,6 +78,8 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
     except Exception as error:
         if is_disk_full(error):
             _exit_with("The disk is full: free some space and run the same command again; finished results are kept.")
+        if isinstance(error, OSError) and error.strerror and (place := error.filename2 or error.filename):
+            _exit_with(f"{place}: {error.strerror[:1].lower()}{error.strerror[1:]}: name another file or folder.")
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, UserError):
             _exit_with(str(error))

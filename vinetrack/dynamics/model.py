@@ -259,15 +259,16 @@ def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: F
     return changed
 
 
-def _is_blank(column: str, trial: Trial) -> bool:
-    """Whether a trial has no value in a column of the sheet, or no sheet has the column."""
-    value = getattr(trial, COLUMNS[column].field, None) if column in COLUMNS else None
-    return value in (None, "", ()) or (isinstance(value, float) and not math.isfinite(value))
+def _of_trial(column: str, trial: Trial) -> object:
+    """Value of a trial in a column of the sheet, SI; NaN where it is blank, and for a column that no sheet has."""
+    value = getattr(trial, COLUMNS[column].field, math.nan) if column in COLUMNS else math.nan
+    return math.nan if value is None or (isinstance(value, str | tuple) and not value) else value
 
 
 def stated(column: str, trial: Trial) -> bool:
     """Whether the sheet gives a trial a value other than zero in this column."""
-    return not _is_blank(column, trial) and getattr(trial, COLUMNS[column].field) != 0
+    value = _of_trial(column, trial)
+    return not isinstance(value, float) or (math.isfinite(value) and value != 0)
 
 
 def check_needs(model: Model, *trials: Trial) -> None:
@@ -275,7 +276,8 @@ def check_needs(model: Model, *trials: Trial) -> None:
     needs = [(effect, column) for effect in model for column in effect.needs]
     for trial in trials:
         for effect, column in needs:
-            if _is_blank(column, trial) and trial.travel_ratio != 1:
+            value = _of_trial(column, trial)
+            if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
                 error = EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")
                 error.effect, error.column = effect.name, column
                 raise error
@@ -285,9 +287,8 @@ def check_needs(model: Model, *trials: Trial) -> None:
 # One model with the whole catalogue, compiled once for all that is asked of any of its effects.
 #
 # A model takes seconds to compile, an effect of no size next to nothing to simulate. What compares models therefore
-# simulates each by the compiled form of one larger model, the host. Wherever no effect of a user's own is involved it
-# is the same model, so that fits, designs, diagnoses and the explorer share what is compiled. An effect that is
-# switched off is skipped, so that the trajectories are those of the smaller model to the last bit.
+# simulates each by the compiled form of one larger model, the host: the same wherever no effect of a user's own is
+# involved. An effect that is switched off is skipped: trajectories are those of the smaller model to the last bit.
 
 
 @lru_cache(maxsize=1)

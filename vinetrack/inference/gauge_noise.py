@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -24,7 +24,14 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.units import AMBIENT_PRESSURE_PA
-from vinetrack.inference.gaussian_processes import posterior, product_of_modes, root_of_covariance, splines, whiten
+from vinetrack.inference.gaussian_processes import (
+    Posterior,
+    posterior,
+    product_of_modes,
+    root_of_covariance,
+    splines,
+    whiten,
+)
 from vinetrack.tracks.position_noise import rough_noise
 
 # ------------------------------------------------------------------------------
@@ -281,7 +288,7 @@ def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise
     for i, each in enumerate(readings):
         if each.values_Pa.size >= FEWEST_SAMPLES and not each.all_noise:
             own_sigma[i] = white_noise_sd(whitened(each.values_Pa, rho)[1:] if rho else each.values_Pa)
-    known_sigmas = [sigma for sigma in own_sigma if math.isfinite(sigma)]
+    known_sigmas = [sigma for sigma in own_sigma if sigma > 0]
     typical = float(np.median(known_sigmas)) if len(known_sigmas) > 1 else 0.0
     noises = []
     for sigma, each in zip(own_sigma, readings, strict=True):
@@ -289,10 +296,10 @@ def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise
             # 1e6: degrees of freedom of a noise that is derived instead of estimated
             noises.append(GaugeNoise(each.rounding_Pa, 1e6, 0.0))
             continue
-        own_degrees = NOISE_DEGREES * each.values_Pa.size if math.isfinite(sigma) else 0.0
+        own_degrees = NOISE_DEGREES * (each.values_Pa.size - 2.5) if math.isfinite(sigma) else 0.0
         # 3: samples below which a trace is left unchanged although other traces determine the noise (derived)
         # 20.0: degrees of freedom that the other traces of a campaign add to the noise of a trace (chosen)
-        degrees_of_others = 20.0 if typical > 0 and each.values_Pa.size >= 3 else 0.0
+        degrees_of_others = 20.0 if typical > 0 and sigma != 0 and each.values_Pa.size >= 3 else 0.0
         degrees = own_degrees + degrees_of_others
         squares = degrees_of_others * typical**2 + (own_degrees * sigma**2 if own_degrees else 0.0)
         pooled_sigma = max(math.sqrt(squares / degrees), each.rounding_Pa) if degrees else 0.0
@@ -416,14 +423,14 @@ class Recorded:
 
     @property
     def typical_Pa(self) -> float:
-        """Absolute pressure at which the scale of `linearised` has unit slope."""
+        """Absolute pressure at which the scale of `part` is 1."""
         return max(float(np.median(self.readings.values_Pa)), -0.5 * AMBIENT_PRESSURE_PA) + AMBIENT_PRESSURE_PA
 
     @property
-    def linearised(self) -> Floats:
+    def part(self) -> Floats:
         """Readings on the scale on which those of a chamber emptying into the tube are linear in the growth."""
         absolute = np.maximum(self.readings.values_Pa + AMBIENT_PRESSURE_PA, 0.1 * AMBIENT_PRESSURE_PA)
-        return np.asarray(-GAMMA * (absolute / self.typical_Pa) ** (-1 / GAMMA))
+        return np.asarray((absolute / self.typical_Pa) ** (-1 / GAMMA))
 
     def at_samples(self, clock_s: float) -> Floats:
         """Splines in time and in growth at all samples, shape (n_samples, n_splines)."""
@@ -447,16 +454,19 @@ class Recorded:
         return np.hstack([in_time, in_growth])
 
     def equations(self, clock_s: float) -> Floats:
-        """Triangular factor of the whitened columns constant, splines, linearised readings, in units of the noise."""
-        columns = np.column_stack([np.ones(self.linearised.size), self.at_readings(clock_s), self.linearised])
-        white = whitened(columns, self.noise.rho) * (self.typical_Pa / self.noise.sigma_Pa)
+        """Triangular factor of the whitened columns constant, splines, readings, in units of the noise, which the scale
+        of `part` makes larger where the pressure is high.
+        """
+        columns = np.column_stack([np.ones(self.part.size), self.at_readings(clock_s), -GAMMA * self.part])
+        noise = self.noise.sigma_Pa / self.typical_Pa * self.part ** (GAMMA + 1)
+        white = whitened(columns / noise[:, None], self.noise.rho)
         return np.asarray(np.linalg.qr(np.vstack([white, np.zeros((columns.shape[1], columns.shape[1]))]), mode="r"))
 
 
 @cache
-def kinds_of_curves() -> tuple[list[Floats], list[float]]:
-    """Modes of the coefficients of the splines, in time, in growth, or in both, for every way in which a pressure may
-    change, and the logarithms of their odds. A chamber that empties gives a line in the growth, bent a little.
+def kinds_of_curves() -> tuple[list[Floats], ...]:
+    """Modes of the coefficients of the splines, in time, in growth, and in both, for every way in which a pressure may
+    change. A chamber that empties gives a line in the growth, bent a little.
     """
     line, over_time = ((np.arange(count)[:, None] - 1.0) / (count - 3) for count in (GROWTH_SPLINES, TIME_SPLINES))
     bent, smooth = (
@@ -469,51 +479,44 @@ def kinds_of_curves() -> tuple[list[Floats], list[float]]:
     time = [np.vstack([modes, np.zeros((GROWTH_SPLINES, modes.shape[1]))]) for modes in in_time]
     growth = [np.vstack([np.zeros((TIME_SPLINES, modes.shape[1])), modes]) for modes in in_growth]
     both = [np.hstack([modes, growth[1]]) for modes in (time[0], *time[-3:])]
-    kinds = (time, growth, both)
-    return [modes for of_kind in kinds for modes in of_kind], [-math.log(len(of)) for of in kinds for _ in of]
+    return time, growth, both
+
+
+def curves_of(factors: Floats, *kinds: Sequence[Floats]) -> tuple[Floats, Posterior]:
+    """Products of splines and readings, the constant eliminated, and the posterior of the coefficients over kinds of
+    curves, each sort with the same odds. Shapes: factors (n_traces, q + 2, q + 2) → (n_traces, q + 1, q + 1).
+    """
+    rows = factors[:, 1:, 1:]
+    products = np.swapaxes(rows, 1, 2) @ rows
+    log_odds = [-math.log(len(sort)) for sort in kinds for _ in sort]
+    # Amplitudes of the smooth functions, parts of the absolute pressure (chosen)
+    amplitudes = np.geomspace(1e-6, 0.3, 16)
+    modes = [each for sort in kinds for each in sort]
+    return products, posterior(products[:, :-1, :-1], products[:, :-1, -1], modes, amplitudes, log_odds)
 
 
 def gauge_clock(traces: Sequence[Recorded]) -> tuple[float, float]:
     """Clock offset between gauge and camera, s: delay from a reading to the growth that belongs to it, the same in all
-    traces; and its standard deviation. The growth that empties the chamber is shifted to where a line in time and a
-    parabola in growth leave least. Where no curve explains the readings to their noise, the residual counts as noise.
+    traces; and its standard deviation: those of the evidence of curves in growth at offsets of up to 60 frames.
     """
-    frames_s = [trace.growth.frame_s for trace in traces if trace.growth is not None]
-    if not frames_s:
+    # 24: traces that tell the offset (chosen)
+    telling = [trace for trace in traces if trace.growth is not None][:: len(traces) // 24 + 1]
+    if not telling:
         return 0.0, 0.0
-    largest = 60  # Largest clock offset, samples (chosen)
-    step_s = float(np.median(frames_s))
-    offsets_s: Floats = step_s * np.arange(-largest, largest + 1.0)
-    log_likelihood = np.zeros(offsets_s.size)
-    for trace in traces:
-        # 5: readings from which the curve, of four coefficients, leaves anything
-        if trace.growth is not None and trace.readings.places.size >= 5:
-            log_likelihood += _offset_log_likelihood(trace, trace.growth, offsets_s / trace.growth.frame_s)
-    best = int(np.clip(np.argmax(log_likelihood), 1, offsets_s.size - 2))
-    before, at, after = log_likelihood[best - 1 : best + 2]
-    bend = 2 * at - before - after
-    if not bend > largest**-2:
-        return 0.0, 0.0
-    return float(offsets_s[best] + 0.5 * step_s * (after - before) / bend), step_s / math.sqrt(bend)
-
-
-def _offset_log_likelihood(trace: Recorded, growth: Growth, offsets: Floats) -> Floats:
-    """Log likelihood of offsets, samples."""
-    readings, rho = trace.readings, trace.noise.rho
-    at = np.arange(float(trace.count)) if readings.edges is not None else readings.places
-    # 400: readings used to estimate an offset (chosen)
-    stride = max(readings.places.size // 400, 1)
-    y = whitened(readings.values_Pa - np.mean(readings.values_Pa), rho)[::stride]
-    line = np.column_stack([np.ones(at.size), np.linspace(-1, 1, at.size)])
-    squares = np.empty(offsets.size)
-    for k, offset in enumerate(offsets):
-        shifted_m = growth.at(at + offset) - growth.at(at[:1] + offset)
-        bends = shifted_m[:, None] ** [1, 2] if np.ptp(shifted_m) > 0 else np.zeros((at.size, 0))
-        curves = np.hstack([line, bends / np.maximum(np.max(np.abs(bends), axis=0), 1e-300)])
-        white = whitened(readings.means_of(curves) if readings.edges is not None else curves, rho)[::stride]
-        squares[k] = y @ y - np.sum((np.linalg.qr(white)[0].T @ y) ** 2)
-    variance = max(trace.noise.sigma_Pa**2, float(np.min(squares)) / max(y.size - 5, 1))
-    return np.asarray(-0.5 * squares / variance)
+    step_s = float(np.median([trace.growth.frame_s for trace in telling if trace.growth is not None]))
+    _, growth, both = kinds_of_curves()
+    log_evidence: dict[int, float] = {}
+    # 60, 4: largest offset and coarse steps, frames (chosen)
+    for offsets in (range(-60, 61, 4), range(-3, 4)):
+        centre = max(log_evidence, key=log_evidence.__getitem__, default=0)
+        for offset in (centre + step for step in offsets if centre + step not in log_evidence):
+            factors = np.array([trace.equations(offset * step_s) for trace in telling])
+            log_evidence[offset] = curves_of(factors, growth[:2], both)[1].log_evidence
+    at, value = (np.array(each, dtype=float) for each in zip(*sorted(log_evidence.items()), strict=True))
+    fine = np.arange(at[0], at[-1] + 0.05, 0.1)
+    weights = np.exp(np.interp(fine, at, value) - value.max())
+    mean = float(np.average(fine, weights=weights))
+    return step_s * mean, step_s * math.sqrt(float(np.average((fine - mean) ** 2, weights=weights)))
 
 
 def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
@@ -535,82 +538,97 @@ def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
             growths[i] = Growth(grown_m, float(np.median(np.diff(time_s))))
     raw = {i: trace for i, trace in enumerate(denoised) if trace is not None}
     read = gauge_readings([trace.pressure_Pa for trace in raw.values()])
-    found = []
+    correlation = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
+    noises = [noise_of_traces(read, rho) for rho in dict.fromkeys((0.0, correlation))]
+    noisy = [k for k, of_trace in enumerate(zip(*noises, strict=True)) if min(each.sigma_Pa for each in of_trace) > 0]
+    if not noisy:
+        return denoised
+    places = list(raw)
+    recorded = [
+        [Recorded(read[k], raw[places[k]].time_s.size, of_all[k], growths[places[k]]) for k in noisy]
+        for of_all in noises
+    ]
     # A pressure that changes between readings can pass for a correlation of their noise: the evidence decides.
-    for rho in {0.0, noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])}:
-        noisy = {
-            i: Recorded(readings, raw[i].time_s.size, noise, growths[i])
-            for i, readings, noise in zip(raw, read, noise_of_traces(read, rho), strict=True)
-            if noise.sigma_Pa > 0
-        }
-        if noisy:
-            found.append((noisy, Curves(list(noisy.values()))))
-    if found:
-        noisy, curves = max(found, key=lambda each: each[1].log_likelihood)
-        for k, i in enumerate(noisy):
-            denoised[i] = DenoisedTrace(raw[i].time_s, *curves.of_trace(k))
+    curves = max(map(Curves, recorded), key=lambda each: each.log_likelihood)
+    good = [trace for trace, excess in zip(curves.traces, curves.excess, strict=True) if excess <= 1]
+    of_good = iter(Curves(good).all() if 0 < len(good) < len(noisy) else curves.all())
+    for k, trace, excess in zip(noisy, curves.traces, curves.excess, strict=True):
+        denoised[places[k]] = DenoisedTrace(raw[places[k]].time_s, *(next(of_good) if excess <= 1 else _splined(trace)))
     return denoised
 
 
 class Curves:
     """The curves through the readings of traces, given their noise; `log_likelihood` is that of the readings, with the
-    curves integrated out.
+    curves integrated out; `excess` is what they leave, in units of what noise may leave.
     """
 
     def __init__(self, traces: Sequence[Recorded]) -> None:
         self.traces = traces
         self.clock_s, self.clock_sigma_s = gauge_clock(traces)
         self.factors = np.array([trace.equations(self.clock_s) for trace in traces])
-        # The constant is eliminated: what is left are the rows below its own.
-        rows = self.factors[:, 1:, 1:]
-        products = np.swapaxes(rows, 1, 2) @ rows
+        products, self.found = curves_of(self.factors, *kinds_of_curves())
         information, score, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
-        modes, log_odds = kinds_of_curves()
-        # Amplitudes of the smooth functions, parts of the absolute pressure (chosen)
-        self.found = posterior(information, score, modes, np.geomspace(1e-6, 0.3, 16), log_odds)
         explained = 2 * score - np.einsum("nkl,nl->nk", information, self.found.mean)
-        self.residual_squares = squares - np.sum(self.found.mean * explained, axis=1)
+        left = squares - np.sum(self.found.mean * explained, axis=1)
+        self.excess = left / [_largest_residual_squares(trace) for trace in traces]
         scales = np.array([math.log(trace.noise.sigma_Pa) * trace.readings.places.size for trace in traces])
         correlated = 0.5 * np.log1p([-(trace.noise.rho**2) for trace in traces])
-        of_constants = np.log(np.abs(self.factors[:, 0, 0]))
-        self.log_likelihood = (
-            float(np.sum(correlated - scales - of_constants - 0.5 * squares)) + self.found.log_evidence
-        )
+        without = correlated - scales - np.log(np.abs(self.factors[:, 0, 0])) - 0.5 * squares
+        self.log_likelihood = float(np.sum(without)) + self.found.log_evidence
 
-    def of_trace(self, k: int) -> tuple[Floats, float, Floats]:
-        """The pressure of a trace at all samples, Pa, the error of its mean, Pa, and one column per other error, one
-        standard deviation each.
+    def all(self) -> Iterator[tuple[Floats, float, Floats]]:
+        """The pressure of every trace at all samples, Pa, the error of its mean, Pa, and one column per other error,
+        one standard deviation each.
         """
-        trace, factor, mean = self.traces[k], self.factors[k], self.found.mean[k]
-        constant = factor[0, -1] / factor[0, 0]
-        at_samples = trace.at_samples(self.clock_s) - factor[0, 1:-1] / factor[0, 0]
-        part = np.maximum(-(constant + at_samples @ mean) / GAMMA, 0.01)
-        variances, vectors = np.linalg.eigh(self.found.covariance[k])
-        earlier, later = (trace.at_samples(self.clock_s + sign * self.clock_sigma_s) for sign in (-1, 1))
-        errors = [at_samples @ (vectors * np.sqrt(np.maximum(variances, 0.0))), 0.5 * (later - earlier) @ mean]
-        errors_Pa = (trace.typical_Pa * part ** (-GAMMA - 1))[:, None] * np.column_stack(errors)
-        means_Pa = errors_Pa.mean(axis=0)
-        mean_error_Pa = math.hypot(trace.typical_Pa / abs(factor[0, 0]), *means_Pa)
-        pressure_Pa = trace.typical_Pa * part**-GAMMA - AMBIENT_PRESSURE_PA
-        if self.residual_squares[k] > _largest_residual_squares(trace):
-            pressure_Pa = _spline(trace)
-        least_Pa = NEGLIGIBLE_NOISE * abs(float(np.median(trace.readings.values_Pa)))
-        return pressure_Pa, mean_error_Pa, _principal_errors(errors_Pa - means_Pa, least_Pa)
+        found = (self.found.mean, self.found.covariance)
+        for trace, factor, mean, covariance in zip(self.traces, self.factors, *found, strict=True):
+            constant = factor[0, -1] / factor[0, 0]
+            at_samples = trace.at_samples(self.clock_s) - factor[0, 1:-1] / factor[0, 0]
+            part = np.maximum(-(constant + at_samples @ mean) / GAMMA, 0.01)
+            variances, vectors = np.linalg.eigh(covariance)
+            earlier, later = (trace.at_samples(self.clock_s + sign * self.clock_sigma_s) for sign in (-1, 1))
+            errors = np.column_stack([
+                np.full(part.size, 1 / factor[0, 0]),
+                at_samples @ (vectors * np.sqrt(np.maximum(variances, 0.0))),
+                0.5 * (later - earlier) @ mean,
+            ])  # fmt: skip
+            errors_Pa = (trace.typical_Pa * part ** (-GAMMA - 1))[:, None] * errors
+            means_Pa = errors_Pa.mean(axis=0)
+            least_Pa = 0.5 * NEGLIGIBLE_NOISE * abs(float(np.median(trace.readings.values_Pa)))
+            pressure_Pa = trace.typical_Pa * part**-GAMMA - AMBIENT_PRESSURE_PA
+            yield pressure_Pa, float(np.linalg.norm(means_Pa)), _principal_errors(errors_Pa - means_Pa, least_Pa)
+
+
+def _splined(trace: Recorded) -> tuple[Floats, float, Floats]:
+    """A trace that no smooth function explains, smoothed by a spline; its errors are those of the curve through it
+    alone, as much larger as it leaves more than noise.
+    """
+    alone = Curves([trace])
+    ((_, mean_error_Pa, errors_Pa),) = alone.all()
+    larger = math.sqrt(max(float(alone.excess[0]), 1.0))
+    return _spline(trace), mean_error_Pa, larger * errors_Pa
 
 
 def _principal_errors(errors_Pa: Floats, least_Pa: float) -> Floats:
-    """The same error covariance in as few columns as possible, by principal components; none of less than so much."""
+    """The same error covariance in as few columns as possible, by principal components. Those are dropped that have
+    less than this together.
+    """
     directions, sizes_Pa, _ = np.linalg.svd(errors_Pa, full_matrices=False)
-    # 1e-2: part of the total error variance of a curve below which a principal direction is dropped (chosen)
-    kept = sizes_Pa**2 > max(1e-2 * float(np.sum(sizes_Pa**2)), least_Pa**2 * len(errors_Pa))
+    together = np.cumsum(sizes_Pa[::-1] ** 2)[::-1]
+    # 1e-2: part of the total error variance below which directions are dropped (chosen)
+    kept = together > max(1e-2 * together[0], least_Pa**2 * len(errors_Pa))
     return np.asarray((directions * sizes_Pa)[:, kept])
 
 
 def _largest_residual_squares(trace: Recorded) -> float:
-    """Largest residual sum of squares, in units of the noise, of a curve that explains a trace (F test)."""
+    """Largest residual sum of squares, in units of the noise, of a curve that explains a trace (F test); none where the
+    scale of curves ends.
+    """
     from scipy.special import fdtri
 
     degrees = trace.readings.values_Pa.size - 1
+    if np.min(trace.readings.values_Pa) < -0.9 * AMBIENT_PRESSURE_PA:
+        return 1e-300
     # 1e-5: probability with which pure noise leaves more than is accepted (chosen)
     return float(degrees * fdtri(degrees, trace.noise.degrees, 1 - 1e-5))
 

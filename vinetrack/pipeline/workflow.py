@@ -46,11 +46,12 @@ def find_experiment(folder: Path) -> Path:
     """Return `folder` if it exists."""
     from vinetrack.experiment.sheet import closest_entry
 
+    if experiment := _claim(folder / CLAIM_FILE).get("experiment", ""):
+        raise ExperimentError([Problem(message="holds results", file=str(folder), remedy=f"give {experiment}")])
     if folder.exists():
         return folder
     missing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.parent.is_dir())
-    close = closest_entry(missing)
-    near = os.path.relpath(missing.with_name(close) if close else missing.parent)
+    near = os.path.relpath(missing.with_name(close) if (close := closest_entry(missing)) else missing.parent)
     remedy = f"did you mean {near}?" if close else f"the nearest existing folder is {near}"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
 
@@ -146,7 +147,6 @@ def begin_run(results: Path, experiment: Path) -> FileLock:
 # What the Snakefile asks: the plan of a run with its inputs and outputs.
 
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
-
 TRIALS_PER_JOB = 50  # Largest number of trials of one job (chosen: recordings of a job take a minute or a few)
 
 

@@ -125,7 +125,7 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        if (path.parent / "experiment.yaml").exists():
+        if (path.parent / "trials.csv").exists() and not (path.parent / "experiment.json").exists():
             where = f"{path.parent} is an experiment: give its results, such as results/{path.parent.name}"
         else:
             where = f"{path} does not exist: give a results folder, or write it with vinetrack run or snakemake"
