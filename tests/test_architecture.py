@@ -32,7 +32,7 @@ BUDGETS = {
     "effects": (765, 3, 8),
     "experiment": (1686, 5, 17),
     "figures": (2350, 8, 38),
-    "inference": (6508, 14, 59),
+    "inference": (6505, 14, 59),
     "interface": (619, 2, 2),
     "kinematics": (1738, 6, 12),
     "laboratory": (1600, 6, 9),

@@ -594,7 +594,7 @@ class Curves:
             ])  # fmt: skip
             errors_Pa = (trace.typical_Pa * part ** (-GAMMA - 1))[:, None] * errors
             means_Pa = errors_Pa.mean(axis=0)
-            least_Pa = 0.5 * NEGLIGIBLE_NOISE * abs(float(np.median(trace.readings.values_Pa)))
+            least_Pa = NEGLIGIBLE_NOISE * abs(float(np.median(trace.readings.values_Pa)))
             pressure_Pa = trace.typical_Pa * part**-GAMMA - AMBIENT_PRESSURE_PA
             yield pressure_Pa, float(np.linalg.norm(means_Pa)), _principal_errors(errors_Pa - means_Pa, least_Pa)
 
@@ -610,13 +610,10 @@ def _splined(trace: Recorded) -> tuple[Floats, float, Floats]:
 
 
 def _principal_errors(errors_Pa: Floats, least_Pa: float) -> Floats:
-    """The same error covariance in as few columns as possible, by principal components. Those are dropped that have
-    less than this together.
-    """
+    """The same error covariance in as few columns as possible, by principal components; none of less than so much."""
     directions, sizes_Pa, _ = np.linalg.svd(errors_Pa, full_matrices=False)
-    together = np.cumsum(sizes_Pa[::-1] ** 2)[::-1]
-    # 1e-2: part of the total error variance below which directions are dropped (chosen)
-    kept = together > max(1e-2 * together[0], least_Pa**2 * len(errors_Pa))
+    # 1e-2: part of the total error variance of a curve below which a principal direction is dropped (chosen)
+    kept = sizes_Pa**2 > max(1e-2 * float(np.sum(sizes_Pa**2)), least_Pa**2 * len(errors_Pa))
     return np.asarray((directions * sizes_Pa)[:, kept])
 
 
