@@ -340,6 +340,25 @@ def test_the_answers_of_both_designs_are_numbers_in_json(tmp_path):
     assert speed["low_90"] < speed["median"] < speed["high_90"]
 
 
+def test_a_place_that_cannot_be_written_and_the_wrong_folder_are_named(tmp_path):
+    """A folder for a file, as output or log; results where an experiment is wanted, and the other way round."""
+    results, experiment = tmp_path / "results", tmp_path / "vines"
+    for folder, name in ((results, "experiment.json"), (experiment, "trials.csv")):
+        folder.mkdir()
+        (folder / name).write_text(json.dumps({"experiment": str(experiment)}))
+    wrong = {
+        ("settings", "--json", tmp_path): tmp_path,
+        ("settings", "--log", tmp_path): tmp_path,
+        ("check", results): experiment,
+        ("compare", experiment): "results/vines",
+    }
+    for arguments, named in wrong.items():
+        done = run(*arguments)
+        assert done.exit_code == 1
+        assert str(named) in done.output.replace("\n", "")
+        assert "internal error of the program" not in done.output
+
+
 MISSING_OR_WRONG = (
     ("predict", "--diameter-mm", 25),
     ("predict", *FAST[:-1], 62000),

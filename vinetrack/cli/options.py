@@ -78,9 +78,9 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
     except Exception as error:
         if is_disk_full(error):
             _exit_with("The disk is full: free some space and run the same command again; finished results are kept.")
+        logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, OSError) and error.strerror and (place := error.filename2 or error.filename):
             _exit_with(f"{place}: {error.strerror[:1].lower()}{error.strerror[1:]}: name another file or folder.")
-        logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, UserError):
             _exit_with(str(error))
         place = f"; the traceback is in {log}" if log else "; run it again with --log FILE for the traceback"
@@ -97,13 +97,12 @@ def _exit_with(message: str) -> None:
 
 def _log_to(path: Path | None) -> None:
     """Send log messages of all modules to a file only, never to the terminal."""
-    handler: logging.Handler = logging.NullHandler()
+    logging.basicConfig(handlers=[logging.NullHandler()], level=logging.INFO, force=True)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
-    logging.basicConfig(
-        handlers=[handler], level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
-    )
+        file = logging.FileHandler(path, mode="w", encoding="utf-8")
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logging.getLogger().addHandler(file)
 
 
 # Type of an option by its kind; text for all other kinds

@@ -600,13 +600,23 @@ class Curves:
 
 
 def _splined(trace: Recorded) -> tuple[Floats, float, Floats]:
-    """A trace that no smooth function explains, smoothed by a spline; its errors are those of the curve through it
-    alone, as much larger as it leaves more than noise.
+    """A trace that no smooth function explains, by a smoothing spline through its readings, with knots where the
+    pressure bends (Dierckx, IMA J. Numer. Anal. 1, 267, 1981); of fewer than five readings lines. Its errors are those
+    of the curve through it alone, as much larger as that leaves more than noise.
     """
+    from scipy.interpolate import UnivariateSpline
+
+    places, values_Pa = trace.readings.places, trace.readings.values_Pa
+    # White noise is assumed: a changing pressure can mimic a correlation of the noise.
+    white_Pa = white_noise_sd(values_Pa) if values_Pa.size >= FEWEST_SAMPLES else 0.0
+    # 0.85: part of the squares of the noise that the spline leaves, the rest for its knots (measured)
+    few = places.size < 5
+    weights = np.full(places.size, 1 / (white_Pa or trace.noise.sigma_Pa))
+    spline = UnivariateSpline(places, values_Pa, weights, k=1 if few else 3, s=0.0 if few else 0.85 * places.size)
     alone = Curves([trace])
     ((_, mean_error_Pa, errors_Pa),) = alone.all()
     larger = math.sqrt(max(float(alone.excess[0]), 1.0))
-    return _spline(trace), mean_error_Pa, larger * errors_Pa
+    return np.asarray(spline(np.arange(float(trace.count)))), mean_error_Pa, larger * errors_Pa
 
 
 def _principal_errors(errors_Pa: Floats, least_Pa: float) -> Floats:
@@ -628,19 +638,3 @@ def _largest_residual_squares(trace: Recorded) -> float:
         return 1e-300
     # 1e-5: probability with which pure noise leaves more than is accepted (chosen)
     return float(degrees * fdtri(degrees, trace.noise.degrees, 1 - 1e-5))
-
-
-def _spline(trace: Recorded) -> Floats:
-    """Smoothing spline through readings at all samples, Pa, with knots where the pressure bends (Dierckx, IMA J. Numer.
-    Anal. 1, 267, 1981); of fewer than five readings lines.
-    """
-    from scipy.interpolate import UnivariateSpline
-
-    places, values_Pa = trace.readings.places, trace.readings.values_Pa
-    # White noise is assumed: a changing pressure can mimic a correlation of the noise.
-    white_Pa = white_noise_sd(values_Pa) if values_Pa.size >= FEWEST_SAMPLES else 0.0
-    # 0.85: part of the squares of the noise that the spline leaves, the rest for its knots (measured)
-    few = places.size < 5
-    weights = np.full(places.size, 1 / (white_Pa or trace.noise.sigma_Pa))
-    spline = UnivariateSpline(places, values_Pa, weights, k=1 if few else 3, s=0.0 if few else 0.85 * places.size)
-    return np.asarray(spline(np.arange(float(trace.count))))
